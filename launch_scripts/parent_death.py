@@ -1,6 +1,6 @@
 """Ends a process with the one that started it, even where that is killed.
 
-As a script it replaces itself by another program, and imports nothing of ours:
+As a script it replaces itself by another program, and imports no module of ours:
 
     python parent_death.py PARENT_PID PROGRAM ARGUMENT...
 """
@@ -23,7 +23,7 @@ def end_with_parent(number: signal.Signals) -> None:
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, int(number))
     parent = multiprocessing.parent_process()
-    if parent is not None and not parent.is_alive():  # it ended before the kernel was told
+    if parent is not None and not parent.is_alive():  # it ended before the kernel knew
         os.kill(os.getpid(), number)
 
 

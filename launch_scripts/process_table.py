@@ -17,14 +17,14 @@ Restart = Literal["always", "never"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Role:
-    """What is to be known of a role.
+    """Properties of a role.
 
     entry       `module:function` of its `run(setup, stop_when)`
     jobs        ids of the processes that a scenario has of it, without ranks
     standbys    how many stand by for each of them, in ranks from 1 on; None: it has no ranks
     stops       place in the order of the end: each role stops after those which still talk to it
     niceness    by how much less urgent it is than the launcher, where the processor is short. A vehicle that is
-                driven late stands, and a target jumps; a route may come a little later, what is kept or shown much
+                driven late stops, and a target jumps; a route may come a little later, storing and drawing much
     memory_mib  that a container of it may take at most: about four times what it took on 4096 x 4096 cells
     is_needed   whether a run is unwell without it
     expendable  whether a run goes on without it, whatever keeps it from starting
@@ -35,8 +35,8 @@ class Role:
     lasting     whether what it writes must outlive its container: a keeper's store, recordings, and what an agent
                 has promised of right of way (decision 25). All else is made again
     takes_over  how its next life follows one that still runs: "beside" it (each answer is complete, and of two the
-                younger life's counts), or after it; one that "waits" starts at once, and waits for a file that the
-                life before has locked
+                younger life's counts), or after it; one that "waits" starts immediately, and waits for a file that
+                the life before has locked
     """
 
     entry: str

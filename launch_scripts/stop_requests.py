@@ -1,4 +1,4 @@
-"""Whether somebody asked a command to end that runs until then."""
+"""Request to end a command that runs until then."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from contextlib import contextmanager
 @contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
     """Tells whether SIGINT or SIGTERM has come. Both raise KeyboardInterrupt, too, so that waits end at once. But
-    an exception may be lost, where the library that is just at work takes it for its own. So loops ask as well.
-    Called on the main thread."""
+    an exception may be lost, where the library that is just at work takes it for its own. Loops therefore poll it
+    as well. Called on the main thread."""
     asked = threading.Event()
 
     def ask(number: int, frame: object) -> None:

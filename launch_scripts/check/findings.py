@@ -1,4 +1,4 @@
-"""What a check has found: a sentence for people, with how much it matters."""
+"""Findings of a check: a sentence for people, with its level."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Finding(NamedTuple):
 
     level  failure: it cannot run so; warning: it runs, but not as one may think
     about  a key of the scenario, or a part of the machine
-    text   what was found, what is expected, what to do
+    text   the value found, the value expected, and the remedy
     """
 
     level: Level
@@ -35,7 +35,7 @@ def warning(about: str, text: str) -> Finding:
 
 
 def counted(findings: Sequence[Finding], level: Level) -> str:
-    """How many there are of a level: "1 failure", "no warnings"."""
+    """Returns the number of findings of a level: "1 failure", "no warnings"."""
     many = sum(finding.level == level for finding in findings)
     return f"{many or 'no'} {level}{'' if many == 1 else 's'}"
 

@@ -1,4 +1,5 @@
-"""This machine: whether it, with what is installed on it, is fit for a swarm, and large enough for one."""
+"""Checks whether this machine and its installation can run a swarm, and whether it is large enough for a
+scenario."""
 
 from __future__ import annotations
 
@@ -24,17 +25,17 @@ from swarm.errors import SwarmError
 
 PACKAGE = "terrain-swarm"
 _EXTRAS = ("all", "roles", "vectors")
-"""What the command needs beside what is always there."""
+"""Packages that the command needs beyond the base install."""
 _ENOUGH_BYTES = 1 << 30
-"""Of memory, and of disk."""
+"""Minimum of free memory, and of free disk."""
 _ENOUGH_FILES = 1024
 _UNSYNCHRONISED = 5
-"""What `adjtimex` returns of a clock that nobody sets: TIME_ERROR."""
+"""Result of `adjtimex` for a clock that is not synchronised: TIME_ERROR."""
 _TIMEX_BYTES = 256
 """Above the size of Linux's `struct timex`, 208 bytes on 64-bit machines: the kernel writes all of it."""
 
-# docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. That agents,
-# vehicles and trees cost in proportion to ticks and numbers is the thumb in the rule.
+# docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. The rule of thumb:
+# agents, vehicles and trees cost in proportion to ticks and numbers.
 _AGENT_CORES_AT_5_HZ = 0.022
 _VEHICLE_CORES_AT_5_HZ = 0.31 / 1000
 _PLANNER_CORES = 0.011
@@ -46,7 +47,7 @@ _BUSY_SHARE = 3 / 4
 """Beyond this share of the cores ticks are late: none of them at 1.4 cores of 2, 10 % at 1.9."""
 _FEW_AGENTS = 5
 _CELL_BYTES = 30
-"""Of the terrain, which all processes share, and of its file in the folder of a run."""
+"""Bytes of the terrain, which all processes share, and of its file in the folder of a run."""
 _RECORDING_BYTES_PER_MINUTE = 20 << 20
 """A rule of thumb on the safe side: a thousand vehicles were recorded with 9 MB a minute, and with 24 before routes
 were drawn as trees (decision 53)."""
@@ -56,7 +57,7 @@ bits."""
 
 
 class Machine(NamedTuple):
-    """What there is here: processor cores, and free bytes of memory and of the disk of a folder of runs."""
+    """Resources of this machine: processor cores, and free bytes of memory and of the disk of a folder of runs."""
 
     cores: int
     free_bytes: int
@@ -64,11 +65,11 @@ class Machine(NamedTuple):
 
 
 class Needs(NamedTuple):
-    """What a scenario is estimated to take.
+    """Estimated needs of a scenario.
 
     cores       that are busy all the time
     disk_bytes  in the folder of the run
-    recording_bytes  of these, what is written while the run lasts
+    recording_bytes  of these, bytes written while the run lasts
     """
 
     processes: int
@@ -80,7 +81,7 @@ class Needs(NamedTuple):
 
 
 def this_machine(runs: Path) -> Machine:
-    """What there is here, with the disk of a folder of runs."""
+    """Returns the resources of this machine, with the disk of a folder of runs."""
     return Machine(len(os.sched_getaffinity(0)), available_bytes(), shutil.disk_usage(_nearest(runs)).free)
 
 
@@ -92,7 +93,7 @@ def available_bytes() -> int:
 
 
 def needs_of(scenario: Scenario, cells: int) -> Needs:
-    """What a scenario takes on a terrain of so many cells."""
+    """Returns the needs of a scenario on a terrain of `cells` cells."""
     vehicles, ticks = scenario.vehicle_count, scenario.vehicles.tick_hz / 5
     agents, processes = len(plan_agents(scenario)), len(processes_of(scenario))
     trees = len(scenario.target_ids) * (1 + scenario.standbys.planner)
@@ -106,7 +107,7 @@ def needs_of(scenario: Scenario, cells: int) -> Needs:
 
 
 def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iterator[Finding]:
-    """Where the machine has less than a run needs."""
+    """Yields findings for each resource of which the machine has less than a run needs."""
     if needs.cores > _BUSY_SHARE * here.cores:
         hz = scenario.vehicles.tick_hz
         fewer = " a larger vehicles.per_agent," if needs.agents > max(_FEW_AGENTS, 2 * here.cores) else ""
@@ -135,7 +136,7 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
 
 
 def _nearest(runs: Path) -> Path:
-    """A folder of runs, or what is there of the path to it."""
+    """Returns a folder of runs, or the nearest existing folder above it."""
     return next(path for path in (runs.absolute(), *runs.absolute().parents) if path.exists())
 
 
@@ -280,7 +281,7 @@ def _clock(runs: Path) -> Said:
 
 
 def _clock_state() -> int:
-    """What the kernel says of its clock; below 0 where it says nothing."""
+    """Returns the kernel's state of its clock; below 0 if it gives none."""
     # All zero asks and changes nothing.
     return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
 
@@ -317,4 +318,4 @@ CHECKS: dict[str, Callable[[Path], Said]] = {
     "browser": _browser,
     "disk": _disk,
 }
-"""What is looked at, in order."""
+"""The checks, in order."""

@@ -218,4 +218,4 @@ _ASKED: Mapping[str, Callable[[Plugin, int, Tell], list[object]]] = {
     "strategy": _strategy,
     "dynamics": _dynamics,
 }
-"""Kind -> what asks a plug-in of it in the worlds of a seed, and returns all answers."""
+"""Kind -> function that calls a plug-in of it in the worlds of a seed, and returns all answers."""

@@ -1,5 +1,5 @@
-"""What of a scenario can be known before it runs: at once (files, certificates, plug-ins, endpoints), and once its
-terrain is built (whether the places that it names lie on ground that can be driven, and can meet)."""
+"""Checks of a scenario before it runs: immediately (files, certificates, plug-ins, endpoints), and once its terrain
+is built (whether its locations are on passable ground, and connected)."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
 
 
 def meets(scenario: Scenario) -> Iterator[Finding]:
-    """Whether the router that is started here is the one that the others connect to."""
+    """Returns True if the router that is started here is the one that the others connect to."""
     listens = {endpoint.rpartition(":")[2] for endpoint in scenario.network.listen}
     for endpoint in scenario.network.connect:
         # Beyond this machine a port may be forwarded.
@@ -146,9 +146,10 @@ def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:
     """The cheap half of `swarm check`, before `swarm up` starts anything. Raises SwarmError with the first failure.
 
     joins       the router is elsewhere
-    has_ground  the terrain's files must be here; else a keeper hands out what is not
+    has_ground  the terrain's files must be here; else a keeper serves the missing ones
     """
-    # Plug-ins, certificates of single processes and ports are looked at by whoever knows which roles start here.
+    # Plug-ins, certificates of single processes and ports are checked by the caller, which knows the roles that
+    # start here.
     found = [*places_counted(scenario), *network(scenario, whole=False)]
     if has_ground:
         found += files_named(scenario)
@@ -194,7 +195,7 @@ def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) 
     if all(target.start is None for target in scenario.targets):
         return
     grid, frame = terrain.grid, MapFrame(terrain.grid)
-    # As the process that moves them: a target keeps to cells where a vehicle fits.
+    # Same rule as in the targets process: a target keeps to cells where a vehicle fits.
     halves = inflation_halves(terrain.vehicle_radius_m, grid.resolution_m)
     closed = np.isinf(inflate(truth, halves) if halves else truth) | terrain.lethal
     for n, target in enumerate(scenario.targets):
@@ -253,7 +254,7 @@ def _shown(given: object, place: tuple[int, int]) -> str:
 
 
 def _near(closed: Bools, place: tuple[int, int]) -> str:
-    """Where the nearest open cell is."""
+    """Returns the nearest open cell."""
     free = np.flatnonzero(~closed)
     if not len(free):
         return ""

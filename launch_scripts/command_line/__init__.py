@@ -1,1 +1,1 @@
-"""The command line itself: families of commands, completion, and what is said of mistakes."""
+"""Command line: families of commands, completion, and sentences for mistakes."""

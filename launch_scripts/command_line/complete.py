@@ -1,6 +1,6 @@
-"""What the shell offers for a value: names of scenarios, runs, targets, vehicles and groups, and allowed words.
+"""Shell completion for scenario, run, target, vehicle and group names, and for enumerations.
 
-Nothing here may fail or take long: somebody has pressed the Tab key. What cannot be read is not offered.
+No function here may fail or take long: the user has pressed the Tab key. Unreadable files are not offered.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def scenarios_and_worlds(ctx: typer.Context, incomplete: str) -> list[str]:
-    """As `scenarios`, and the small worlds of `swarm simulate --seeds`."""
+    """Like `scenarios`, and the small worlds of `swarm simulate --seeds`."""
     from launch_scripts.simulation.worlds import WORLDS
 
     return [*scenarios(ctx, incomplete), *(name for name in WORLDS if name.startswith(incomplete))]

@@ -4,8 +4,8 @@ A command is a function and `@command(app, PANEL)`. Its docstring is its help: p
 `name  meaning` for its arguments and options, as the docstrings of scenario sections have them. A parameter without
 a default is an argument, one with a default an option; `Annotated[..., typer.Option(...)]` says what else there is,
 such as bounds or completion. A parameter whose type is a dataclass stands for one option per field, which the
-class's own docstring explains: options that several commands share are declared and explained once. What the
-function returns is the exit code.
+class's own docstring explains: options that several commands share are declared and explained once. The function
+returns the exit code.
 """
 
 from __future__ import annotations

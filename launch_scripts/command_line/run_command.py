@@ -23,9 +23,9 @@ EXTRAS = {
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
-    """Runs the command that is made here. Returns its exit code; what a user, a file or the network has wrong is
-    told in a sentence."""
-    # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
+    """Runs the command that is made here. Returns its exit code; a fault of the user, a file or the network is
+    reported in a sentence."""
+    # A shell starts what it puts into the background deaf to SIGINT. An explicit signal is obeyed.
     asked: list[int] = []
 
     def stop(number: int, frame: object) -> None:
@@ -73,8 +73,8 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
 
 
 def _sentence(error: TyperException) -> str:
-    """What Typer found wrong, in its own words, with what they lack: the value found, what an argument is, which
-    commands there are. Empty where Typer has printed help already."""
+    """Returns Typer's sentence about a mistake, completed: the value found, the meaning of an argument, the list of
+    commands. Empty where Typer has printed help already."""
     if type(error).__name__ == "NoArgsIsHelpError":  # private to Typer, as all of its classes of errors
         return ""
     ctx: Any = getattr(error, "ctx", None)
@@ -91,8 +91,8 @@ def _sentence(error: TyperException) -> str:
 
 
 def _fill_streams() -> None:
-    """Let standard streams that were closed lead nowhere: the next file that is opened would take their place, and
-    get what is printed."""
+    """Redirects closed standard streams to nowhere: otherwise the next file that is opened would take their place,
+    and receive printed text."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free

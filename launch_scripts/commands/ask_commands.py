@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 _TURN_S = 0.1
 """A scrape or Ctrl-C waits this long at most. Prometheus gives up after 10 s by default; shorter turns would cost
-CPU while nobody asks."""
+CPU without any query."""
 
 
 @command(app, ASK)
@@ -151,7 +151,7 @@ def top(
 
 @command(app, ASK)
 def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
-    """Say whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if nobody answers. For probes.
+    """Report whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if no process replies. For probes.
 
     With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
     there in a fraction of a second. Otherwise it asks the whole swarm over its router, for two seconds.
@@ -179,7 +179,7 @@ def health(where: Where, url: str | None = None, live: bool = False, as_json: As
 
 
 def swarm_answer(status: Status) -> Answer:
-    """Whether all processes that the run needs are there and ready."""
+    """Returns whether all processes that the run needs are there and ready."""
     from launch_scripts.web.health_probe import Answer
     from swarm.runtime.stats import READY
 

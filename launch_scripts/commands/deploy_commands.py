@@ -80,7 +80,7 @@ def plan(
 
     hosts  The machines, in TOML: see docs/deploy.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
-    kit    What starts the processes: systemd, or compose (containers).
+    kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
     wheel  Put this wheel of the swarm into the archives, to be installed from them.
     days   Days until new certificates expire.
@@ -162,15 +162,15 @@ def size(
     link: Annotated[float, typer.Option(min=1, max=1e9)] = 1000.0,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> int:
-    """How many machines a swarm needs, by a table of swarms that were measured.
+    """Estimate how many machines a swarm needs, from a table of measured swarms.
 
     swarm deploy size --vehicles 1000 --targets 10
 
     swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
 
-    Machines are used to 60 % of cores and memory, and links to half. What one process cannot carry is named: more
-    machines do not help it. What is larger than the measured swarms is extrapolated. They had the speeds and the
-    density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
+    Machines are used to 60 % of cores and memory, and links to half. A process that is too small for its load is
+    named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
+    and the density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
 
     Exit code 1 if a process has to do more than one core can.
 
@@ -248,12 +248,13 @@ def certs(
 
     swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
-    Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
-    What is there is kept while more than a third of its time is left.
+    Copy ca.pem and the two files of a name to the machine where it runs. ca.key stays here: its holder can admit
+    any process. Existing certificates are kept while more than a third of their time is left.
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Make those that its processes lack or that end soon, too, and number anew what it revokes.
+    scenario  Make certificates that its processes lack or that end soon, too, and replacements for those that it
+              revokes.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """
@@ -280,7 +281,7 @@ def certs(
 
 @command(app)
 def revoke(folder: Path, names: list[str]) -> None:
-    """Deny everything to who has these names in a certificate. A running router notices within a second.
+    """Deny everything to holders of certificates with these names. A running router notices within a second.
 
     swarm deploy revoke certs agent.all.a0
 
@@ -311,9 +312,9 @@ def zenohd(
     swarm deploy zenohd router.json5 --listen tcp/127.0.0.1:7447 --plugins /usr/lib/zenoh
 
     out       The file to write, for `zenohd -c FILE`.
-    listen    Where to listen, such as tls/0.0.0.0:7447; several times if need be.
+    listen    Endpoint to listen at, such as tls/0.0.0.0:7447; repeat for several.
     peer      Another router to connect to.
-    scenario  Whose processes may take part: needed with certificates.
+    scenario  Scenario whose processes may take part: needed with certificates.
     plugins   Folder with libzenoh_plugin_storage_manager.so, to store marks, too.
     volume    Volume of the storage: memory, or one whose backend is installed.
     """

@@ -28,7 +28,7 @@ _MOST_ALTITUDE_M = 10_000.0
 
 @dataclass(frozen=True)
 class RosSide:
-    """How the ROS side is reached.
+    """Connection to the ROS side.
 
     ros           Router of the ROS side, rmw_zenohd; tcp/127.0.0.1:7447 if not given.
     domain        ROS_DOMAIN_ID; 0 if not given.
@@ -61,7 +61,7 @@ def ros2(
 
     settings  A .toml file: topics, rates, names, both sides.
     vehicles  Ids of vehicles that ROS hears of, with * and ?; may be given several times.
-    topics    Print what is forwarded, and exit.
+    topics    Print the forwarded topics, and exit.
     as_json   With --list: as JSON.
     """
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
@@ -127,13 +127,13 @@ def _join(network: NetworkConfig) -> Swarm:
 
 @dataclass(frozen=True)
 class Drives:
-    """How a vehicle is driven.
+    """Control of a vehicle.
 
     target         Follow routes to this target; without it the vehicle is avoided, and no more.
     drive          By missions, or by guided setpoints.
     arm            Arm it and set its mode; without it that is the pilot's.
     altitude       Metres at which one that flies follows.
-    above          What --altitude is above; terrain: ArduPilot only.
+    above          Reference of --altitude; terrain: ArduPilot only.
     vehicle_class  Which class of the swarm's vehicles it drives as.
     """
 
@@ -148,7 +148,7 @@ class Drives:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Who a vehicle is, in the swarm and on its link.
+    """Identity of a vehicle, in the swarm and on its link.
 
     id           Its name in the swarm; if not given, mav1 of system 1.
     group        Whose it is.

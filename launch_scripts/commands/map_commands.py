@@ -1,4 +1,4 @@
-"""`swarm map`: inspects a keeper's store, exports its marks, imports them into another, shows what was learned."""
+"""`swarm map`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
 _TIMEOUT_S = 2.0
-"""Whoever has not answered for as long counts as gone (`network.lease_s`), and a keeper answers from memory."""
+"""A process without a reply for this time counts as ended (`network.lease_s`), and a keeper replies from memory."""
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -114,7 +114,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
 
 @command(app)
 def export(store: Store, out: Path) -> None:
-    """Write the marks of a store: all of them, and what was learned, as JSON, which can be imported; the winners as
+    """Write the marks of a store: all of them, with learned factors, as JSON, which can be imported; the winners as
     pixels or polygons.
 
     swarm map export runs/LAST/map.sqlite marks.json
@@ -192,7 +192,7 @@ def learned(
 
 
 def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
-    """The newest word of each author. Raises BusError if nobody answers.
+    """The newest word of each author. Raises BusError if no process replies.
 
     where  names the swarm in errors
     """
@@ -210,7 +210,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
 
 
 def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
-    """Prints what was learned of each kind of ground."""
+    """Prints the learned factor of each terrain class."""
     kinds = learned_kinds(words)
     if as_json:
         print(json.dumps({"kinds": [each._asdict() for each in kinds]}, indent=2))

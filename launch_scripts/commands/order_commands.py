@@ -1,7 +1,7 @@
 """Orders to a running swarm: `pause`, `resume`, `group`, `set`, `orders`, `target` and `vehicle stop|go`.
 
-Each is one `GiveOrder`, made of a subject and the fields that its command has read (`give`). A keeper holds what is
-ordered, and each process acknowledges it.
+Each is one `GiveOrder`, made of a subject and the fields that its command has read (`give`). A keeper stores the
+orders in force, and each process acknowledges them.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def group(
 
     name         The group.
     targets      The targets that it may chase.
-    as_scenario  Those that the scenario says.
+    as_scenario  The targets of the scenario.
     """
     from swarm.errors import ConfigError
 
@@ -119,7 +119,7 @@ def set_(
 
 @command(app, ORDER)
 def orders(where: Where, as_json: AsJson = False) -> None:
-    """Print what is ordered and not taken back. Zones are in `swarm zone list`.
+    """Print the orders in force. Zones are in `swarm zone list`.
 
     swarm orders --json
     """
@@ -199,7 +199,7 @@ def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
 
 
 def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> int:
-    """Gives orders, one after the other, and prints who obeys. Returns 1 if somebody has not said so.
+    """Gives orders, one after the other, and prints who obeys. Returns 1 if a process has not replied.
 
     orders  fields of `GiveOrder` each
     at      the place that they are about, if any: becomes their `cell`
@@ -256,7 +256,7 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
 
 def print_obeyed(acknowledged: Acknowledged) -> int:
-    """Prints who obeys an order, and who has not said so. Returns the exit code."""
+    """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
     typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
     if acknowledged.silent:

@@ -46,9 +46,9 @@ def check(
     swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
 
     kind     sensor, walk, cost_layer, assignment, strategy or dynamics.
-    name     As in a scenario: module:Name, or an installed one's name.
+    name     Name as in a scenario: module:Name, or that of an installed plug-in.
     options  Its options, as a JSON object.
-    folder   Where its module lies, if it is not installed.
+    folder   Folder of its module, if it is not installed.
     seeds    In how many sets of worlds it is asked.
     """
     from launch_scripts.check.plugin_check import check_plugin

@@ -42,7 +42,7 @@ def compare(
 ) -> None:
     """Show what differs between runs: settings, versions and machines, and all figures beside each other.
 
-    Where a run listened is left out: free ports differ each time.
+    Endpoints of a run are left out: free ports differ each time.
 
     swarm compare 20261122-154115-44bb LAST
 
@@ -188,8 +188,8 @@ def replay(
     A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
 
     process  Only this process, such as planner-t3.
-    until    Only so many seconds from the start of the run, by its own clock.
-    keep     Copy what is replayed into a folder: a test case.
+    until    Stop at this time (s) of the run's own clock.
+    keep     Copy the replayed files into a folder: a test case.
     """
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.simulation.replay import keep as keep_recorded

@@ -32,7 +32,7 @@ app = typer.Typer()
 
 @dataclass(frozen=True)
 class Place(Tls):
-    """Where a process finds its scenario, its router and its files.
+    """Locations of a process's scenario, router and files.
 
     connect      The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.
     health_port  Answer probes on this port, at /healthz and /readyz; 0 picks one.
@@ -67,7 +67,7 @@ class Part(Place):
 
 @dataclass(frozen=True)
 class Joins:
-    """What an agent hosts that is not in the scenario."""
+    """Vehicles that an agent hosts beyond the scenario."""
 
     group: str
     count: int
@@ -227,7 +227,7 @@ def run_role(
 
 
 def _health_of(name: str, place: Place) -> Health:
-    """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
+    """Returns the health reports of the role: to its supervisor, and to probes if they have a port."""
     from launch_scripts.web.health_verdict import Process, health_pages
     from launch_scripts.web.server import Server
     from swarm.runtime.health import Health, supervisor_of

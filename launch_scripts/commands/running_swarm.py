@@ -56,7 +56,8 @@ class Where(Tls):
         return found.network
 
     def network(self) -> NetworkConfig:
-        """How this command reaches the swarm. Raises BusError if none runs here, ConfigError for a wrong option."""
+        """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
+        wrong option."""
         import msgspec
 
         from launch_scripts.launcher.options import as_process, with_network
@@ -99,7 +100,7 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
     """The newest run in a folder whose router listens; a router at the usual endpoint if there is none.
 
     name  of the run, or its folder; only that is looked at then
-    Raises BusError with what was looked at, ConfigError if there is no run of that name.
+    Raises BusError with the places that were tried, ConfigError if there is no run of that name.
     """
     from launch_scripts.observe.run_folder import find_run
     from swarm.bus.endpoints import listening
@@ -110,7 +111,7 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
     tried = [(folder.resolve().name, network) for folder in folders if (network := _network_of(folder)) is not None]
     if name is None:
         tried.append(("", scenario.NetworkConfig()))
-    # Of runs with the same router only the newest can be behind it.
+    # Of runs with the same router only the newest can be connected to it.
     by_router = {network.connect: (run, network) for run, network in reversed(tried)}
     newest_first = sorted(by_router.values(), key=tried.index)
     found = [each for each in newest_first if any(map(listening, each[1].connect))]

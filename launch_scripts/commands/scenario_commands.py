@@ -44,14 +44,14 @@ _AGENTS, _LEAST_PER_AGENT = 8, 25
 
 @dataclass(frozen=True)
 class Choices:
-    """What a new scenario is made from; None is not chosen yet, and an empty text is none.
+    """Choices for a new scenario; None is not chosen yet, and an empty text is none.
 
     terrain   jacksboro, synthetic, or a file of elevation.
     photo     A GeoTIFF in colour on the same ground.
     vehicles  How many vehicles.
     targets   How many targets.
-    walk      How targets move: still, random, waypoints or evade.
-    seconds   How long the run lasts.
+    walk      Motion of targets: still, random, waypoints or evade.
+    seconds   Duration of the run.
     """
 
     panel: ClassVar[str | None] = None
@@ -85,7 +85,7 @@ _ASKED = {
 
 @command(app, PREPARE)
 def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices) -> None:
-    """Write a scenario of your own, with a comment for every key. On a terminal it asks for what is not given.
+    """Write a scenario of your own, with a comment for every key. On a terminal it asks for missing choices.
 
     An existing file is never written over.
 
@@ -111,12 +111,12 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
 
 
 def is_terminal() -> bool:
-    """True if somebody can be asked."""
+    """Returns True if there is a user to ask."""
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _asked(path: Path, choices: Choices, ask: Callable[..., Any] = typer.prompt) -> Choices:
-    """The choices with answers for what is missing; what is not possible is said and asked again."""
+    """Returns the choices with answers for the missing ones; an impossible answer is explained and asked again."""
     from swarm.config.load import BUILT_IN_TERRAINS
 
     for name, (_, question) in _ASKED.items():
@@ -157,7 +157,7 @@ def _text(path: Path, choices: Choices) -> str:
 
 
 def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
-    """What is written: enough to see what a scenario is, and no more."""
+    """Returns the settings to write: enough to show the form of a scenario, and no more."""
     from swarm.config.setting_types import MOST_PER_AGENT
 
     terrain: dict[str, Any] = {"source": _from(path, chosen.terrain)}
@@ -233,7 +233,7 @@ def check(
 
 
 def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    """facts  what is learnt on the way, for the last line"""
+    """facts collects facts on the way, for the last line"""
     from launch_scripts.check import scenario_check
     from launch_scripts.check.findings import warning
     from launch_scripts.ports import check_ports
@@ -311,7 +311,7 @@ def _print(found: list[Finding], summary: str = "") -> int:
 
 
 def _summary(path: Path, found: list[Finding], facts: dict[str, Any]) -> str:
-    """What is told of a scenario that can run."""
+    """Returns the summary of a scenario that can run."""
     from launch_scripts.check.findings import counted
     from swarm.config.input_files import size
 
@@ -326,7 +326,7 @@ def _summary(path: Path, found: list[Finding], facts: dict[str, Any]) -> str:
 
 @command(app, PREPARE)
 def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
-    """Look at this machine and this installation: is it fit for a swarm, and what is to be done?
+    """Check this machine and this installation: is it fit for a swarm, and which steps are missing?
 
     Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
     disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.

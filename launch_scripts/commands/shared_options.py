@@ -70,7 +70,7 @@ Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 
 @dataclass(frozen=True)
 class Tls:
-    """The three files of mutual TLS: all, or none. Whatever says how a swarm is reached has them, too.
+    """The three files of mutual TLS: all, or none. Every option that states how a swarm is reached includes them.
 
     tls_ca    Certificate of the authority, PEM.
     tls_cert  Our certificate, PEM.
@@ -90,7 +90,7 @@ class Tls:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is started and shown: `swarm demo` and `swarm up`.
+    """Start and display of a run: `swarm demo` and `swarm up`.
 
     seconds        How long the run lasts once the swarm is up.
     seed           Seed of everything random.
@@ -118,10 +118,10 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Meeting(Tls):
-    """Where the processes of a launcher meet others.
+    """Endpoints where the processes of a launcher meet others.
 
     connect  Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.
-    listen   Where the router listens too, for other machines, such as tls/0.0.0.0:7448.
+    listen   Further endpoint of the router, for other machines, such as tls/0.0.0.0:7448.
     """
 
     panel: ClassVar[str | None] = NETWORK
@@ -135,7 +135,8 @@ class SomeProcesses:
     """Which part of a swarm a launcher starts, and of which run.
 
     only       Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.
-    rank       Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.
+    rank       Of planners and the targets process, start those of this rank: 0 leads, 1 is the first standby, and
+               so on.
     run_id     Take part in this run; by default a new one, or the one in the namespace.
     take_over  Take over from the launcher that runs this part of the run here, as for an upgrade: it is ended once
                successors are ready.

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
 _SHOWN_FAILURES = 20
-"""Commands that replay a failure. A terminal of 24 lines shows so many and the last sentence; results.parquet has
-every trial."""
+"""Commands that replay a failure. A terminal of 24 lines shows this number and the last sentence; results.parquet
+has every trial."""
 
 
 @command(app, RUN)
@@ -197,9 +197,9 @@ def sweep(
 ) -> int:
     """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
 
-    Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
-    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial.
-    It needs the extra "sweep" (Dask, pyarrow).
+    Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: a second start,
+    also with other seeds or settings, runs only the missing trials. Exit code 1 if a law broke in any trial. It
+    needs the extra "sweep" (Dask, pyarrow).
 
     swarm sweep study.toml
 

@@ -1,4 +1,4 @@
-"""What `swarm status` and `swarm top` show of a run: a picture of the moment, and one that is drawn each second."""
+"""Views of `swarm status` and `swarm top` of a run: a picture of the moment, and one that is drawn each second."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ class Status:
 
 
 def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObserver:
-    """A swarm of which whoever has answered has said how it is, if it does so in time. Raises BusError if nobody
-    answers."""
+    """Context of an observer that has received the state of all processes which reply in time. Raises BusError if
+    no process replies."""
     clock, observer = MonotonicClock(), OutsideObserver(bus)
     began_s = time.monotonic()
     while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
@@ -81,13 +81,13 @@ def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObser
 
 
 def ask_status(where: Where) -> Status:
-    """A running swarm as it is now. Raises BusError if nobody answers."""
+    """A running swarm as it is now. Raises BusError if no process replies."""
     with where.bus() as bus:
         return status_of(observed(bus, where), MonotonicClock().now_ns())
 
 
 def status_of(observer: OutsideObserver, now_ns: int) -> Status:
-    """What was heard so far. Somebody has answered."""
+    """Returns the state received up to now. Somebody has answered."""
     assert observer.latest is not None
     members, strangers = observer.members()
     return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
@@ -151,7 +151,7 @@ def _processes(status: Status) -> Table:
 
 
 def _planning(state: RunState) -> Table:
-    """What of the targets no other table has: beside the rest it would be wider than a terminal."""
+    """Table of the remaining target columns. Separate, so that the main table fits a terminal."""
     told = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
     shown = columns(*(column.label for column in told))
     for line in state.targets:
@@ -195,7 +195,7 @@ def status_fields(status: Status) -> dict[str, Any]:
 
 
 def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
-    """Where the planner's target is; None if that is not known, or not on this terrain."""
+    """Returns the cell of the planner's target; None if that is unknown, or not on this terrain."""
     cell = planner.target_cell
     return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None
 
@@ -204,7 +204,7 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
 
 
 def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
-    """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
+    """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if no process replies at the beginning."""
     make_output_outlive_readers()
     console = Console(highlight=False)
     moving = console.is_terminal and not as_json and not once
@@ -270,7 +270,7 @@ def _keys() -> Iterator[None]:
 
 
 def _asked_to_end() -> bool:
-    """Whether `q` was pressed."""
+    """Returns True if `q` was pressed."""
     if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
     keys = os.read(sys.stdin.fileno(), 64)

@@ -46,13 +46,13 @@ class Answer:
 
     @property
     def searching(self) -> bool:
-        """Whether nobody sees the target: then the route leads to a place to look at."""
+        """True if the target is unseen: then the route leads to a cell to search."""
         return isinstance(self.reply, RouteReply) and self.reply.routes[0].status is RouteStatus.SEARCHING
 
     @property
     def goal(self) -> int | None:
-        """Where the route leads to; None if the planner does not tell: of a search it tells no place further on
-        than the steps that were asked for."""
+        """End of the route; None if the planner does not state it: during a search it states no cell beyond the
+        requested steps."""
         if not self.searching:
             return self.target_cell
         cells = self.path()
@@ -60,7 +60,7 @@ class Answer:
 
     @property
     def target_cell(self) -> int | None:
-        """Where the target is, or was last."""
+        """Current or last known cell of the target."""
         cell = self.reply.target_cell
         return cell if cell is not None and 0 <= cell < self.frame.grid.cells else None
 
@@ -74,7 +74,7 @@ class Answer:
 
 
 def _leads(route: Route) -> bool:
-    """Whether there is a way: to the target, or to a place where it is looked for."""
+    """Returns True if a path exists: to the target, or to a cell where it is searched for."""
     searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
     return searching or route.status is RouteStatus.OK
 

@@ -76,16 +76,14 @@ def info(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
+    """Describe the content of a terrain file or a scenario, and the steps that brought it onto a metric grid.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
     these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
     Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
     ROS map_server .yaml or .yml, and .png with --resolution-m and
-    --height-scale. The lines after the table
-    say what was done to the file, and what you should know about it; those
-    with a ! what looks wrong. Costs are those of the scenario, of a file
-    those of an empty one or of a preset.
+    --height-scale. The lines after the table state the processing steps of the file, and notes about it; those with
+    a ! look wrong. Costs are those of the scenario, of a file those of an empty one or of a preset.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
@@ -95,8 +93,8 @@ def info(
     height_scale        Metres per unit of height, where the file does not say it.
     fill                Fill voids from their surroundings instead of forbidding them.
     cover               A raster of land-cover codes on the same ground.
-    cover_codes         What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.
-    elevation_encoding  What stands for a height, where the file does not show it.
+    cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
+    elevation_encoding  Encoding of heights, where the file does not state it.
     """
     from shared_map.terrain.terrain import build_terrain
     from shared_map.terrain.terrain_report import doubts_about, facts_of
@@ -159,8 +157,7 @@ def cost(
     """Build the prior cost map of a scenario; write it and a picture of it.
 
     Cost is a pace in seconds per metre: 0.1 is 10 m/s. Lethal cells are never
-    entered. What looks wrong is corrected in the scenario: cost.max_slope_deg,
-    cost.class_factor, cost.zones, terrain.labels.
+    entered. Correct mistakes in the scenario: cost.max_slope_deg, cost.class_factor, cost.zones, terrain.labels.
 
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain cost mine.toml --out cost.tif
@@ -306,11 +303,11 @@ def reach(
     swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
 
     terrain  A terrain file, a scenario file or a built-in scenario.
-    to       Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
+    to       Destination: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
     start    Only where good ways from there lead: a corridor.
     slack    With --from: a way may take this share longer than the best.
     out      Write .tif: seconds, -1 where there is no way; .geojson, .gpkg, .kml or .csv: areas.
-    every_s  How far apart areas are, in seconds.
+    every_s  Distance between areas, in seconds.
     """
     from launch_scripts.commands import terrain_routes
 
@@ -437,12 +434,12 @@ def _shares(terrain: Terrain) -> str:
 # --- what slopes cost, as numbers over slope ---------------------------------------------------------------------
 
 SLOPES_PERCENT = (-30, -20, -10, -5, 0, 5, 10, 20, 30)
-"""Of the tables; downhill is negative."""
+"""Slopes of the tables; downhill is negative."""
 _SLOPES = [f"{slope:+d}" if slope else "0" for slope in SLOPES_PERCENT]
 
 
 class Curve(NamedTuple):
-    """What one rule or preset does to pace.
+    """Effect of one rule or preset on pace.
 
     unit     factor: pace over that of level ground; m/s: speed
     notes    sentences: what it is, where it comes from, its settings
@@ -487,7 +484,8 @@ def rules_of_all() -> Shown:
 
 
 def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
-    """What steps cost where `directional`; where not, what cells cost, and what steps would."""
+    """Returns the costs of steps with `directional`; without it, the costs of cells, and those that steps would
+    have."""
     cost, row = scenario.cost, SLOPE_RULES[scenario.cost.slope_rule]
     climb_deg, descent_deg = step_limits_deg(cost)
     limits = f"{cost.max_slope_deg:g} degrees of ground"
@@ -503,7 +501,7 @@ def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
 
 
 def _rules_fields(shown: Shown) -> dict[str, Any]:
-    """For programs. What is too steep has no value."""
+    """For programs. Slopes that are too steep have no value."""
     return {
         title: [
             {

@@ -108,7 +108,7 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     values = {"name": route.name, **route.facts()}
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
-    # A line has two points at least, also of somebody who is there already.
+    # A line has two points at least, even for a vehicle that is already there.
     whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values)
     line = Layer("route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], COSTS)
     if ending not in (".csv", ".gpkg"):
@@ -165,7 +165,7 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
     if found.status is not RouteStatus.OK:
         raise TerrainError(_why_not(found.status, terrain, first, last))
     cells = found.cells[:, 0] * grid.cols + found.cells[:, 1]
-    # What is left to drive tells what has been driven, by whichever rule the planner counts.
+    # The remaining cost gives the cost driven, by any rule of the planner.
     left_s = finder.cost_to_go_s().reshape(-1)[cells].astype(np.float64)
     return DescribedRoute(
         name=scenario.name,
@@ -240,12 +240,12 @@ def _why_not(status: RouteStatus, terrain: Terrain, first: int, last: int) -> st
 # --- from everywhere --------------------------------------------------------------------------------------------
 
 _MOST_BANDS = 200
-"""Most areas of a file: more cannot be told apart on a map."""
+"""Most areas of a file: more cannot be distinguished on a map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """What driving takes from each cell.
+    """Driving time from each cell.
 
     seconds    float32 (rows, cols), s; inf where there is no way. To the place; of a corridor, from one place
                to the other through the cell
@@ -258,7 +258,7 @@ class Reach:
 
     @property
     def share(self) -> float:
-        """Of all cells those from which there is a way."""
+        """Share of all cells from which a path exists."""
         return float(np.isfinite(self.seconds).mean())
 
     def quantiles_s(self) -> tuple[float, float]:
@@ -268,7 +268,8 @@ class Reach:
 
 
 def reach(source: str, place: str, preset: str | None = None) -> Reach:
-    """What driving to a place takes from everywhere. Raises TerrainError or ConfigError with one sentence."""
+    """Computes the driving time to a location from every cell. Raises TerrainError or ConfigError with one
+    sentence."""
     goal = read_place(place, "--to")
     scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)

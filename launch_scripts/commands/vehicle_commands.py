@@ -91,7 +91,7 @@ def remove(
             raise ConfigError(f"no agent {agent} takes part {where}; it has {', '.join(sorted(agents)) or 'none'}")
         asked.setdefault(agent, []).append(name)
     with _open(network, found[0].run_id) as bus:
-        # Who names the agent itself means all of its vehicles, which an empty list says.
+        # A request that names the agent itself means all of its vehicles, which an empty list expresses.
         said = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
     for one in said.values():
         if one.unknown:

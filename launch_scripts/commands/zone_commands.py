@@ -66,7 +66,7 @@ def add(
     layer          Which layer, of a file that has several.
     crs            Coordinate system, where the file names none: EPSG:32632, or local.
     kind           lethal, or pace:X for X seconds per metre.
-    until          How long it lasts: 90s, 10m, 2h. Until it is removed, if not given.
+    until          Duration: 90s, 10m, 2h. Until it is removed, if not given.
     name           Its name; an existing zone of that name is replaced.
     vehicle_class  For vehicles of this class of the scenario only.
     """
@@ -136,7 +136,7 @@ def list_zones(where: Where, as_json: AsJson = False) -> None:
 
 
 def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as_json: bool) -> int:
-    """Gives orders and prints who obeys; as JSON all at once. Returns 1 if somebody has not said so.
+    """Gives orders and prints who obeys; as JSON all at once. Returns 1 if a process has not replied.
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """

@@ -99,7 +99,8 @@ def _begun(
     end: datetime.datetime,
     extensions: Mapping[x509.ExtensionType, bool],
 ) -> x509.CertificateBuilder:
-    """A certificate to be signed. `extensions`: whether who does not know one has to refuse the certificate."""
+    """A certificate to be signed. `extensions`: whether software that does not know an extension has to refuse the
+    certificate."""
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -155,7 +156,7 @@ def ends_on(path: Path) -> datetime.date:
 
 
 def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
-    """Whether a certificate is of its folder's authority, goes with its key, has this common name and these
+    """Returns True if a certificate is of its folder's authority, matches its key, has this common name and these
     hosts at least, and a third of its time or more is left."""
     try:
         check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))

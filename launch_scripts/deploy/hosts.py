@@ -46,7 +46,7 @@ class HostConfig(Section, frozen=True, kw_only=True):
     roles: Annotated[tuple[HostRole, ...], Meta(min_length=1)] = HOST_ROLES
 
     def endpoint(self, port: int) -> str:
-        """Where its router is reached, over mutual TLS."""
+        """Endpoint of its router, over mutual TLS."""
         host = f"[{self.address}]" if ":" in self.address else self.address
         return f"tls/{host}:{port}"
 
@@ -66,7 +66,7 @@ class HostsConfig(Section, frozen=True, kw_only=True):
 
     @property
     def losses(self) -> int:
-        """`survive`, or what stands for it."""
+        """`survive`, or its default."""
         return min(1, len(self.hosts) - 1) if self.survive is None else self.survive
 
 
@@ -76,7 +76,7 @@ def load_hosts(path: Path) -> HostsConfig:
 
 
 def parse_hosts(text: str, source: str = "hosts") -> HostsConfig:
-    """As `load_hosts`, of a text."""
+    """Like `load_hosts`, from a text."""
     raw = parse_toml(text, source, ConfigError)
     try:
         config = msgspec.convert(raw, HostsConfig)
@@ -88,7 +88,7 @@ def parse_hosts(text: str, source: str = "hosts") -> HostsConfig:
 
 
 def _faults(config: HostsConfig) -> Iterator[str]:
-    """Where machines that are valid each do not fit together."""
+    """Returns contradictions between machines that are valid each."""
     for key, of in (("name", lambda host: host.name), ("address", lambda host: _plain(host.address))):
         found, times = Counter(map(of, config.hosts)).most_common(1)[0]
         if times > 1:
@@ -107,7 +107,7 @@ def _faults(config: HostsConfig) -> Iterator[str]:
 
 
 def _can_be_reached(address: str) -> bool:
-    """Whether it is one machine's address, or what can be a name of DNS: its last label is no number."""
+    """Returns True if it is one machine's address, or a possible name of DNS: its last label is not a number."""
     ip = _ip(address)
     if ip is None:
         labels = address.split(".")

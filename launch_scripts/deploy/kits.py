@@ -44,7 +44,7 @@ class _HostBefore(msgspec.Struct):
 
 
 class _Before(msgspec.Struct):
-    """What is read of an earlier plan."""
+    """Content of an earlier plan."""
 
     run_id: str = ""
     hosts: tuple[_HostBefore, ...] = ()
@@ -55,8 +55,8 @@ def write_kits(
 ) -> list[Path]:
     """An archive for each machine, `out/NAME.tar.gz`, which unpacks into `swarm-NAME/`. Returns the archives.
 
-    Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. What is there already
-    is kept while it is good, so that a second plan replaces no key that needs none. `launcher`: whether a launcher
+    Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. Existing files are
+    kept while they are valid, so that a second plan replaces no key without need. `launcher`: whether a launcher
     starts the processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be
     read or written.
     """
@@ -168,7 +168,7 @@ def _unwritable(path: Path, out: Path, error: OSError) -> StoreError:
 
 
 def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
-    """With what belongs to a file by its name, as .shp, .dbf and .prj."""
+    """Adds the files that belong to a file by name, as .shp, .dbf and .prj."""
     for place, source in files.items():
         yield place, source
         if place.startswith(f"{GROUND}/"):

@@ -32,7 +32,7 @@ LAUNCHER_CORES = 0.06
 _CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 """Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, in docs/scale-figures.md."""
 _CORES_PER_VEHICLE = 0.00066
-"""Of an agent; from the same table."""
+"""Cores of an agent; from the same table."""
 ROUTER, KEEPER, AGENT = "router", "keeper", "agent"
 
 
@@ -54,12 +54,12 @@ class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def name(self) -> str:
-        """As in logs: "planner-t3.r1"."""
+        """Name in logs: "planner-t3.r1"."""
         return f"{self.role}-{self.id}"
 
     @property
     def selector(self) -> str:
-        """What `swarm up --only` calls it: "planner.t3.r1"."""
+        """Name for `swarm up --only`: "planner.t3.r1"."""
         return f"{self.role}.{self.id}"
 
 
@@ -95,7 +95,7 @@ class PlannedHost(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
-    """Who runs where. All machines have one scenario but for its `[network]`.
+    """Assignment of processes to machines. All machines have one scenario but for its `[network]`.
 
     run_id    of the run that all take part in, so that a restart goes on with its store
     scenario  as it runs: with the standbys that the plan added, and all that routers admit
@@ -197,8 +197,8 @@ def place(
     """Host name -> its processes. Every role has machines enough.
 
     Each goes to the machine that is then the least loaded for its cores, of those that have none of the same job,
-    or of all where there is one. Roles that few machines carry come first, so that others leave them room; then
-    agents, so that the loss of a machine costs no more vehicles than its share.
+    or of all where there is one. Roles that few machines can carry are placed first, so that others leave them
+    room; then agents, so that the loss of a machine costs no more vehicles than its share.
 
     before  id of a keeper -> name of the machine that has its store
     """
@@ -275,7 +275,7 @@ def router_name(host: PlannedHost) -> str:
 
 
 def as_json(plan: Plan) -> dict[str, Any]:
-    """What `swarm deploy plan --json` prints, and what lies in every archive as plan.json."""
+    """Returns the output of `swarm deploy plan --json`, which is also plan.json in every archive."""
     return {
         "scenario": plan.scenario.name,
         "run_id": plan.run_id,
@@ -297,7 +297,7 @@ def ids_of(host: PlannedHost, role: str) -> Iterator[str]:
 
 
 def _follows(one: str, other: str) -> bool:
-    """Whether two ids differ by a number at their end, which is one higher: a7, a8."""
+    """Returns True if two ids differ by a number at their end, which is one higher: a7, a8."""
     stem = one.rstrip("0123456789")
     number = one[len(stem) :]
     return number.isdecimal() and other == f"{stem}{int(number) + 1}"

@@ -1,4 +1,4 @@
-"""How many machines a swarm needs, from a table of measured swarms (`measured_runs.toml`). Pure.
+"""Number of machines that a swarm needs, from a table of measured swarms (`measured_runs.toml`). Pure.
 
 Each figure of one process, such as the CPU of a planner, is interpolated between the measured runs: linear radial
 functions over the logarithms of vehicles, targets, agents, side of the map and tick rate (scipy's RBFInterpolator).
@@ -6,8 +6,8 @@ They meet every measured run, and go on as a power law beyond the largest. A mea
 table is foretold to within 7 to 17 % at the median, by figure.
 
 Agents and planners are placed in equal blocks; keeper, targets and monitor run on the first machine, whose launcher
-records. Every router is linked with every other one. A message crosses once to each machine on which somebody takes
-it, so what enters a machine is at most what its processes take, and at most what all others send.
+records. Every router is linked with every other one. A message crosses once to each machine with a subscriber, so
+the traffic into a machine is at most that of its processes, and at most that of all others.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ from launch_scripts.process_table import LAUNCHER, ROLES
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
-"""Of the cores and the memory of a machine, and of one core by a process: beyond it work waits (decision 58)."""
+"""Usable share of the cores and the memory of a machine, and of one core by a process: beyond it work waits
+(decision 58)."""
 LINK_SHARE = 0.5
-"""Of a link's capacity."""
+"""Usable share of a link's capacity."""
 OVERHEAD_BYTES = 100
-"""Of a message on a link: key, Zenoh's and TCP/IP's headers. Assumed, not measured."""
+"""Overhead of a message on a link: key, Zenoh's and TCP/IP's headers. Assumed, not measured."""
 MOST_MACHINES = 2000
 MOST_SESSIONS = 8192
 """`transport/unicast/max_sessions` of a router (swarm/bus/zenoh_config.py)."""
 CELLS_PER_VEHICLE = 262.144
-"""As the scenario `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
+"""Same density as in the scenario `thousand`: 512 x 512 cells for 1,000 vehicles."""
 
 _SINGLE = ("targets", "keeper", "monitor")
 """Roles of one process, all on the first machine."""
 _SPREAD = ("agent", "planner")
 """Roles whose processes are shared out over all machines."""
 _SMOOTHING = 0.1
-"""Of the interpolation: two runs of nearly one size differ by what else the machine did."""
+"""Smoothing of the interpolation: two runs of nearly one size differ by other load of the machine."""
 _FIGURES = ("cpu_ms_per_s", "memory_mb", "messages_in", "messages_out", "bytes_in", "bytes_out")
 _RUNS = Path(__file__).with_name("measured_runs.toml")
 
@@ -77,7 +78,7 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 class Needs(msgspec.Struct, frozen=True, kw_only=True):
-    """What a swarm takes on so many machines.
+    """Needs of a swarm on a number of machines.
 
     cpu_cores        role -> cores of all its processes, all machines together
     process          role -> share of a core that one process takes; of launchers the one that records
@@ -112,7 +113,7 @@ def measured_runs() -> list[Measured]:
 
 
 def reaches(swarm: Swarm) -> bool:
-    """Whether no side of a swarm is larger than in all measured runs."""
+    """Returns True if no dimension of a swarm is larger than in all measured runs."""
     sides = ("vehicles", "targets", "agents", "side")
     return all(getattr(swarm, side) <= max(getattr(run, side) for run in measured_runs()) for side in sides)
 
@@ -131,7 +132,7 @@ def one_process(swarm: Swarm) -> dict[str, dict[str, float]]:
 
 
 class Estimate:
-    """What the processes of one swarm take, asked of the table once for any number of machines."""
+    """Needs of the processes of one swarm, looked up once for any number of machines."""
 
     def __init__(self, swarm: Swarm, standbys: int = 0) -> None:
         self._swarm = swarm
@@ -142,7 +143,7 @@ class Estimate:
         self._memory_gb = {role: self._one["memory_mb"][role] / 1000 for role in self._count}
 
     def on(self, machines: int) -> Needs:
-        """What the swarm needs on so many machines."""
+        """Returns the needs of the swarm on a number of machines."""
         spread, count = 1 / machines, self._count
         cores = {role: self._cpu[role] * count[role] for role in count}
         shared = spread * (sum(cores[role] for role in _SPREAD) + cores["router"])
@@ -171,7 +172,7 @@ class Estimate:
         )
 
     def _enters(self, taken: Mapping[str, float], sent: Mapping[str, float], machines: int) -> tuple[float, float]:
-        """What enters each machine a second from all others, and the first."""
+        """Returns the traffic into each machine per second from all others, and into the first."""
         elsewhere = 1 - 1 / machines
         here = self._sum(taken, {role: self._count[role] / machines for role in _SPREAD})
         most = self._sum(sent, self._count) * elsewhere
@@ -185,7 +186,8 @@ class Estimate:
 
 
 def fewest_machines(estimate: Estimate, machine: Machine) -> Needs:
-    """The fewest machines of a kind that carry a swarm. Raises ConfigError if none do; it says what is full."""
+    """The fewest machines of a kind that carry a swarm. Raises ConfigError if none suffice; it names the full
+    resource."""
     machines = 1
     while machines <= MOST_MACHINES:
         found = estimate.on(machines)
@@ -197,7 +199,7 @@ def fewest_machines(estimate: Estimate, machine: Machine) -> Needs:
 
 
 def too_much(found: Needs, machine: Machine) -> list[str]:
-    """What is fuller than it may be, in sentences. No further machine mends those that begin with "one"."""
+    """Returns a sentence per resource beyond its limit. No further machine helps those that begin with "one"."""
     said = [
         f"one {role} process takes {share:.2f} of a core"
         for role, share in sorted(found.process.items(), key=lambda each: -each[1])
@@ -221,7 +223,7 @@ def _count(swarm: Swarm, role: str) -> int:
 
 
 def _place(swarm: Swarm) -> list[float]:
-    """Where a swarm lies among others: the logarithms of its size."""
+    """Returns the position of a swarm among others: the logarithms of its size."""
     return [math.log(getattr(swarm, name)) for name in Swarm.__struct_fields__]
 
 

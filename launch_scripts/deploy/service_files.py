@@ -1,9 +1,9 @@
-"""What starts the processes of a machine: a systemd service, or a compose file, from the templates beside it.
+"""Service files of a machine: a systemd service, or a compose file, from the templates beside it.
 
-systemd starts one launcher, which starts a crashed process again within a fraction of a second from a warm fork
-server, builds the terrain once for all, and ends roles in order; the unit limits all of it, and shuts the rest of
-the system off from it. In containers (compose-spec.io, which docker compose and podman-compose read) each process
-is a service of its own, which the engine starts again. zenohd, Eclipse's router, can stand for a router of ours.
+systemd starts one launcher, which restarts a crashed process within a fraction of a second from a warm fork server,
+builds the terrain once for all, and ends roles in order. The unit limits all of it, and separates it from the rest
+of the system. In containers (compose-spec.io, which docker compose and podman-compose read) each process is a
+service of its own, which the engine starts again. zenohd, Eclipse's router, can stand for a router of ours.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from swarm.wire.topics import MARKS
 
 UNIT, COMPOSE_FILE = "swarm.service", "compose.yaml"
 HEALTH_PORT = 9464
-"""Where a launcher, or a container, answers probes and Prometheus."""
+"""Port where a launcher, or a container, answers probes and Prometheus."""
 _LABEL = re.compile(r"[a-z0-9]+([.-][a-z0-9]+)*")
 _LONGEST_LABEL = 50
-"""A label has 63 characters at most (RFC 1123). The other 13 are left for what is added to it: Compose adds a
+"""A label has 63 characters at most (RFC 1123). The other 13 characters are left for suffixes: Compose adds a
 number, Kubernetes up to 11 characters."""
 _SCENARIO = "scenario.toml"
 
@@ -46,7 +46,7 @@ _SCENARIO = "scenario.toml"
 def _templates() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    # They make scripts and YAML, not HTML: what goes in is quoted where it is no checked name.
+    # They make scripts and YAML, not HTML: a value is quoted unless it is a checked name.
     loader = PackageLoader("launch_scripts.deploy")
     return Environment(loader=loader, undefined=StrictUndefined, keep_trailing_newline=True, autoescape=False)
 

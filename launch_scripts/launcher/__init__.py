@@ -1,6 +1,6 @@
-"""The processes of a run on this machine: start, watch, restart, stop, show. What `swarm demo` and `swarm up` do.
+"""The processes of a run on this machine: start, watch, restart, stop, show. Work of `swarm demo` and `swarm up`.
 
-What a launcher promises:
+Guarantees of a launcher:
 
 - All processes are forked by one server, which loads what they share once (`forkserver`, `preloaded`). It starts
   before the command itself is loaded, and kernels that no process has compiled yet are compiled beside it.
@@ -11,7 +11,7 @@ What a launcher promises:
   all of them within a second (`signals`). No process outlives its launcher, even where that is killed.
 - A launcher listens only (`watcher`): it is no member of the run, and its absence changes nothing. The one that
   starts the first keeper records and reports the run, all others look after their own processes.
-- What operators order while the swarm runs is followed by planners that come and go (`ordered_planners`).
+- Targets which operators add or remove while the swarm runs start and end planners (`ordered_planners`).
 - An upgrade takes a running part over (`takeover`): successors get ready beside it before it is asked to end.
 
 `up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console` and `terminal_tables`

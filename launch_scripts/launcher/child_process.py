@@ -26,15 +26,15 @@ CRASHED = 70
 """Exit code of a process that crashed by a bug."""
 
 _GRACE_S = 4.0
-"""Seconds from SIGTERM to the end of what does not stop by itself, as it hangs in its start: a second less than a
-launcher waits (`STOP_GRACE_S`)."""
+"""Seconds from SIGTERM to the end of a process that does not stop by itself, as it hangs in its start: a second
+less than a launcher waits (`STOP_GRACE_S`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExitReason:
     """The last word of a process: why it ended.
 
-    exit_code  0: as asked. It has left the swarm, and all that it keeps is written; what is left to do is the
+    exit_code  0: as asked. It has left the swarm, and all its files are written; the rest of its end is the
                operating system's
     refused    by a SwarmError, not a bug, so that a restart may not help
     """
@@ -46,7 +46,7 @@ class ExitReason:
 
 @dataclass(frozen=True, slots=True)
 class Reports:
-    """Where a process of the launcher tells what.
+    """Channels from a process to its launcher.
 
     log_path     its log
     log_format   of the log
@@ -61,7 +61,7 @@ class Reports:
 
 
 def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
-    """Runs a role until it is told to stop. Ends the process with the role's exit code."""
+    """Runs a role until it receives a stop signal. Ends the process with the role's exit code."""
     _redirect(reports.log_path, reports.log_format, setup)
     setup = replace(setup, health=Health(Board(reports.health)))
     pipe = reports.exit_reason
@@ -94,7 +94,7 @@ def load_entry(entry: str) -> Any:
 
 
 def wait_for_launcher() -> None:
-    """Blocks until the launcher is gone."""
+    """Blocks until the launcher has ended."""
     parent = multiprocessing.parent_process()
     if parent is None:
         threading.Event().wait()
@@ -103,8 +103,8 @@ def wait_for_launcher() -> None:
 
 
 def _run_until_launcher_ends(niceness: int) -> None:
-    """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on.
-    It does not before: all wait for whoever still starts."""
+    """Blocks until the launcher has ended. A role calls it once it is built, and gives way to others from then on.
+    It does not return earlier: all wait for any process that still starts."""
     import psutil  # the launcher, which imports this module too, needs none to start
 
     with contextlib.suppress(OSError):  # not every system lets a process choose

@@ -1,5 +1,5 @@
-"""What a command shows on the terminal while it runs: lines, one table that is drawn anew, progress, and at the end
-where what it left is to be seen.
+"""Terminal output of a running command: lines, one table that is redrawn, progress, and at the end the files left
+behind.
 
 Output outlives its reader: no run ends because a terminal is closed or `head` has enough.
 """
@@ -29,15 +29,15 @@ from launch_scripts.plain_text import plain
 log = logging.getLogger(__name__)
 
 Tell = Callable[[str, float], None]
-"""Called with what is done and the share of it that is."""
+"""Called with the current step and the share of it that is done."""
 _PATIENCE_S = 1.0
-"""What takes less is not told of."""
+"""Shorter work has no progress line."""
 _PLAIN_EVERY_S = 5.0
 _BUSY_EVERY_S = 0.2
 _TABLE_EVERY_S = 1.0
-"""What the table shows is made once a second (`Recorder.shown`)."""
+"""The table's content is made once a second (`Recorder.shown`)."""
 _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
-"""Of a pipe, and of a terminal."""
+"""Errors of a pipe, and of a terminal, without a reader."""
 
 _FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
 _LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
@@ -91,7 +91,8 @@ class Terminal:
         self.print(Text(plain(text), style=style or ""))
 
     def print(self, what: Any) -> None:
-        """Prints, if that is possible: a full disk ends no run. For a reader who has left see `OutlivingOutput`."""
+        """Prints, if that is possible: a full disk ends no run. See `OutlivingOutput` for a reader that has
+        left."""
         try:
             self._console.print(what, soft_wrap=True)  # whoever copies a line gets it whole
             self._console.file.flush()
@@ -99,7 +100,7 @@ class Terminal:
             log.warning("cannot write the output: %s", error.strerror or error)
 
     def busy(self, text: Callable[[], str] | str) -> contextlib.AbstractContextManager[None]:
-        """Shows what goes on in this block, and for how long, once it has taken a second."""
+        """Shows the current work in this block, and its time, once it has taken a second."""
         now = (lambda: text) if isinstance(text, str) else text
         return _busy_line(self._console, self.say, now, changes=self._table and self._live is None)
 
@@ -111,17 +112,17 @@ class Terminal:
             self.say(f"cannot write the output: {error.strerror or error}", "red")
 
     def due(self) -> bool:
-        """Whether it is time to show the next summary."""
+        """Returns True if the next summary is due."""
         return time.monotonic() >= self._due_s
 
     def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType]) -> None:
-        """Draws the table anew, or says the line where there is no table."""
+        """Redraws the table, or prints the line if there is no table."""
         self._due_s = time.monotonic() + (_TABLE_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
             self.say(line())
             return
         table = table_on(self._console)
-        with contextlib.suppress(OSError):  # of a terminal that is gone
+        with contextlib.suppress(OSError):  # of a closed terminal
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
                 self._live.start()
@@ -135,7 +136,7 @@ class Terminal:
 
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
-            if name in REPORTED and value != {}:  # of what nobody has learned there is no line
+            if name in REPORTED and value != {}:  # without learned factors there is no line
                 table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
         self.print(table)
 
@@ -165,11 +166,11 @@ def busy_loading(*, as_json: bool, plain: bool) -> contextlib.AbstractContextMan
 def _busy_line(
     console: Console, say: Callable[[str], None], text: Callable[[], str], *, changes: bool
 ) -> Iterator[None]:
-    """Tells on a thread what goes on beside it, as the one at work may be in native code for seconds. What takes
-    less than a second is not told of.
+    """Reports the current work from a thread, because the working thread may be in native code for seconds. Work of
+    less than a second is not reported.
 
     say      prints a line that stays
-    text     what goes on, with counts where there are any; the seconds are added here
+    text     current work, with counts if there are any; the seconds are added here
     changes  whether the terminal can show a line that changes; otherwise a line is said every 5 s
     """
     began_s = time.monotonic()
@@ -203,7 +204,7 @@ def _busy_line(
 
 @contextlib.contextmanager
 def progress() -> Iterator[Tell]:
-    """Yields what tells how far some work is, on a terminal only and after the first second."""
+    """Yields a function that reports progress, on a terminal only and after the first second."""
     console, now = Console(stderr=True), ["working"]
 
     def tell(what: str, share: float) -> None:
@@ -215,8 +216,8 @@ def progress() -> Iterator[Tell]:
 
 
 class OutlivingOutput:
-    """A text stream as it is, until its reader is gone: from then on what is written goes nowhere. Other errors, as
-    of a full disk, are raised as ever."""
+    """Wraps a text stream until its reader has closed it: from then on output is discarded. Other errors, as of a
+    full disk, are raised as ever."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -266,13 +267,13 @@ def _recordings(run_dir: Path) -> list[Path]:
 
 
 def _rerun_command() -> str:
-    """How to call rerun's viewer from where this command was called."""
+    """Returns the command line of rerun's viewer, from the caller's folder."""
     beside = Path(sys.executable).with_name("rerun")
     return "rerun" if shutil.which("rerun") or not beside.exists() else _shown(beside)
 
 
 def tunnel(port: int) -> str:
-    """How to reach a page of this machine from another one."""
+    """Returns the command for an SSH tunnel to a page of this machine."""
     return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
 
 

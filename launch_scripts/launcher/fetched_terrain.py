@@ -33,7 +33,7 @@ def missing_files(scenario: Scenario) -> list[str]:
 
 
 def find_members(scenario: Scenario) -> list[RunInfo]:
-    """Members of the run in the namespace, with routers; empty if nobody answers.
+    """Returns members of the run in the namespace, with routers; empty if no process replies.
 
     Waits for a router, and for a keeper if files of the terrain are missing here. Says once what it waits for.
     """

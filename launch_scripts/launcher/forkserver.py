@@ -39,8 +39,8 @@ def start_forkserver(loads: str | None) -> None:
     forkserver.set_forkserver_preload([] if loads is None else ["launch_scripts.launcher.preloaded"])
     # The tracker's start unblocks signals, so it comes first.
     resource_tracker.ensure_running()
-    # What is blocked here stays blocked in the server and in all that it forks: a Ctrl-C, which reaches the
-    # whole process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
+    # Signals blocked here stay blocked in the server and in all that it forks: a Ctrl-C, which reaches the whole
+    # process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
     os.environ[LOADS] = loads or ""
     try:
@@ -89,7 +89,8 @@ class WarmUp:
         self._thread.start()
 
     def done(self, timeout_s: float) -> bool:
-        """Whether processes may be started: all is loaded, and what a first route needs is compiled."""
+        """Returns True if processes may be started: all modules are loaded, and the kernels of a first route are
+        compiled."""
         done = self._ready.wait(timeout_s)
         if self._failure is not None:
             raise self._failure
@@ -97,7 +98,7 @@ class WarmUp:
 
     @property
     def progress(self) -> str:
-        """How far it is."""
+        """Returns the progress."""
         if not self._all:
             return "loading kernels"
         first = f" ({len(self._first)} to go before the first route)" if self._first else ""
@@ -118,7 +119,7 @@ class WarmUp:
         self._ready.set()
 
     def _build(self) -> None:
-        """The first builder answers once the forkserver has loaded everything, and tells what is missing."""
+        """The first builder replies once the forkserver has loaded everything, and names the missing kernels."""
         pipes = [self._builder(tells=True)]
         first, others = pipes[0].recv()
         self._first, self._left = set(first), {*first, *others}
@@ -151,7 +152,7 @@ class WarmUp:
 
 
 def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
-    """Compile what is missing, together with the other builders, and tell the name of each kernel.
+    """Compiles missing kernels, together with the other builders, and reports the name of each.
 
     tells  at first which are missing: those for a first route, and the others. Without a scenario there are none
     """
@@ -172,7 +173,7 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
 
 
 def _say(tell: Connection, what: object) -> None:
-    """Tell the launcher. One that has refused its scenario meanwhile hears nothing, and whoever started it must
+    """Tell the launcher. A launcher that has refused its scenario meanwhile has closed the pipe, and its user must
     read no traceback of that."""
     with contextlib.suppress(OSError):
         tell.send(what)

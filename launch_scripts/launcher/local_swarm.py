@@ -32,20 +32,20 @@ log = logging.getLogger(__name__)
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SETTLED_S = 10.0
-"""After a run of so many seconds the wait starts at its shortest again."""
+"""After a run of this length (s) the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
 FORCED_GRACE_S = 1.0
 """For all that still run, at once, when the end is asked for a second time."""
 REFUSALS_ALLOWED = 5
-"""So many refusals within `REFUSALS_WITHIN_S` are taken for final."""
+"""This number of refusals within `REFUSALS_WITHIN_S` is final."""
 REFUSALS_WITHIN_S = 60.0
 FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
 
 
 STILL_S = 60.0
-"""A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes are
-told: a machine that is far too busy is not helped by starts."""
+"""A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes fail:
+restarts do not help an overloaded machine."""
 LOOK_EVERY_S = 1.0
 """A sixtieth of `STILL_S`, so what hangs is found in time; the launcher's loop turns ten to twenty times as
 often."""
@@ -89,7 +89,7 @@ class Running:
     process: ForkServerProcess | None = None
     pipe: Connection | None = None
     last_word: ExitReason | None = None
-    """What this life has said at its end; None while it has not."""
+    """Last message of this life; None while it has none."""
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
@@ -97,9 +97,9 @@ class Running:
     """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
     begins_when: Callable[[], bool] | None = None
-    """What its first start waits for; None once it has been started, or where it waits for nothing."""
+    """Condition of its first start; None once it has been started, or without a condition."""
     takes_over: bool = False
-    """Whether its first start is beside a life that still runs here."""
+    """True if its first start is beside a life that still runs here."""
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
@@ -115,13 +115,13 @@ class Running:
 
     @property
     def ended_as_asked(self) -> bool:
-        """Whether this life has said so: nothing of it can be lost any more, however it leaves."""
+        """True if this life has reported its end: none of its data can be lost any more, however it leaves."""
         word = self.hear_last_word()
         return word is not None and word.exit_code == 0
 
     @property
     def exitcode(self) -> int | None:
-        """That of a process which has ended; None as long as it runs, or if there is none."""
+        """Exit code of an ended process; None as long as it runs, or if there is none."""
         return None if self.process is None else self.process.exitcode
 
     def kill(self) -> None:
@@ -136,7 +136,7 @@ class Running:
                 os.kill(self.process.pid, number)
 
     def state(self) -> str:
-        """What it does, as far as the kernel says."""
+        """State of the process, according to the kernel."""
         import psutil
 
         with contextlib.suppress(psutil.Error):
@@ -151,7 +151,7 @@ class Running:
         return self.last_word
 
     def seen(self) -> Process:
-        """How it is. Called by any thread."""
+        """Returns its condition. Called by any thread."""
         if self.process is None or self.health is None:
             again = self.due_s is not None
             return Process(
@@ -198,7 +198,7 @@ class LocalSwarm:
         return counts
 
     def seen(self) -> list[Process]:
-        """How each process is. Called by any thread: it waits for nothing."""
+        """Returns the condition of each process. Called by any thread: it waits for nothing."""
         return [running.seen() for running in list(self.running)]
 
     def start(self, role: str | None = None) -> None:
@@ -293,11 +293,11 @@ class LocalSwarm:
         that did not end as asked.
 
         One that has said that it ended is waited for no longer: it takes as long to leave as the machine is busy or
-        its disk stalls, and has nothing to do any more. It is given `STOP_GRACE_S` after all others, and its end is
-        nobody's failure.
+        its disk stalls, and has nothing to do any more. It gets `STOP_GRACE_S` after all others, and its end is no
+        failure.
 
-        Once `force` says so, all are asked at once and get `FORCED_GRACE_S`. What is killed then is in `cut_short`,
-        and nobody's failure.
+        Once `force` says so, all are asked at once and get `FORCED_GRACE_S`. A process killed then is in
+        `cut_short`, and is no failure.
         """
         for running in self.running:
             running.due_s = running.begins_when = None
@@ -368,16 +368,16 @@ class LocalSwarm:
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
 
     def _is_final(self, running: Running, exit_code: int, ran_s: float, now_s: float) -> bool:
-        """Whether a process that refused to run now would do so again. A refused first start is; a later one may be
-        the network's, so it takes several in a short time. A disk that was written to once is full and will have
-        space again."""
+        """Returns True if a process that refused to run now would do so again. A refused first start is; a later
+        one may be the network's, so it takes several in a short time. A disk that was written to once is full and
+        will have space again."""
         running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
         first = running.restarts == 0 and ran_s < SETTLED_S
         return first or (exit_code != StoreError.exit_code and len(running.refused_s) >= REFUSALS_ALLOWED)
 
     def _exit_reason(self, running: Running, code: int) -> ExitReason:
         if code == 255:
-            # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
+            # The forkserver has ended and reports no more ends: kill, because two processes of one id must not run.
             running.send(signal.SIGKILL)
         if (reason := running.hear_last_word()) is not None and reason.exit_code:
             return reason
@@ -391,7 +391,8 @@ class LocalSwarm:
         return ExitReason(how, 1)
 
     def _failure(self, running: Running, force: bool) -> str | None:
-        """What kept a process that was asked to end from doing so, in words; it is forgotten if it has ended."""
+        """Returns the reason why a process that was asked to end has not done so, in words; it is forgotten if it
+        has ended."""
         code, said = running.exitcode, None
         if running.ended_as_asked or (code is None and force):
             return None

@@ -18,7 +18,7 @@ LogFormat = Literal["text", "json"]
 LOG_FORMATS: tuple[LogFormat, ...] = ("text", "json")
 
 MAX_BYTES = 16 << 20
-"""A log that is longer is renamed to NAME.1, in the place of the one before, and begun anew."""
+"""A longer log is renamed to NAME.1, in the place of the previous one, and begun again."""
 
 
 _Raised = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
@@ -43,7 +43,7 @@ FORMAT = _Format("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
 class Speaker(NamedTuple):
-    """Who writes a log."""
+    """Author of a log."""
 
     role: str
     id: str
@@ -76,7 +76,7 @@ class JsonLines(logging.Formatter):
 
 
 class LogFile(RotatingFileHandler):
-    """Appends to a file, which is opened at the first line. Lines that cannot be written are counted, and told
+    """Appends to a file, which is opened at the first line. Lines that cannot be written are counted, and reported
     when there is space again.
 
     takes_output  standard output and error of this process, that of native libraries included, go to the file too

@@ -1,4 +1,4 @@
-"""What a run is started with: a scenario by name, options of the command line, which processes, in which folder."""
+"""Options of a run: a scenario by name, options of the command line, processes, folder."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def new_run_id() -> str:
 
 _HIGHEST = 1 << 61
 _DIGITS = 20
-"""Of the number in a file of incarnations, which is always as long."""
+"""Width of the number in a file of incarnations, which never changes."""
 _LATER_KEYS = (("map", "plot_regions"),)
 """Sections and keys that the version before does not know: at their default they change no id, so that parts of
 both versions agree on one."""
@@ -201,9 +201,9 @@ def common_run_id(scenario: Scenario) -> str:
 
 
 def make_run_dir(runs: Path, run_id: str) -> Path:
-    """The folder of a run on this machine: what belongs to the run, such as a keeper's store, is found there again
-    when its processes are started anew. Raises ConfigError on an id that no folder may have, StoreError where the
-    folder cannot be made."""
+    """Returns the folder of a run on this machine: files of the run, such as a keeper's store, are found there when
+    its processes restart. Raises ConfigError on an id that no folder may have, StoreError where the folder cannot
+    be made."""
     try:
         check_id("run id", run_id)
     except ValueError as error:
@@ -223,7 +223,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
     """The incarnation of a process that starts now: nanoseconds since 1970, and in any case higher than that of
     every earlier start in this run's folder. Raises StoreError if the folder cannot be written.
 
-    So a restart is the later one although the clock was put back meanwhile.
+    A restart is therefore the later one even if the clock was set back meanwhile.
     """
     path = run_dir / "lives" / f"{role}-{id}"
     try:
@@ -235,7 +235,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
             with contextlib.suppress(ValueError):  # cut short by a full disk
                 last = min(int(os.pread(file, _DIGITS, 0) or b"0"), _HIGHEST)
             incarnation = max(time.time_ns(), last + 1)
-            # In place and always as long: so a full disk keeps nobody from a second one.
+            # Fixed-length write in place, so that a restart works on a full disk.
             if os.pwrite(file, b"%0*d" % (_DIGITS, incarnation), 0) != _DIGITS:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(file)
@@ -282,22 +282,22 @@ class UpOptions:
 
     @property
     def is_new(self) -> bool:
-        """Whether the run begins here, with all of its processes."""
+        """True if the run begins here, with all of its processes."""
         return not self.joins and self.is_whole and self.run_id is None and not self.takes_over
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing but a router may be lacking."""
+        """True if only a router may be missing."""
         return set(processes_of(self.scenario, ROLES[1:])) <= set(self.table)
 
     @property
     def records(self) -> bool:
-        """Whether this launcher, alone of all of the run, records and reports it."""
+        """True if this launcher is the one of the run that records and reports it."""
         return any(spec.name == RECORDED_BESIDE for spec in self.table)
 
     @property
     def asks_for_ground(self) -> bool:
-        """Whether files of the terrain may be missing here, as a keeper elsewhere hands the base map out."""
+        """True if files of the terrain may be missing here, as a keeper elsewhere serves the base map."""
         return self.joins or not (self.is_whole or "keeper" in self.roles)
 
     @property

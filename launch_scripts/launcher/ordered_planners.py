@@ -21,7 +21,7 @@ LEAVES_TO_OTHERS_S = 3.0
 
 
 class OrderedPlanners:
-    """Brings the planners on this machine to what is ordered.
+    """Starts and ends planners on this machine according to orders.
 
     ranks  which of an added target's planners to start here
     own    processes that this launcher started: of the scenario's own targets it sees to their planners only
@@ -49,7 +49,7 @@ class OrderedPlanners:
         self._refused: set[str] = set()
 
     def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
-        """Start what is missing, and end what is not wanted any more.
+        """Starts missing planners, and ends unwanted ones.
 
         alive  (role, id) of the processes that are up, anywhere
         """

@@ -1,7 +1,7 @@
 """Loads, on import, what the processes of a run share: the forkserver imports this module before it forks, so each
 role starts at once.
 
-Loading is paid once for all processes instead of once for each. Where planners are to run, the planner and its
+Loading is paid once for all processes instead of once for each. On machines with planners, the planner and its
 kernels are loaded too. Kernels that are not compiled yet are left to `WarmUp`, unless there is no folder to keep
 them in: then they are compiled here.
 """
@@ -24,7 +24,7 @@ MODULES = (
     "vehicle_agent.main",
     "launch_scripts.simulation.world.main",
     "launch_scripts.monitor.main",
-    # What these import as they run, each for itself otherwise.
+    # Modules which these import at run time, each for itself otherwise.
     "encodings.idna",
     "numpy.ma",
     "psutil",

@@ -1,7 +1,8 @@
 """The router: a Zenoh session in router mode that passes on all messages.
 
-Zenoh reads access control when a session opens, and closes no single link. So when a name is revoked, the router
-opens its session anew: all links end, and whoever is admitted is back within half a second, as after a restart.
+Zenoh reads access control when a session opens, and closes no single link. When a name is revoked, the router
+therefore reopens its session: all links end, and every admitted process is back within half a second, as after a
+restart.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class RouterService:
 
 
 class Admission:
-    """The router's session, opened anew whenever the names that are revoked change."""
+    """The router's session, reopened whenever the list of revoked names changes."""
 
     def __init__(self, network: NetworkConfig) -> None:
         self._network = network
@@ -90,7 +91,7 @@ class Admission:
         self.bus = open_bus(self._admitting, mode="router")
 
     def reopened(self) -> ZenohBus | None:
-        """The new session, if one was opened. Where the names cannot be read, those before stay in force."""
+        """The new session, if one was opened. If the list cannot be read, the previous one stays in force."""
         try:
             admitting = with_revocations(self._network)
         except SwarmError as error:

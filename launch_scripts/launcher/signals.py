@@ -25,7 +25,7 @@ T = TypeVar("T")
 SAME_S = 0.3
 """Signals so close together are one: wrappers and shells send a Ctrl-C on, which the terminal sends to all."""
 _TURNS_HZ = 2.0
-"""How often a launcher turns, at least."""
+"""Lowest rate of a launcher's turns."""
 _NAME = "launcher"
 
 
@@ -38,10 +38,10 @@ class StopAsked:
         self.number: signal.Signals | None = None
         """The first signal; None as long as none has come."""
         self._times = 0
-        """How often the end was asked for by SIGINT or SIGTERM, and when last."""
+        """Number of SIGINT or SIGTERM, and the time of the last."""
         self._last_s = -math.inf
         self._leaves: Callable[[], bool] = lambda: False
-        """Whether a signal leaves what is being done."""
+        """True if a signal interrupts the current work."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, self._asked)
@@ -59,12 +59,12 @@ class StopAsked:
         return self.number is not None
 
     def force(self) -> bool:
-        """Whether the end is asked for a second time."""
+        """True if there was a second stop signal."""
         return self._times > 1
 
     @property
     def exit_code(self) -> int:
-        """Of a run that a signal cut short, as shells have it: 128 and the signal's number."""
+        """Exit code of a run that a signal ended, as shells have it: 128 and the signal's number."""
         return 128 + (self.number or 0)
 
     def interruptible(self, work: Callable[[], T]) -> T | None:
@@ -73,8 +73,7 @@ class StopAsked:
         return self._until(work, self.__bool__)
 
     def interruptible_once_more(self, work: Callable[[], T]) -> T | None:
-        """The same, but what has been asked before is done with: only a further SIGINT or SIGTERM leaves this work,
-        and none that is the first."""
+        """Same, but without earlier signals: only a further SIGINT or SIGTERM interrupts this work."""
         most = max(self._times, 1)
         return self._until(work, lambda: self._times > most)
 
@@ -101,7 +100,7 @@ class MachineSignals:
         self._health.starts("the start of its processes")
         self._health.begins(_TURNS_HZ)
         self.url = ""
-        """Of the figures; empty without a port, and before it is opened."""
+        """URL of the metrics; empty without a port, and before it is opened."""
         self._port, self._address = options.metrics_port, options.signals_address
         self._seen = seen
         self._metrics: MetricsEndpoint | None = None
@@ -124,9 +123,9 @@ class MachineSignals:
         missing: Sequence[str],
         up: Collection[tuple[str, str]] | None = None,
     ) -> None:
-        """The launcher has turned: tells so, and answers who has asked for figures since the last time.
+        """Notes a turn of the launcher, and answers scrapes that came since the last one.
 
-        missing  names of processes that it has started and nobody has heard yet
+        missing  names of processes that it has started and that no process has received yet
         up       (role, id) of the processes that live, where these are a part of the run; None: all of the run is
                  observed, so the figures name it
         """

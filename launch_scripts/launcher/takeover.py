@@ -1,8 +1,8 @@
 """Takes a run's part on this machine over from the launcher that runs it, of this version or the one before.
 
-All that takes long happens beside the predecessor: terrain, kernels, planners with their trees, agents up to their
-promises. Then the predecessor is asked to end, and each process of its roles is followed by its successor as soon
-as the operating system says that it has ended. The predecessor knows nothing of this: SIGTERM ends it in order.
+Slow steps run beside the predecessor: terrain, kernels, planners with their trees, agents up to their promises.
+Then the predecessor is asked to end, and each process of its roles is followed by its successor as soon as the
+operating system says that it has ended. The predecessor knows nothing of this: SIGTERM ends it in order.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PATIENCE_S = 60.0
 
 
 class TakeOver:
-    """What is waited for and what is done, turn by turn. Raises ConfigError where there is nobody to follow.
+    """Takeover from an earlier launcher, turn by turn. Raises ConfigError if there is none to follow.
 
     running  the processes that are started here; those whose predecessors have to end before begin then
     targets  of the scenario: planners of others were ordered, and are ordered again
@@ -54,7 +54,7 @@ class TakeOver:
         self._planners_ready = False
         """Once they are, agents begin beside theirs."""
         self._asked = False
-        """Whether the predecessor has been asked to end."""
+        """True if the predecessor has been asked to end."""
         for each in running:
             if TABLE[each.spec.role].takes_over == "beside":
                 continue
@@ -66,11 +66,11 @@ class TakeOver:
 
     @property
     def done(self) -> bool:
-        """Whether all of this machine's part has been taken over."""
+        """True if all of this machine's part has been taken over."""
         return self._asked and all(running.alive for running in self._running)
 
     def advance(self, now_s: float) -> None:
-        """Do what has become possible. `now_s`: of a clock that only goes on."""
+        """Performs all steps that have become possible. `now_s`: of a clock that only goes on."""
         if self._asked:
             return
         if has_ended(self._launcher):
@@ -95,35 +95,35 @@ class TakeOver:
         self._look_again()
 
     def _look_again(self) -> None:
-        """See who is to be followed: one that has crashed meanwhile runs in a new life, or comes no more."""
+        """Updates the process to follow: one that has crashed meanwhile runs in a new life, or comes no more."""
         own = [each.process.pid for each in self._running if each.process is not None]
         self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
 
     def _is_free(self, name: str) -> bool:
-        """Whether nobody holds what a process needs for itself. The launcher before starts a life that has crashed
-        again until it ends, so the end of a life before that says nothing."""
+        """Returns True if the exclusive resources of a process are free. The launcher before starts a life that has
+        crashed again until it ends, so the end of a life before that says nothing."""
         return self._asked and has_ended(self.predecessors.get(name, self._launcher))
 
 
 def _lacks(running: Running) -> tuple[str, ...] | None:
-    """What a process lacks to do its job, by its own word; None where it has not said anything."""
+    """Returns the missing needs of a process, by its own report; None if it has not reported."""
     vitals = running.seen().vitals
     return None if vitals is None else vitals.lacks
 
 
 def _plans(running: Running) -> bool:
-    """Whether a process can answer, if it is a planner."""
+    """Returns True if a process can reply, if it is a planner."""
     return TABLE[running.spec.role].takes_over != "beside" or _lacks(running) == ()
 
 
 def _waits(running: Running) -> bool:
-    """Whether a process has come as far as the file of its promises, if it is an agent that follows another; or
-    further, where the life before it has crashed."""
+    """Returns True if a process has come as far as the file of its promises, if it is an agent that follows
+    another; or further, if the life before it has crashed."""
     return not running.takes_over or _lacks(running) in ((LIFE_BEFORE,), ())
 
 
 def _was_ordered(name: str, targets: Collection[str]) -> bool:
-    """Whether a process is the planner of a target that an operator has added."""
+    """Returns True if a process is the planner of a target that an operator has added."""
     role, _, id = name.partition("-")
     return role == "planner" and job_of(id) not in targets
 
@@ -158,7 +158,7 @@ def writing(file: Path) -> list[int]:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a process is gone, or dead and not yet reaped."""
+    """Returns True if a process has ended, or is dead and not yet reaped."""
     import psutil
 
     try:
@@ -172,6 +172,6 @@ def _writes() -> Iterator[tuple[int, Path]]:
     import psutil
 
     for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, OSError):  # ended meanwhile, or somebody else's
+        with contextlib.suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
             for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
                 yield process.pid, Path(path)

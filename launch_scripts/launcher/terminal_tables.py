@@ -33,7 +33,7 @@ def live_table(state: RunState, title: str, console: Console) -> Group:
 
 
 def fitted(state: RunState, above: list[RenderableType], console: Console) -> Group:
-    """What is to be seen in any case, and below it as many targets as the console has lines for."""
+    """Fits the lines to the console: the fixed lines, and below them as many targets as there is room for."""
     options = console.options.update(no_wrap=False, overflow="fold")
     used = len(console.render_lines(Group(*above), options, pad=False))
     targets = targets_table(state, max(console.height - used - 3, _FEWEST_TARGETS))

@@ -128,7 +128,7 @@ class _Run:
         """When the run began that this is a part of; None if it begins here."""
         self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
-        """What operators have ordered, once somebody watches the swarm."""
+        """Orders in force, once the swarm is watched."""
         lines = JsonLines(Speaker(LAUNCHER, "0", run_id)) if options.log_format == "json" else None
         self._terminal = Terminal(options.as_json, options.plain, lines)
         self._stop_asked = StopAsked()
@@ -136,10 +136,10 @@ class _Run:
         self._swarm = LocalSwarm(options.table, self._setup_of, run_dir, options.log_format)
         self._disk = DiskWatch(run_dir)
         self.begun = False
-        """Whether all that can be refused before a process starts has been accepted."""
+        """True if everything that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
         self._routed = False
-        """Whether a route was served."""
+        """True if a route was served."""
         self._up_at_s: float | None = None
         """When the swarm was whole, on the run's clock."""
         self._web_port = 0
@@ -334,7 +334,7 @@ class _Run:
 
     @property
     def _all_external(self) -> bool:
-        """Whether no route is served before a tracker from outside tells where its target is."""
+        """Returns True if no route is served before an external tracker publishes its target."""
         return not any(target.is_simulated for target in self._scenario.targets)
 
     def _missing(self, watcher: Watcher) -> list[str]:
@@ -368,7 +368,7 @@ class _Run:
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
     def _title(self, up: str, elapsed_s: float) -> str:
-        """How far the run is, on its own clock, which everybody shows: start-up counts, its time is added."""
+        """Returns the run time (s), start-up included. All displays show this value."""
         if self._up_at_s is None:
             return f"{self._scenario.name}: starting, {up} processes are up, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
@@ -445,6 +445,6 @@ class _Run:
             self._terminal.print_json(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
-        # The figures come first: a full disk keeps nobody from them.
+        # Results are written first, so that a full disk does not prevent them.
         write_report(self._run_dir, report, known, self._terrain, truth=self._truth)
         return True

@@ -1,4 +1,4 @@
-"""What a launcher hears of the swarm: all of it if it records the run, else its own processes."""
+"""A launcher's view of the swarm: all of it if it records the run, else its own processes."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, STATS, STATUS
 
 _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
-"""What a launcher hears of all processes where another records the run: routes until one is served."""
+"""Topics of all processes that a launcher receives if another one records the run: routes until one is served."""
 _READ_S = 0.1
 """Longest time for which the launcher reads at once: it has processes to look after."""
 
 
 _OTHER_LINES = 4
-"""Of the table: title, empty line, labels, and the line of the prompt."""
+"""Other lines of the table: title, empty line, labels, and the line of the prompt."""
 
 
 class OwnPart(LatestState):
@@ -63,21 +63,21 @@ class OwnPart(LatestState):
 
     @property
     def well(self) -> str:
-        """How many are alive, in words."""
+        """Returns the number of living processes, in words."""
         return f"{len(self.own_up())} of {len(self.own)}"
 
     def own_loads(self) -> list[ProcessLoad]:
-        """What they take up, each that has told anything."""
+        """Returns the load of each process that has published any."""
         own = {spec.name for spec in self.own}
         return [line for line in self.loads.lines(self.own_up()) if line.name in own]
 
     def own_alarms(self, now_ns: int) -> list[str]:
-        """What goes wrong with them or is told by them, in lines for people."""
+        """Returns their alarms, in lines for people."""
         alarms = alarms_of(self, self.plan.targets, now_ns)
         return lines_of([alarm for alarm in alarms if alarm.lasts], self.grid, SHOWN_ALARMS)
 
     def report(self, *, run_id: str, seconds: float, startup_s: float | None) -> dict[str, Any]:
-        """For programs: these processes, and that all else is told by another launcher."""
+        """Returns for programs: these processes, and a note that another launcher reports all others."""
         return {
             "run_id": run_id,
             "recorded": False,
@@ -103,14 +103,15 @@ class OwnPart(LatestState):
 class Watcher(RunObserver):
     """Listens only. It is no member of the run, so that its absence changes nothing.
 
-    known  what is kept of it. An `OwnPart` is told of the processes in `look_after`, of orders, and of who is there
+    known  the store of received messages. An `OwnPart` receives messages of the processes in `look_after`, orders,
+           and tokens
     """
 
     def __init__(self, bus: Bus, known: Recorder | OwnPart, clock: Clock) -> None:
         self.known = known
         self.notes: list[Note] = []
         self.web_port = 0
-        """Where the live view's page is; 0 until that is known."""
+        """Port of the live view's page; 0 until it is known."""
         self.routes_served = False
         self._clock = clock
         self._inbox = Inbox()
@@ -147,7 +148,7 @@ class Watcher(RunObserver):
                 return
 
     def finish(self) -> None:
-        """Takes in what has arrived and was not due yet: nobody speaks any more."""
+        """Takes messages that have arrived and were not due yet: no further ones come."""
         for heard in self.due(self.now_ns(), all=True):
             self.take(heard, self.now_ns())
 

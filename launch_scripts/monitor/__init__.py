@@ -1,11 +1,10 @@
-"""The live view: records a run, and shows it to whoever looks.
+"""The live view: records a run, and shows it to connected viewers.
 
 - `main`: the process; `service` hears the swarm and draws it frame by frame, ten a second for those who look, else
-  five (decision 102). It asks nothing but costs of planners, and nobody waits for it.
+  five (decision 102). It queries nothing but costs of planners, and no process waits for it.
 - `ground` lies still: the terrain, its layers with their legends, zones.
 - `movers` moves: vehicles, targets, bodies, their routes and trails, beliefs, alarms.
-- `live_layout` has the layers, their legends, and what stands beside: plots, a summary, a log.
-- `view_outputs` has the pen which logs what differs from what was logged last, and where that goes: a file
-`run.rrd`, a
-  port for native viewers, a page. If the file ends for want of space, another is begun once there is some.
+- `live_layout` has the layers, their legends, and the panels beside: plots, a summary, a log.
+- `view_outputs` has the pen, which logs differences only, and its destinations: a file `run.rrd`, a port for native
+  viewers, a page. If the file ends for want of space, another is begun once there is some.
 """

@@ -1,5 +1,4 @@
-"""What the view looks like: the layers between which a person switches, their legends, the figures beside them, and
-where all of it stands.
+"""Layout of the view: the layers between which a person switches, their legends, and the metrics beside them.
 
 A layer is a tab with the same swarm on other ground. A legend is a picture, as a text panel of the viewer can show
 neither colours nor pictures.
@@ -39,7 +38,7 @@ _ROWS = ((4, 25), (5, 21))
 _SIZE_PX, _SWATCH_PX, _TEXT_PX, _GAP_PX = 20, (40, 18), 52, 30
 _LEFT_PX, _SCALE_PX = 14, 420
 _FINE = 4
-"""Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
+"""Factor by which shapes are drawn larger before they are scaled down, so that their edges are smooth."""
 ZONE_COLOURS: dict[str, Colour] = {
     "no-go": colours.NO_GO,
     "slow": colours.SLOW_MARK,

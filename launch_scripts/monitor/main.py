@@ -19,7 +19,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 
 FRAME_HZ = 10.0
-"""How often the view is drawn for those who look."""
+"""Frame rate for viewers."""
 _TAG = "view"
 _Make = Callable[[Member], Service]
 
@@ -50,7 +50,7 @@ class LoadingMonitor:
     the start of any other process. It is a member of its run already: it is alive, answers, and may be ended.
 
     member  joins when this starts, and is handed on
-    load    called on a thread; returns what makes the service. What it raises ends the process
+    load    called on a thread; returns what makes the service. Its exceptions end the process
     """
 
     def __init__(self, member: Member, post: Post, load: Callable[[], _Make]) -> None:
@@ -88,7 +88,7 @@ class LoadingMonitor:
             self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """A run that ends before the view is loaded has none, and no recording: nobody waits for it."""
+        """A run that ends before the view is loaded has none, and no recording: its end waits for neither."""
         if self._service is not None:
             self._service.stop(now_ns)
         else:

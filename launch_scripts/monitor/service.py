@@ -50,26 +50,26 @@ log = logging.getLogger(__name__)
 _READ: dict[Topic, float] = {
     **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5
 }  # fmt: skip
-"""What is shown, and how often the newest of each key is taken; 0 for each frame. Marks come by way of the map's
-sync."""
+"""Topics on show, and the interval at which the newest of each key is taken; 0 for each frame. Marks come by way of
+the map's sync."""
 _ROUTES_SEEN_S = 0.5
 """For those who look routes are taken so often."""
 _UNSEEN = 2
-"""While nobody looks each frame but the second is left out: what is drawn is for the recording only."""
+"""Without viewers every second frame is left out: frames are drawn for the recording only."""
 _EVERY_S = {"anew": 10.0, "figures": 1.0}
-"""How often for viewers that come what is drawn on change only is drawn anew at most, and figures are drawn."""
+"""Shortest interval of complete redraws for new viewers, and the interval of metrics."""
 _ANSWER_S = 5.0
-"""Longest wait for a planner's costs. A planner answers within 1 s, or says that it has no tree; what is more is
+"""Longest wait for a planner's costs. A planner replies within 1 s, or states that it has no tree; the remainder is
 for a busy machine."""
 
 
 class MonitorService:
     """Shows a run on a recording stream.
 
-    scene      what it is drawn on, and what is known of the run beforehand
+    scene      terrain and other inputs that are known beforehand
     web_port   port of the live view's page on this machine; 0: it has none
     recording  watches the file of the recording, if there is one
-    audience   who looks at the stream; somebody always does if this is not given
+    audience   viewers of the stream; if not given, there is always one
     member     one that has joined already; None: one that joins when the service starts
     """
 
@@ -105,7 +105,7 @@ class MonitorService:
         self._observer = RunObserver(bus, post, self.figures, _READ)
         self._watched = False
         self._drawn_for = 0
-        """So many viewers had ever come when all was drawn anew last."""
+        """Number of viewers that had ever connected at the last complete redraw."""
         self._limit = RateLimit(_EVERY_S)
         self._turn = self._frame = 0
         """Ticks so far, and those in which something was drawn."""
@@ -123,7 +123,7 @@ class MonitorService:
             self._member.join()
         self._observer.keep_samples()
         self._observer.ask_gone()
-        self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
+        self.figures.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
         self._sync.start(now_ns)
         self._pen.set_time(0, 0.0)
         self._begin_drawing()
@@ -143,7 +143,7 @@ class MonitorService:
                 self._hear(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Takes in what has come and draws one frame, if one is due."""
+        """Processes received messages and draws one frame, if one is due."""
         self._member.tick(now_ns)
         self._turn += 1
         audience = self._audience()
@@ -240,7 +240,7 @@ class MonitorService:
 def load_view(
     setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, closing: contextlib.ExitStack
 ) -> Callable[[Member], MonitorService]:
-    """Prepares what is drawn, opens the recording and the live view's ports, and returns what makes the service.
+    """Prepares drawing, opens the recording and the live view's ports, and returns the factory of the service.
 
     Called on a thread of its own, so what it returns is called by the thread that owns the service.
 

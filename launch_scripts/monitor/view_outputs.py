@@ -1,4 +1,4 @@
-"""What is drawn on: a pen, and the file, the port and the page where its strokes go.
+"""Outputs of drawing: a pen, and the file, the port and the page to which its strokes go.
 
 Texts of others are shown so that they do nothing but stand there. Rerun's headless viewer ends on a character that
 its fonts lack, and its text panel reads Markdown, where an image may be fetched. Ids are safe by their characters;
@@ -40,10 +40,10 @@ log = logging.getLogger(__name__)
 _PORT_PATIENCE_S = 3.0
 """A port that is in use is waited for so long: after a restart the one before may still have it."""
 _MEMORY = "64MiB"
-"""What the stream keeps for viewers that come later; the oldest goes first. The process grows by twice as much."""
+"""Limit of the stream's store for later viewers; the oldest goes first. The process grows by twice as much."""
 _PACK_S = 1.0
-"""Within this time rerun packs what is logged of an entity into one chunk, unless the service flushes it for those
-who watch. Ten chunks a second take its threads five times the CPU, and twice the space."""
+"""Interval at which rerun packs logged data of an entity into one chunk, unless the service flushes it for viewers.
+Ten chunks a second take its threads five times the CPU, and twice the space."""
 STILL_CHECKS = 5
 """Checks in a row, one a second, that find the file as long as before: something is drawn every second."""
 _RETRY_S = 10.0
@@ -101,11 +101,12 @@ def screen(radius: float) -> float:
 
 
 class Pen:
-    """Draws on one recording stream, on one terrain. Style is logged once, of the rest only what differs from what
-    was logged last: part by part, as rerun keeps what it is not told anew.
+    """Draws on one recording stream, on one terrain. Style is logged once, of the rest only differences from the
+    last log: part by part, as rerun keeps parts that are not logged again.
 
     rerun's viewer tells of the instance under the pointer what its components say, if they are three at most, else
-    how many there are. So balls have three: a place, a colour, and a sentence. Their radii are in the blueprint.
+    how many there are. Balls therefore have three: a position, a colour, and a sentence. Their radii are in the
+    blueprint.
     """
 
     def __init__(self, streams: list[rr.RecordingStream], mesh: TerrainMesh) -> None:
@@ -119,13 +120,13 @@ class Pen:
             stream.log(entity, *parts, static=static)
 
     def set_time(self, frame: int, seconds: float) -> None:
-        """Sets the time of all that follows. What is logged before the first call is on no timeline."""
+        """Sets the time of all that follows. Data logged before the first call is on no timeline."""
         for stream in self.streams:
             stream.set_time("tick", sequence=frame)
             stream.set_time("sim_time", duration=seconds)
 
     def flush(self) -> None:
-        """Sends what is logged to viewers: else rerun packs what is logged within a second together."""
+        """Sends logged data to viewers: else rerun packs the data of a second together."""
         for stream in self.streams:
             stream.flush(timeout_sec=0)
 
@@ -144,12 +145,13 @@ class Pen:
         return fresh
 
     def placed(self, places_m: Sequence[tuple[float, float]], above: float) -> Floats:
-        """Places, east and south in metres, as points so many `scale_m` over the ground, float32 (n, 3)."""
+        """Returns positions, east and south in metres, as points at this height (`scale_m`) over the ground,
+        float32 (n, 3)."""
         east_south = np.array(places_m, np.float32).reshape(-1, 2)
         return self.mesh.place(east_south[:, 0], east_south[:, 1], above * self.mesh.scale_m)
 
     def style(self, entity: str, radius: float, colour: Colour | None = None) -> None:
-        """How lines look, which never changes."""
+        """Logs the style of lines, which never changes."""
         colours = None if colour is None else [colour]
         style = rr.LineStrips3D.from_fields(colors=colours, radii=[screen(radius)])
         self.log(entity, style, static=True)
@@ -212,12 +214,12 @@ class Sinks:
         self._blueprint = blueprint
         self.rec = self._stream()
         self.streams = [self.rec]
-        """Where to log: `rec`, and the file that was begun last, if the first has ended."""
+        """Streams to log to: `rec`, and the file that was begun last, if the first has ended."""
         self._servers: list[Server] = []
         self.page: LivePage | None = None
         self.gate: Server | None = None
         """The known port of the stream for native viewers. rerun lets pages read its answers only if their Origin
-        is on loopback, but looks at no Host. So rerun listens on a loopback address that is drawn by chance."""
+        is on loopback, but looks at no Host. rerun therefore listens on a random loopback address."""
         live: list[rr.GrpcServerSink] = []
         if config.live:
             host, port = behind = _hidden_address()
@@ -249,13 +251,13 @@ class Sinks:
         return Audience(sum(one.now for one in each), sum(one.ever for one in each))
 
     def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
-        """What the page shows of the run beside the view, asked once a second for each page that is open."""
+        """Sets the page's information about the run beside the view, asked once a second for each open page."""
         if self.page is not None:
             self.page.run = run
 
     def begin_file(self, path: Path) -> None:
-        """Lets what is logged to `streams` go to this file, too. On a stream of its own: new sinks for `rec` would
-        close the live view's port. Raises StoreError where nothing can be written to it."""
+        """Sends later logs of `streams` to this file, too. On a stream of its own: new sinks for `rec` would close
+        the live view's port. Raises StoreError where nothing can be written to it."""
         _, *earlier = self.streams
         stream = self._stream()
         try:
@@ -280,7 +282,7 @@ class Sinks:
 
     def _flush(self, within_s: float) -> None:
         for stream in reversed(self.streams):
-            with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
+            with contextlib.suppress(Exception):  # a viewer that has left must not keep the file from its end
                 stream.flush(timeout_sec=within_s * 0.8)
 
     def _let_play(self) -> None:
@@ -309,7 +311,7 @@ class RateLimit:
         self._next_ns = dict.fromkeys(self._every_ns, 0)
 
     def due(self, name: str, now_ns: int, slower: int = 1) -> bool:
-        """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""
+        """Returns True if it is time; if so, the next time is counted from now, later by this factor."""
         if now_ns < self._next_ns[name]:
             return False
         self._next_ns[name] = now_ns + slower * self._every_ns[name]
@@ -320,7 +322,7 @@ class RecordingWatch:
     """Notices that a recording has ended for want of space, says so, and begins another when there is some. Rerun's
     file sink ends at the first error, with a line in its own log only.
 
-    begin  lets what is drawn from now on go to this file as well; raises StoreError where it cannot
+    begin  sends later drawings to this file as well; raises StoreError if it cannot
     """
 
     def __init__(self, path: Path, begin: Callable[[Path], None]) -> None:
@@ -331,7 +333,7 @@ class RecordingWatch:
         self._limit = RateLimit({"look": 1.0, "try": _RETRY_S, "say": SAY_EVERY_S})
 
     def check(self, now_ns: int) -> tuple[str | None, bool]:
-        """What is to be told, if anything, and whether a new file has begun, in which nothing is drawn yet."""
+        """Returns a sentence to report, if any, and whether a new file has begun, which is empty yet."""
         if not self._limit.due("look", now_ns) or not self._has_ended():
             return None, False
         if self._limit.due("say", now_ns):
@@ -372,7 +374,7 @@ def check_space(folder: Path) -> None:
 
 def _files(path: Path | None) -> list[rr.FileSink]:
     """A file without a footer, if there is to be one. For that rerun keeps an entry of every chunk in memory up to
-    the end, 4 MB a minute of the demo. What reads recordings reads those without one, too: a killed monitor leaves
+    the end, 4 MB a minute of the demo. Readers of recordings accept files without one, too: a killed monitor leaves
     one in any case."""
     return [] if path is None else [rr.FileSink(path, write_footer=False)]
 
@@ -400,7 +402,7 @@ def _when_free(listen: Callable[[], T]) -> T:
 
 
 def _hidden_address() -> tuple[str, int]:
-    """An address on loopback that nobody guesses, if the system has more than one there."""
+    """Returns an address on loopback that cannot be guessed, if the system has more than one there."""
     host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}"
     with socket.socket() as probe:
         try:

@@ -18,7 +18,7 @@
 | run_folder.py      | the folder of a run, and how files are written whole                                     |
 | palette.py         | how pictures and the live view look                                                      |
 
-A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by whoever does what is counted, and a
-process that is started again goes on counting where it ended (`swarm.runtime.stats.carried`). So all who watch
+A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by the process that does the counted
+work, and a restarted process continues its previous counts (`swarm.runtime.stats.carried`). All watchers therefore
 agree once messages have arrived, whenever they began to watch.
 """

@@ -1,6 +1,6 @@
 """The table of facts: what people are shown of a run, in which words and units. Pure.
 
-Who shows a fact takes its label and its text from here, so that it reads the same everywhere.
+Every display of a fact takes its label and its text from here, so that it reads the same everywhere.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 
 NONE = "-"
-"""What is shown where nothing is known."""
+"""Text for an unknown value."""
 
 
 Of = TypeVar("Of", RunState, TargetLine)
@@ -147,7 +147,7 @@ FACTS: tuple[Fact[RunState], ...] = (
         "Messages that were no messages of this swarm, or came under a key that is not their sender's.",
     ),
 )  # fmt: skip
-"""What is shown of a run. A new row appears everywhere."""
+"""Facts on show of a run. A new row appears everywhere."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
     Fact("target", "target", _word, "Its id, and what is unusual about it.", of="title"),
@@ -165,7 +165,7 @@ TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
     Fact("pose_age_s", "seen", seconds, "Time since its last pose.", always=False),
     Fact("tracker", "tracker", _word, "Who tells where it is.", always=False),
 )  # fmt: skip
-"""What is shown of each target, what matters most first: a narrow panel cuts off the end."""
+"""Facts on show of each target, the most important first: a narrow panel cuts off the end."""
 
 _BY_NAME = {fact.name: fact for fact in FACTS}
 
@@ -191,7 +191,7 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("certified_gap",),
     ("processes_well", "restarts", "messages_now_per_s"),
 )
-"""How the facts of a run are set in lines."""
+"""Lines in which the facts of a run are set."""
 IF_ANY = ("learned",)
 """Facts that have a line of their own, where there is anything to say."""
 MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
@@ -210,16 +210,16 @@ def lines(state: RunState) -> list[str]:
 
 
 _SAID_SINGLY = 2
-"""Of more alarms of one kind there is one line for all: on a slow machine every process is behind."""
+"""Beyond this number alarms of one kind share one line: on a slow machine every process is behind."""
 _NAMED = 3
-"""Names in the line for many alarms: so many ids fit a terminal's line of 80 columns beside label, count and
-time."""
+"""Names in the line for many alarms: this number of ids fits a terminal's line of 80 columns beside label, count
+and time."""
 
 
 def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
     """The alarms that last, the most serious first, in lines for people; then how many lines are left out.
 
-    over  also what is over
+    over  also closed alarms
     """
     return lines_of(state.alarms if over else state.standing_alarms, state.grid, most)
 

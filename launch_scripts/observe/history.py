@@ -1,7 +1,7 @@
 """A run over time, in bounded memory: samples of its figures, tracks, routes that vehicles began.
 
 Memory does not grow with the length of a run: `Thinned` forgets every second entry when it holds too many, and
-keeps half as many from then on. So what is kept stays evenly spread from the beginning of a run to its end.
+keeps half as many from then on. Kept samples therefore stay evenly spread from the beginning of a run to its end.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Thinned(Generic[T]):
             self._total = sum(map(self._size, self.kept))
 
     def all(self) -> list[T]:
-        """What is kept, and the newest."""
+        """Kept samples, and the newest."""
         if self.last is None or self.kept[-1] is self.last:
             return self.kept
         return [*self.kept, self.last]
@@ -137,7 +137,7 @@ class Tracks:
         self._samplings: Thinned[_Sampling] = Thinned(limit, lambda sampling: len(sampling[1]))
 
     def due(self, now_ns: int) -> bool:
-        """Whether it is time for a sample."""
+        """Returns True if a sample is due."""
         return now_ns >= self._due_ns
 
     def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:

@@ -1,4 +1,4 @@
-"""The newest message of every sender of a run: what processes counted, who is alive, where everything is, marks.
+"""Newest message of every sender of a run: counters, liveliness, positions, marks.
 
 Pure: time is an argument. The launcher, the live view, the simulation and the commands pass it what they heard on
 `HEARD` or `RECORDED` (`run_observer.py`).
@@ -40,7 +40,7 @@ _ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clo
 
 @dataclass(frozen=True, slots=True)
 class RunPlan:
-    """What a complete run has.
+    """Expected processes of a complete run.
 
     crew        (role, id) of the processes that it needs: no router, which belongs to no run, and no monitor
     vehicles    of the scenario; guests come on top
@@ -83,7 +83,7 @@ def run_of_most(found: Iterable[RunInfo]) -> tuple[str, str]:
 
 
 def plan_of_members(members: Iterable[RunInfo]) -> RunPlan:
-    """By what the processes of a run answer: the same as by its scenario."""
+    """Returns the plan from the replies of the run's processes: the same as from its scenario."""
     told = [info for info in members if info.run_id]
     crew = dict.fromkeys(
         (role, id) for info in told for role, _, id in (name.partition("-") for name in info.crew) if id
@@ -187,7 +187,7 @@ class LatestState(Counts):
         self.last_ns: int | None = None
         """When the first and the last message were heard; None before."""
         self.moved_ns = 0
-        """When a vehicle or a target was last heard of. What comes later are the words of a run that ends."""
+        """When a vehicle or a target was last heard of. Later messages are those of a run that ends."""
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
@@ -202,9 +202,9 @@ class LatestState(Counts):
         self._alive: dict[tuple[str, str], set[int]] = {}
         """(role, id) of every process that has ever been seen alive -> incarnations whose token is up."""
         self._told_ns: dict[tuple[str, str], int] = {}
-        """(role, id) -> when the process told its counts last, or appeared."""
+        """(role, id) -> time of the process's last counts, or of its first token."""
         self._fleet_told_ns: dict[str, int] = {}
-        """Agent -> when it told of vehicles last."""
+        """Agent -> time of its last message about vehicles."""
 
     def heard(self, message: Message, now_ns: int) -> Message | None:
         """Takes in a message; returns it, a pose with its cell, and None for a pose that does not count."""
@@ -271,19 +271,19 @@ class LatestState(Counts):
         return sorted(key for key, incarnations in self._alive.items() if incarnations)
 
     def is_up(self, role: str, job: str) -> bool:
-        """Whether the process with this job or one of its standbys is alive."""
+        """Returns True if the process with this job or one of its standbys is alive."""
         return any(self._alive.get((role, ranked_id(job, rank))) for rank in range(HIGHEST_RANK + 1))
 
     def was_up(self, role: str, id: str) -> bool:
-        """Whether the process has ever been seen alive."""
+        """Returns True if the process has ever been seen alive."""
         return (role, id) in self._alive
 
     def knows(self, role: str, id: str) -> bool:
-        """Whether the process has ever been seen alive, or what it counted is known."""
+        """Returns True if the process has ever been seen alive, or its counts are known."""
         return self.was_up(role, id) or (role, id) in self._newest
 
     def told_by_planner(self, target: str) -> PlannerStatus | None:
-        """What the planner that leads says; None if there is none, or it is gone and says nothing any more."""
+        """Returns the state of the leading planner; None if there is none, or it has ended."""
         ids = [ranked_id(target, rank) for rank in range(HIGHEST_RANK + 1)]
         gone = any(self.knows("planner", id) for id in ids) and not any(self.is_well("planner", id) for id in ids)
         return None if gone else self.status.get(target)
@@ -293,23 +293,23 @@ class LatestState(Counts):
         return [id for each, id in self.up() if each == role]
 
     def is_well(self, role: str, id: str) -> bool:
-        """Whether a process is as it should be: alive, or ended because it was asked to."""
+        """Returns True if a process is in order: alive, or ended on request."""
         if self._alive.get((role, id)):
             return True
         stats = self.newest_stats(role, id)
         return stats is not None and stats.gauges.get(ENDED, 0.0) > 0
 
     def fills(self, role: str, id: str) -> bool:
-        """Whether somebody does what this process is for, as it should: itself, or a keeper or a targets process of
-        another name, as when it was started by hand."""
+        """Returns True if the job of this process is done in order: by itself, or by a keeper or a targets process
+        of another name, as when it was started by hand."""
         if self.is_well(role, id) or role not in ("keeper", "targets") or split_rank(id)[1]:
             return self.is_well(role, id)
         known = {each for each_role, each in (*self._alive, *self._newest) if each_role == role}
         return any(self.is_well(role, each) for each in known if not split_rank(each)[1])
 
     def silent(self, before_ns: int) -> list[tuple[str, str, int]]:
-        """(role, id, when) of processes that are alive and have not told their counts since then, though they did
-        before."""
+        """Returns (role, id, time) of processes that are alive and have not published their counts since then,
+        though they did before."""
         return [
             (*key, told_ns)
             for key, told_ns in sorted(self._told_ns.items())
@@ -332,7 +332,8 @@ class LatestState(Counts):
     # --- trackers -------------------------------------------------------------------------------------------------
 
     def lost(self, now_ns: int) -> set[str]:
-        """The targets that nobody tracks now; those without a tracker as their planners tell."""
+        """Returns the targets that no tracker publishes now; those without a tracker according to their
+        planners."""
         told = {id for id, status in self.status.items() if status.tracker_lost and self._trackings.of(id) is None}
         return self._trackings.lost(now_ns) | told
 
@@ -345,7 +346,7 @@ class LatestState(Counts):
         return None if age_ns is None else age_ns / NS_PER_S
 
     def tracking(self) -> dict[str, Any]:
-        """How often targets were lost, which still are, and what was odd about poses: for a report."""
+        """Returns how often targets were lost, which still are, and anomalies of poses: for a report."""
         return {
             "lost": self.total("trackers_lost"),
             "lost_at_end": sorted(self.lost(self.moved_ns)),
@@ -361,8 +362,8 @@ class LatestState(Counts):
         return self._vehicles
 
     def driven(self, crew: Collection[tuple[str, str]], now_ns: int) -> VehicleColumns:
-        """The vehicles that somebody drives: not those that have left, or whose agent is gone. An agent of the crew
-        which ended because it was asked to has said its last words, and they stand."""
+        """Returns the vehicles that are driven: not those that have left, or whose agent has ended. An agent of the
+        crew which ended because it was asked to has said its last words, and they stand."""
         vehicles = self.vehicles()
         agents = list(map(agent_of, vehicles.ids))
         drives = {agent: self._drives(agent, ("agent", agent) in crew, now_ns) for agent in set(agents)}
@@ -378,7 +379,7 @@ class LatestState(Counts):
         return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
 
     def tells_of_vehicles(self, agent: str) -> bool:
-        """Whether the agent has said where it drives."""
+        """Returns True if the agent has published its vehicles."""
         return agent in self._fleet_told_ns
 
     def groups(self) -> dict[str, str]:
@@ -406,11 +407,11 @@ class LatestState(Counts):
         return bool(self._marks)
 
     def learned_words(self) -> list[MarkSet]:
-        """What each author has learned of kinds of ground: sets about the tile beyond the map."""
+        """Returns the measurements of each author of terrain classes: sets in the tile beyond the map."""
         return [marks for (_, tile), marks in sorted(self._marks.items()) if tile == self.grid.tiles]
 
     def marked(self) -> MarkedCells:
-        """What stands about each cell, as the shared map merges it; cells cleared again are left out."""
+        """Returns the current mark of each cell, as the shared map merges it; cells cleared again are left out."""
         of_tile: dict[int, list[MarkSet]] = {}
         for (_, tile), marks in sorted(self._marks.items()):
             if tile < self.grid.tiles:

@@ -20,7 +20,7 @@ INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"
 MARKED_LETHAL, MARKED_SLOW = VIOLET, ORANGE
 LETHAL_GROUND, FORBIDDEN = "#39404a", YELLOW
 GROUPS = (GREEN, BLUE, PINK, SKY, BLACK)
-"""Of groups, in the scenario's order; then from the first again."""
+"""Colours of groups, in the scenario's order; then from the first again."""
 STATE_COLOURS = {
     VehicleState.FOLLOWING: GREEN,
     VehicleState.ARRIVED: BLUE,

@@ -1,4 +1,4 @@
-"""What the processes of a run take up and how well they keep time, from what each says of itself. Pure."""
+"""CPU, memory and tick lateness per process, from their `Stats`. Pure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LEAST_NS = NS_PER_S // 2
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessLoad:
-    """What one process takes up, over the last second or so; None where it is not known.
+    """Load of one process, over the last second or so; None where it is unknown.
 
     cpu_percent  100 is one core
     late_per_s   ticks that came later than half a period, or not at all
@@ -37,7 +37,7 @@ class ProcessLoad:
 
 
 class ProcessLoads:
-    """The last two that every process told of itself."""
+    """The last two loads of every process."""
 
     def __init__(self) -> None:
         self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
@@ -52,7 +52,7 @@ class ProcessLoads:
             self._told[key] = (last, stats)
 
     def lines(self, up: Collection[tuple[str, str]]) -> list[ProcessLoad]:
-        """Every process that has told anything, in order.
+        """Returns every process with a known load, in order.
 
         up  (role, id) of those that are alive
         """

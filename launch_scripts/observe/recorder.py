@@ -2,7 +2,7 @@
 
 `RunFigures` keeps the figures of a run at successive instants, which is all that the live view needs. `Recorder`
 keeps tracks, routes, captures and notes, too, and makes the report. Pure: time is an argument, and the owner of a
-bus passes it what comes on `HEARD` or `RECORDED`.
+bus passes it messages on `HEARD` or `RECORDED`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
 _SHOWN_NS = 5 * NS_PER_S // 4
-"""So old may be what is shown: a sample is taken with the first message after its second."""
+"""Largest age of shown values: a sample is taken with the first message after its second."""
 
 
 class RunFigures:
@@ -69,12 +69,12 @@ class RunFigures:
         self._add_sample(now_ns)
 
     def summary(self, now_ns: int) -> RunState:
-        """What the run is at a time."""
+        """Returns the state of the run at a time."""
         return state_of(self.observed, now_ns)
 
     def shown(self, now_ns: int) -> RunState:
-        """What people are shown: the state of the last sample, so that it is made once a second for all. Anew where
-        the swarm has said nothing since, as that is news, too."""
+        """Returns the state for displays: that of the last sample, so that it is made once a second for all. It is
+        made again if the swarm has been silent since, as that is news, too."""
         if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
             self._sampled = now_ns, self.summary(now_ns)
         return self._sampled[1]
@@ -108,7 +108,7 @@ class RunFigures:
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 8_000_000
-"""Of all routes that are kept, about: beside its steps a route takes 64 bytes."""
+"""Estimated size of all routes that are kept: beside its steps a route takes 64 bytes."""
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
 
@@ -133,7 +133,7 @@ class Recorder(RunFigures):
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
-        """Where and when targets were captured; how often, `Observed` counts."""
+        """Positions and times of captures; `Observed` counts them."""
         self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + 64)
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
@@ -162,7 +162,7 @@ class Recorder(RunFigures):
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
 
     def _capture(self, note: Note, now_ns: int) -> None:
-        """Of targets that nobody tracks, too: the process that moves them tells of each capture."""
+        """Also of untracked targets: the process that moves them publishes each capture."""
         cell = note.cell
         if note.target is None or cell is None or cell >= self.grid.cells:
             return
@@ -205,7 +205,7 @@ class Recorder(RunFigures):
         observed = self.observed
         if seconds is None and observed.first_ns is not None and observed.last_ns is not None:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
-        # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
+        # Later messages are those of a run that ends: without trackers there is no alarm.
         state = self.summary(observed.moved_ns or observed.last_ns or 0)
         rates = [sample.messages_per_s for sample in self.samples.all() if sample.messages_per_s is not None]
         fields = {
@@ -293,7 +293,7 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 def _rounded(value: Any) -> Any:
-    """Rounds to six digits, finer than any measurement here. What JSON cannot express becomes None."""
+    """Rounds to six digits, finer than any measurement here. Values that JSON cannot express become None."""
     if isinstance(value, dict):
         return {name: _rounded(item) for name, item in value.items()}
     if isinstance(value, float):

@@ -1,9 +1,10 @@
-"""What went wrong in a run: one list for the view, the table, `swarm status` and the report. Pure.
+"""Alarms of a run: one list for the view, the table, `swarm status` and the report. Pure.
 
-Whoever is concerned tells it (`swarm.runtime.membership`), with each `Stats`, so that one who comes late knows it.
-What a process cannot tell of itself is found here: that it is gone or silent, and that a target is lost.
+The process concerned publishes an alarm (`swarm.runtime.membership`) with each `Stats`, so that late subscribers
+know it. Alarms that a process cannot raise itself are found here: that it has ended or is silent, and that a target
+is lost.
 
-A tree that was grown long ago is no alarm: what has changed since is repaired in it.
+An old tree is no alarm: later changes are repaired in it.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Alarm:
     text        a sentence
     target      the target that it concerns
     cell        where it is; None if it has no place
-    since_s     time of the run at which it began; None if whoever looks came later
+    since_s     time of the run at which it began; None if the watcher came later
     over_s      time of the run at which it was over; None while it lasts
     """
 
@@ -111,7 +112,8 @@ class Alarm:
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
-    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first."""
+    """Returns all alarms of a run at an instant: open ones, the serious first, then closed ones, the newest
+    first."""
     began_ns, wanted = latest.plan.started_ns or 0, list(targets)
     found = [
         *_missing(latest, wanted, now_ns),
@@ -141,11 +143,11 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
 
 
 _UNKNOWN_NS = -1
-"""When an alarm began whose beginning nobody knows. No message can say so."""
+"""Beginning of an alarm whose beginning is unknown. No message can say so."""
 
 
 def _told(latest: LatestState) -> Iterator[Told]:
-    """What processes say. What lasted when one went is not said any more."""
+    """Returns alarms published by processes. Alarms that were open when a process ended are left out."""
     for (role, id), stats in latest.newest().items():
         for alarm in stats.alarms:
             if alarm.over_ns is not None or latest.is_well(role, id):
@@ -153,7 +155,7 @@ def _told(latest: LatestState) -> Iterator[Told]:
 
 
 def starts(latest: LatestState, role: str, id: str, now_ns: int) -> bool:
-    """Whether a process has not been seen yet, and has not been waited for for long."""
+    """Returns True if a process has not been seen yet, and is not overdue."""
     began_ns = latest.plan.started_ns
     began = began_ns is not None and now_ns - began_ns < STARTING_S * NS_PER_S
     return began and not latest.knows(role, id)

@@ -75,7 +75,7 @@ def ended(folder: Path) -> dict[str, Any]:
 
 
 def _facts(folder: Path) -> dict[str, Any]:
-    """What `run.json` says; empty where it cannot be read."""
+    """Returns the content of `run.json`; empty if it cannot be read."""
     try:
         facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -193,7 +193,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 LOOK_EVERY_S = 5.0
-"""A full disk is told of within seconds, and a try is 64 kB, which no disk feels at this rate."""
+"""A full disk is reported within seconds, and a try is 64 kB, which no disk feels at this rate."""
 SAY_EVERY_S = 60.0
 """A full disk is named once a minute (docs/operate/failures.md): often enough to be seen, and the log stays
 readable."""

@@ -49,7 +49,7 @@ _EARLY = 100_000
 
 
 class Known(Protocol):
-    """A keeper of what is heard, such as `LatestState` or `Recorder`."""
+    """Receiver of an observer's messages, such as `LatestState` or `Recorder`."""
 
     def heard(self, message: Message, now_ns: int) -> object:
         """Takes in a message."""
@@ -78,7 +78,7 @@ class RunObserver:
         self._bus.watch_alive(self._post)
 
     def keep_samples(self, topics: Iterable[Topic] = ()) -> None:
-        """Has samples kept until they are `due`: none wakes a thread, and what is passed over is not decoded.
+        """Has samples kept until they are `due`: none wakes a thread, and skipped ones are not decoded.
 
         topics  if given, only these: the owner collects the others, from some senders
         """
@@ -107,10 +107,10 @@ class RunObserver:
         self._due_ns[topic.name] = now_ns + self._every_ns[topic.name]
 
     def due(self, now_ns: int, *, all: bool = False) -> Iterator[Heard]:
-        """What was collected and is due, to be taken in (`take`): one topic after the other, as the bus keeps no
-        order between topics either.
+        """Returns collected samples that are due, to be applied (`take`): one topic after the other, as the bus
+        keeps no order between topics either.
 
-        all  also what is not due yet
+        all  also samples that are not due yet
         """
         for name, topic in self._topics.items():
             if all or now_ns >= self._due_ns[name]:
@@ -129,8 +129,8 @@ class RunObserver:
 
 
 class OutsideObserver(RunObserver):
-    """Observes whatever run is in a namespace, without its scenario. What comes before its members have answered is
-    kept, and taken in then: only they know on which terrain poses are.
+    """Observes whatever run is in a namespace, without its scenario. Messages before the replies of its members are
+    kept, and applied then: only members know the terrain of poses.
 
     latest   the newest of the run; None before its members have answered
     answers  what each process has answered last, of whatever run; routers belong to none
@@ -152,9 +152,9 @@ class OutsideObserver(RunObserver):
         self.run: RunInfo | None = None
         """The first answer of a process of the run that is observed; None before one is found."""
         self.answered = False
-        """Whether all who would answer a question have."""
+        """True if all processes that would reply to a query have done so."""
         self.over = False
-        """Whether all who answer belong to another run by now. Set for good."""
+        """True if all processes that reply belong to another run by now. Set for good."""
         self.answers: dict[tuple[str, str], RunInfo] = {}
         self._follows = follows
         self._early: deque[Callable[[LatestState], object]] = deque(maxlen=_EARLY)
@@ -200,8 +200,8 @@ class OutsideObserver(RunObserver):
         self._learn(lambda latest: latest.heard(message, now_ns))
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        """A liveliness token rose or fell; of a process that is gone its last words are asked for, as it may have
-        gone before it said anything to us."""
+        """Handles a change of a liveliness token; the last `Stats` of an ended process are queried, as it may have
+        ended before it published any to us."""
         (self._up.add if up else self._up.discard)(peer)
         if not up:
             self.ask_gone()
@@ -229,7 +229,7 @@ class OutsideObserver(RunObserver):
 
     @property
     def whole(self) -> bool:
-        """Whether each process that has answered has also said what it counts, and each agent where it drives."""
+        """True if each process that has replied has also published its counts, and each agent its vehicles."""
         latest = self.latest
         return self.answered and all(
             latest is not None

@@ -25,7 +25,7 @@ _DRIVEN = ("distance_m", "waiting_s", "standing_s")
 
 
 class Driven:
-    """How far each vehicle drove and how long it waited, from the places at which it was seen.
+    """Distance and waiting time of each vehicle, from its observed positions.
 
     totals  float64 (3, n), a column for each of `ids`: metres along straight lines between samples, on the map;
             seconds of waiting for a route; seconds with a route on one spot from one sample to the next
@@ -36,7 +36,7 @@ class Driven:
         self.groups: dict[str, str] = {}
         self.totals = np.zeros((3, 0))
         self._place_m = np.zeros((0, 2))
-        """Where each was last; NaN before."""
+        """Last position of each; NaN before."""
         self._rows: dict[str, int] = {}
         self._seen: list[str] = []
         self._seen_rows: NDArray[np.intp] = np.zeros(0, np.intp)

@@ -1,4 +1,4 @@
-"""What a run is at an instant: the one thing that all who show a run draw from. Pure."""
+"""State of a run at an instant: the one source of all displays of a run. Pure."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One target at an instant. What of it is shown, and how, `facts.TARGET_FACTS` says.
+    """One target at an instant. `facts.TARGET_FACTS` selects and formats its fields.
 
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
     rank        of the planner that leads; 0 unless a standby does
     nearest_m   distance of the nearest vehicle
     pose_age_s  time since its last pose; None before the first
-    lost        whether nobody tracks it: it was where that says, and may be anywhere
+    lost        whether no tracker publishes it: the position is the last known one
     """
 
     id: str
@@ -48,7 +48,7 @@ class TargetLine:
 
     @property
     def title(self) -> str:
-        """The id, and what is unusual about its tracker and its planner."""
+        """The id, and exceptional states of its tracker and its planner."""
         unusual = []
         if self.lost:
             unusual.append("lost" if self.pose_age_s is None else f"lost {self.pose_age_s:.0f} s")
@@ -61,10 +61,10 @@ class TargetLine:
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """A run at an instant. What of it is shown, and how, `facts.FACTS` says.
+    """A run at an instant. `facts.FACTS` selects and formats its fields.
 
     elapsed_s       time of the run, since it began
-    states          vehicles that somebody drives, by VehicleState
+    states          vehicles that are driven, by VehicleState
     classes         the same by class, "ground" first
     alive           processes that are as they should be: alive, or ended because they were asked to
     expected        processes that the run needs
@@ -201,7 +201,7 @@ def _lines(
 
 
 def _learned(latest: LatestState) -> dict[str, float]:
-    """As the planner says that has learned most: those of other groups may have been told less."""
+    """From the planner with the most learned factors: those of other groups may have received fewer."""
     told = [
         {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
         for (role, _), stats in latest.newest().items()

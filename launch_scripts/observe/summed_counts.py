@@ -19,7 +19,7 @@ Number = TypeVar("Number", int, float)
 
 
 def sum_of(values: Iterable[Number | None]) -> Number | None:
-    """The sum of what is known; None if nothing is."""
+    """Returns the sum of known values; None if there are none."""
     told = [value for value in values if value is not None]
     return sum(told) if told else None
 
@@ -30,7 +30,7 @@ class Counts:
     def __init__(self) -> None:
         self._stats: dict[tuple[str, str, int], Stats] = {}
         self._counting: list[Stats] | None = None
-        """Those that are summed; None since the last that was new."""
+        """Lives that are summed; None since the last that was new."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
 
@@ -46,7 +46,7 @@ class Counts:
                 self._newest[stats.role, stats.id] = stats
 
     def newest_stats(self, role: str, id: str) -> Stats | None:
-        """What the newest incarnation of a process has said last."""
+        """Returns the last `Stats` of a process's newest incarnation."""
         return self._newest.get((role, id))
 
     def newest(self) -> dict[tuple[str, str], Stats]:
@@ -54,7 +54,7 @@ class Counts:
         return dict(sorted(self._newest.items()))
 
     def _summed(self) -> list[Stats]:
-        """What is summed: of lives whose counts a later one carries on only the later."""
+        """Returns the summed counts: of lives whose counts a later one carries on only the later."""
         if self._counting is None:
             self._counting = []
             before: dict[tuple[str, str], int] = {}
@@ -104,7 +104,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class CertifiedGap:
-    """How far above the optimum some routes can be at most: 1.05 is proven to be at most 5 % above it.
+    """Certified gap of some routes at most: 1.05 is proven to be at most 5 % above the optimum.
 
     mean, p95, max  cost over proven lower bound; None without a proven route
     routes          that vehicles began

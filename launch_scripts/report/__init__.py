@@ -1,4 +1,4 @@
-"""What a run leaves for people and for other programs.
+"""Files of a run for people and for other programs.
 
 Commands and the ends of runs and studies write it; nothing else imports it. Matplotlib is imported here alone.
 

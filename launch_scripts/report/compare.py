@@ -1,4 +1,4 @@
-"""What differs between runs, and their figures beside each other. Pure."""
+"""Differences between runs, and their metrics beside each other. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SUMMED = {
 
 @dataclass(frozen=True)
 class LeftRun:
-    """What a run has left.
+    """Files of a finished run.
 
     settings  its scenario, as TOML was read; None where there is no file of it
     """
@@ -58,7 +58,7 @@ def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
 
 
 def remarks(runs: Sequence[LeftRun]) -> list[str]:
-    """What to know before figures are compared, in sentences."""
+    """Returns notes on differences that affect a comparison, in sentences."""
     terrains = [_table(run.report.get("terrain")).get("digest") for run in runs]
     seeds, seconds, scales = ([run.report.get(name) for run in runs] for name in ("seed", "seconds", "time_scale"))
     simulated = [bool(run.report.get("simulated")) for run in runs]

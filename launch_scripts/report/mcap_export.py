@@ -1,7 +1,7 @@
 """`swarm export --mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`.
 
-A viewer that jumps to an instant shows the last message of each topic. So each message holds all of its topic: all
-vehicles, all routes, all marks; what would be too much is told less often. One message is made at a time.
+A viewer that jumps to an instant shows the last message of each topic. Each message therefore holds all of its
+topic: all vehicles, all routes, all marks; large topics are written less often. One message is made at a time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _CAPTURE: Colour = (1.0, 0.85, 0.1, 1.0)
 _SHOWN_NS = 5 * NS_PER_S
 """Captures are drawn for so long."""
 _MOST_POINTS, _MOST_CELLS = 2_000_000, 64_000_000
-"""Of all routes drawn, and of all grids of marks, in a recording: 48 MB and 64 MB before compression."""
+"""Limits for all routes drawn, and for all grids of marks, in a recording: 48 MB and 64 MB before compression."""
 _LEAST, _MOST = 8, 600
 """Messages that drawings and grids of marks get, as far as there is news for them."""
 
@@ -91,7 +91,7 @@ def _write(path: Path, timeline: Iterable[Told], types: RosTypes, facts: Mapping
     """Write messages as they come, in compressed chunks of a megabyte; returns how many each topic has.
     Raises StoreError.
 
-    facts  about the run, for whoever looks into the file
+    facts  about the run, for a reader of the file
     """
     counts: Counter[str] = Counter()
     channels: dict[str, int] = {}
@@ -125,7 +125,7 @@ def _colours(report: Mapping[str, Any]) -> dict[str, Colour]:
 
 
 def _facts(run: str, report: Mapping[str, Any], grid: GridSpec) -> dict[str, str]:
-    """What places and times mean, and which run it is."""
+    """Returns the meaning of positions and times, and the identity of the run."""
     known = {name: report[name] for name in ("scenario", "seed", "version") if report.get(name) is not None}
     place = {"crs": grid.crs, "west_m": grid.west_m, "north_m": grid.north_m, "resolution_m": grid.resolution_m}
     return {name: str(value)[:1000] for name, value in {"run": run, **known, **place}.items()}
@@ -180,7 +180,7 @@ class _Timeline:
     def _moving(self, tracks: Sequence[Track], topic: str, *, frames: bool) -> Iterator[Told]:
         """The samples of all tracks, time by time. Headings lead from each sample to the next of its track.
 
-        frames  whether transforms are told, too
+        frames  whether transforms are written, too
         """
         tracks = sorted((each for each in tracks if len(each.time_ns)), key=lambda each: (each.id, each.piece))
         if not tracks:
@@ -204,7 +204,7 @@ class _Timeline:
             yield Told(now_ns, topic, messages.pose_array(now_ns, xy_m[some], headings[some].tolist()))
 
     def _marks(self) -> Iterator[Told]:
-        """What was marked at the end, each cell from its newest mark on: -1 where nothing is."""
+        """Marks at the end, each cell from its newest mark on: -1 without a mark."""
         grid, marks, ground = self._tracks.grid, self._tracks.marks, self._ground
         side = 1 if ground is None else ground.side
         while (-(-grid.rows // side)) * (-(-grid.cols // side)) > 1 << 20:
@@ -294,7 +294,7 @@ class _Words(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Line:
-    """time_ns as `RunTracks` counts; name, who says it"""
+    """time_ns as `RunTracks` counts; name, the sender"""
 
     time_ns: int
     severity: Severity

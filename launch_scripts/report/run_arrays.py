@@ -1,7 +1,7 @@
 """The arrays that a run leaves, so that it can be drawn and exported after it: `tracks.npz` and `ground.npz`.
 
-Both are archives of NumPy. What is read was perhaps cut off, or made by somebody else: it is checked whole, or
-refused in one sentence, before anything is made of it.
+Both are archives of NumPy. A file may be cut off, or made by another program: it is checked whole, or refused in
+one sentence, before it is used.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ TRACKS_FILE, GROUND_PACE_FILE = "tracks.npz", "ground.npz"
 _LEAST_M, _FARTHEST_M = 1e-4, 1e12
 """Cells of no terrain are so small, and no message places anything so far away."""
 _MOST_BYTES = 1 << 30
-"""Of all arrays of an archive, unpacked."""
+"""Limit for all arrays of an archive, unpacked."""
 _DAMAGES = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError, SyntaxError),
     *(MemoryError, OverflowError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-"""What NumPy and zipfile raise on bytes that are no archive of arrays."""
+"""Exceptions of NumPy and zipfile on bytes that are no archive of arrays."""
 _KINDS: Mapping[str, Any] = {
     "text": np.str_,
     "whole": np.int64,
@@ -113,7 +113,7 @@ class GivenRoute:
 
 @dataclass(frozen=True, eq=False)
 class RunTracks:
-    """What moved in a run.
+    """Tracks of moving entities in a run.
 
     captures  tracks of one point each
     marks     at the end
@@ -134,7 +134,7 @@ class RunTracks:
 class GroundPace:
     """The ground as the map knew it at the beginning, in blocks of `side` x `side` cells, the last ones cut off.
 
-    pace_s_per_m  float16 (rows, cols)  mean of what can be driven in a block; inf where nothing can
+    pace_s_per_m  float16 (rows, cols) mean of passable cells in a block; inf if there are none
     best_s_per_m  pace of the quickest cell
     """
 
@@ -237,7 +237,8 @@ def read_tracks(path: Path) -> RunTracks:
 
 
 def tracks_in(content: bytes, path: Path) -> RunTracks:
-    """What `packed_tracks` packed. Raises StoreError if it is damaged; `path` is how the sentence calls it."""
+    """Reads the output of `packed_tracks`. Raises StoreError if it is damaged; `path` is how the sentence calls
+    it."""
     with _arrays_in(content, path) as arrays:
         grid = _grid(str(arrays["grid"]))
         columns = {name: _checked(name, arrays[name], kind) for name, (_, kind) in _COLUMNS.items()}

@@ -37,13 +37,13 @@ Groups = Mapping[str, str]
 
 
 def vehicle_tracks(tracks: RunTracks, groups: Groups) -> list[Layer]:
-    """Where vehicles went; and where each stood that never moved, as a line has a length."""
+    """Returns the tracks of vehicles; and the position of each that never moved, as a line has a length."""
     lines = Layer("vehicle_tracks", "LineString", {"vehicle": "text", "group": "text", **TIMED})
     return _moved(lines, [(each, {"vehicle": each.id, "group": groups.get(each.id)}) for each in tracks.vehicles])
 
 
 def target_tracks(tracks: RunTracks, groups: Groups) -> list[Layer]:
-    """Where targets went, likewise: a target which jumps begins a new piece."""
+    """Returns the tracks of targets: a target which jumps begins a new piece."""
     lines = Layer("target_tracks", "LineString", {"target": "text", "piece": "int", **TIMED})
     return _moved(lines, [(each, {"target": each.id, "piece": each.piece}) for each in tracks.targets])
 
@@ -70,7 +70,7 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, Value]]]) -> li
 
 
 def _captures(tracks: RunTracks, groups: Groups) -> list[Layer]:
-    """Where targets were captured."""
+    """Returns the captures of targets."""
     features = [
         Feature([each.xy_m], {"target": each.id, "at": moment(each.time_ns[0])}) for each in tracks.captures
     ]
@@ -103,7 +103,7 @@ def _routes(tracks: RunTracks, groups: Groups) -> list[Layer]:
 
 
 def _marks(tracks: RunTracks, groups: Groups) -> list[Layer]:
-    """What was marked at the end, as `mark_layer`."""
+    """Returns the marks at the end, as `mark_layer`."""
     grid, marks = tracks.grid, tracks.marks
     kinds, paces = np.full((grid.rows, grid.cols), 255, np.uint8), np.zeros((grid.rows, grid.cols), np.float32)
     kinds.reshape(-1)[marks.cells], paces.reshape(-1)[marks.cells] = marks.kinds, marks.paces
@@ -151,7 +151,7 @@ WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {
     "routes": _routes,
     "marks": _marks,
 }
-"""What can be exported -> its layers."""
+"""Name of an export -> its layers."""
 
 
 ENDINGS = tuple(ending.removeprefix(".") for ending in FORMATS)

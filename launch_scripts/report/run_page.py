@@ -100,7 +100,7 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
 
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
-    """What went wrong, the serious first: a line, whether it is serious, and the lines that it stands for."""
+    """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
     size = report.get("terrain") or {}
     grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
     told = [
@@ -118,7 +118,7 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
 
 
 def _left_behind(report: Mapping[str, Any]) -> list[str]:
-    """What vehicles did not do, in sentences."""
+    """Returns unfinished business of vehicles, in sentences."""
     vehicles, routed = report["vehicles"], report.get("vehicles_routed")
     unrouted = 0 if routed is None else vehicles - routed
     told = (
@@ -155,7 +155,7 @@ def _cell(name: str, value: Any) -> tuple[str, Any]:
 
 
 def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What the page's template makes a map of: a drawing to be laid over pictures; None without tracks."""
+    """Returns the input of the page's map: a drawing over pictures; None without tracks."""
     if not (folder / TRACKS_FILE).exists():
         return None
     tracks = read_tracks(folder / TRACKS_FILE)
@@ -183,8 +183,8 @@ def _picture(path: Path, kind: str) -> str | None:
 def _svg(
     size_in: tuple[float, float], place: tuple[float, float, float, float], draw: Callable[[Axes], None]
 ) -> Markup:
-    """What `draw` draws on axes at a place of a figure, as an SVG element as wide as its place. Its text is text,
-    and the page says in which font."""
+    """Returns the drawing of `draw` on axes at a place of a figure, as an SVG element as wide as its place. Its
+    text is text, and the page says in which font."""
     with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run", "text.parse_math": False}):
         figure = Figure(figsize=size_in)
         axes = figure.add_axes(place)

@@ -42,7 +42,7 @@ from swarm.wire.messages.map_data import MarkKind
 
 _SHOWN_LABELS = 30
 _MOST_PIXELS = 1 << 20
-"""Of marks and of what was learned: of a larger grid, blocks of cells."""
+"""Limit for pictures of marks and of learned factors: of a larger grid, blocks of cells."""
 _MOST_POINTS = 60_000
 """Points of all tracks: more would be slow to look at."""
 Points = NDArray[np.float64]
@@ -189,7 +189,7 @@ class GroundPicture:
     """A picture of the ground from its north-west to its south-east corner.
 
     pixels  uint8 (height, width, 3)
-    drawn   what is on it beside the terrain, for a legend: lethal, forbidden, hidden
+    drawn   layers on it beside the terrain, for a legend: lethal, forbidden, hidden
     level   of the terrain, that was drawn
     """
 
@@ -235,8 +235,8 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: Floats | None) -
 
 
 def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
-    """What the scenario's zones forbid. Zones of vector files are among what is lethal: to read them again takes
-    long."""
+    """Returns the cells that the scenario's zones forbid. Zones of vector files are among lethal cells: reading
+    them again takes long."""
     cells = np.zeros(terrain.pace_s_per_m.shape, np.bool_)
     for zone in scenario.cost.zones:
         if zone.kind == "forbidden" and zone.file is None:
@@ -248,8 +248,8 @@ def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
 
 
 def hidden_cells(scenario: Scenario, terrain: Terrain, truth: NDArray[np.float32] | None) -> Bools:
-    """Where the truth differs from what the map knew at the beginning; only where it is lethal if whole classes of
-    ground are slower or quicker in truth, as every meadow would be outlined."""
+    """Returns the differences between ground truth and the initial map; only lethal ones if whole terrain classes
+    are slower or faster in truth, as every meadow would be outlined."""
     if truth is None:
         return np.zeros(terrain.pace_s_per_m.shape, np.bool_)
     hidden: Bools = (truth != terrain.ground_s_per_m) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
@@ -268,7 +268,7 @@ def _photo(seen: Level) -> Pixels:
     return lit
 
 
-# --- what was learned of it ---------------------------------------------------------------------------------------
+# --- learned factors ----------------------------------------------------------------------------------------------
 
 LEARNED_FILE = "learned.png"
 SLOWER, QUICKER = palette.ORANGE, palette.BLUE
@@ -280,7 +280,7 @@ through the strongest."""
 
 
 def learned_pixels(terrain: Terrain, factors: Floats) -> NDArray[np.uint8]:
-    """uint8 (rows, cols, 4): nothing where the prior stands, and where it is lethal. Of a large terrain every n-th
+    """uint8 (rows, cols, 4): nothing where the prior stands, and where it is lethal. On a large terrain every n-th
     cell.
 
     factors  float32 (KEYS,)  of each kind of ground

@@ -38,7 +38,7 @@ class Plot:
 
     draw       draws `lines` of a report on axes; False if the run did not measure any of them
     lines      name in the report's series or distributions -> label in the legend, and colour
-    of         what is shown of a value of the report
+    of         the plotted value of the report
     tick       a shown value in words
     least      the vertical axis ends there at least
     over_time  whether the horizontal axis is the run's seconds; else it is a value
@@ -90,7 +90,7 @@ def told(report: Report, name: str) -> tuple[Values, Values]:
 def _states(axes: Axes, plot: Plot, report: Report) -> bool:
     series = report["series"]
     shown = [name for name in plot.lines if any(series.get(name) or ())]
-    if not shown:  # stopped before any vehicle had told where it is
+    if not shown:  # stopped before any vehicle had published its position
         return False
     labels, colours = zip(*(plot.lines[name] for name in shown), strict=True)
     axes.stackplot(series["t_s"], *(series[name] for name in shown), labels=labels, colors=colours, linewidth=0)
@@ -179,7 +179,7 @@ PLOTS = (
 
 
 def _legend_above(axes: Axes) -> None:
-    """A legend of what is labelled beside the title, in letters so small that both have room."""
+    """Draws a legend of the labels beside the title, in small letters so that both have room."""
     _, labels = axes.get_legend_handles_labels()
     figure: Any = axes.get_figure(root=True)
     ems = sum(0.52 * len(label) + 2.6 for label in labels)

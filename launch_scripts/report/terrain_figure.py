@@ -35,7 +35,7 @@ _PACES = LinearSegmentedColormap.from_list(
     "paces", ["#fbf7dc", "#f6d27a", "#ee9140", "#cf4a2c", "#7d1626"]
 ).with_extremes(bad=_LETHAL)
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ede6d1", "#5c4576"])
-"""From what is driven to what is lethal."""
+"""From passable to lethal cells."""
 _TINTS = [*(TINT / 255)]
 for _kind, _tint in (  # photos' own colours do not tell these classes apart
     (TerrainClass.ROAD, (1.0, 0.91, 0.69)), (TerrainClass.BUILT, (0.75, 0.38, 0.35)),

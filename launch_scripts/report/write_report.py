@@ -64,7 +64,7 @@ def write_report(
     *,
     truth: NDArray[np.float32] | None = None,
 ) -> None:
-    """Writes what is named above. Raises StoreError if the folder cannot be written.
+    """Writes the files named above. Raises StoreError if the folder cannot be written.
 
     truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     """
@@ -116,7 +116,7 @@ TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "gr
 
 
 def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
-    """One row per target, group or vehicle. What has no value is empty."""
+    """One row per target, group or vehicle. Missing values are empty."""
     rows = [flat(id, row) for id, row in report[section].items()]
     columns = list(dict.fromkeys(["id", *(name for row in rows for name in row)]))
     file = io.StringIO()

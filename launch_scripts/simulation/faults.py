@@ -21,8 +21,8 @@ RELINK_S = 0.3
 OBSERVER = "recorder-0"
 """The node that writes the report. No fault touches it, or the report would be wrong."""
 MOST_WRONG_S = 11.5 * 3600
-"""No clock is further off, whatever steps come together: marks of a process whose clock is a day ahead of the
-reader's are refused, so of two that are half a day off to either side one would never hold what the other says."""
+"""No clock is further off, in any combination of steps: marks of a process whose clock is a day ahead of the
+reader's are refused, so of two that are half a day off to either side one would never accept the other's."""
 _NS_PER_MS = 1_000_000
 """A unit: plans of faults are written in milliseconds, the simulated clock counts nanoseconds."""
 
@@ -52,7 +52,7 @@ class Crash:
 
 @dataclass(frozen=True, slots=True)
 class Hang:
-    """Stops a process's loop for a while. Its session lives on, and what comes meanwhile waits."""
+    """Stops a process's loop for a while. Its session lives on, and messages wait meanwhile."""
 
     from_s: float
     until_s: float
@@ -102,7 +102,7 @@ class FaultPlan:
     twins: tuple[Twin, ...] = ()
 
     def counts(self) -> dict[str, int]:
-        """How many faults of each kind there are."""
+        """Returns the number of faults of each kind."""
         return {
             "crashes": len(self.crashes),
             "cuts": len(self.partitions),
@@ -159,15 +159,15 @@ class FaultyLinks:
         )
 
     def any_cut(self, at_s: float) -> bool:
-        """Whether anybody is cut off at a time, in seconds since the run began."""
+        """Returns True if any process is cut off at a time, in seconds since the run began."""
         return any(self._cut(each, at_s, outwards=True) for each in self._plan.partitions)
 
     def noticed(self, partition: Partition) -> bool:
-        """Whether a partition outlasts the lease, so that sessions end and liveliness tokens fall."""
+        """Returns True if a partition outlasts the lease, so that sessions end and liveliness tokens fall."""
         return partition.until_s - partition.from_s > self._lease_s
 
     def _cut(self, partition: Partition, at_s: float, outwards: bool) -> bool:
-        """Whether messages from the nodes (`outwards`), or to them, are lost now."""
+        """Returns True if the link currently drops messages from the nodes (`outwards`), or to them."""
         back_s = partition.until_s + (RELINK_S if self.noticed(partition) else 0.0)
         half_open = partition.one_way and at_s < min(partition.from_s + self._lease_s, partition.until_s)
         return partition.from_s <= at_s < back_s and (outwards or not half_open)
@@ -183,12 +183,12 @@ def _apart(partition: Partition, source: str, destination: str) -> bool:
 def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     """Draws a plan for a run of a scenario: everything at once in the first three fifths, nothing in the rest.
 
-    Crashes of any process; cuts that nobody notices, cuts that all do, also of one way; hangs; clocks that are
-    wrong and steps of them; second lives of agents; messages lost, late, repeated and out of order. A seed may
-    leave any of them out, so that a failure shows what it needs.
+    Returns random faults: crashes of any process; partitions, unnoticed, noticed and one-way; hangs; clock offsets
+    and steps; second lives of agents; messages lost, late, repeated and out of order. A seed may leave any of them
+    out, so that a failure shows what it needs.
 
     Agents with at most one other in their layer, on the ground or in the air, have no second life elsewhere: a plot
-    of theirs has one member, and nobody can tell which of its files is the first.
+    of theirs has one member, and it is unknown which of its files is the first.
     """
     chance = random.Random(f"faults/{seed}")
     names = sorted(spec.name for spec in processes_of(scenario, SIMULATED_ROLES))
@@ -207,7 +207,7 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     crashes = [Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(names)) for _ in range(chance.randrange(7))]
     for _ in range(chance.randrange(3)):
         hangs.append(Hang(*span(chance.choice((0.3, 1.5, 4.0))), chance.choice(names)))
-    # Of fewer than three agents no plot has a majority without the one that is cut off.
+    # With fewer than three agents no plot has a majority without the one that is cut off.
     if len(agents) >= 3 and chance.random() < 0.3:
         name = chance.choice(agents)
         from_s, until_s = span(4.0)

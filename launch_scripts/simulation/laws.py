@@ -1,4 +1,4 @@
-"""The laws that hold in every simulation, whatever goes wrong in it: what no process could see.
+"""Laws of every simulation under any faults, which no process could check itself.
 
 `LawBook` watches a simulation from its beginning, runs it to its end and says which of these broke:
 
@@ -45,11 +45,11 @@ from vehicle_agent.service import AgentService
 LONGEST_WAIT_S = 10.0
 ROUTED_WITHIN_S = 5.0
 SETTLED_S = 4.0
-"""What was said so long before the end has reached everybody."""
+"""Age at the end of messages that have reached every process."""
 LAST_WORDS_S = 6.0
-"""Once nobody says anything new, all hold the same after so long."""
+"""Time without new messages after which all replicas are equal."""
 _SHOWN = 3
-"""Cases of one law that are told of a run: what follows on the first says little."""
+"""Reported cases of one law in a run: consequences of the first say little."""
 _ROUTED = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
 _UNDER_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.WAITING)
 
@@ -76,7 +76,7 @@ class BrokenLaw(msgspec.Struct, frozen=True):
 
 
 def sets_of(held: Mapping[str, bytes]) -> Sets:
-    """What a digest says."""
+    """Returns the sets that a digest names."""
     rows = ((author, row) for author, packed in held.items() for row in np.frombuffer(packed, DIGEST_ROW))
     return {(author, int(row["tile"])): (int(row["epoch"]), int(row["seq"])) for author, row in rows}
 
@@ -87,7 +87,7 @@ def missing(has: Sets, wanted: Sets) -> list[tuple[str, int]]:
 
 @dataclass(eq=False)
 class _Life:
-    """What one life of an agent has heard and done.
+    """Inputs and actions of one life of an agent.
 
     reports    (body, incarnation) -> the newest report that was delivered to it, and when
     ticked_ns  its last tick; None before the first
@@ -166,7 +166,7 @@ class LawBook:
         if self._trace is not None:
             self._trace(now_ns, source, destination, topic, payload)
         if topic == BODY.name and destination.startswith("agent-"):
-            with contextlib.suppress(ProtocolError):  # what is no report closes nothing
+            with contextlib.suppress(ProtocolError):  # an invalid report closes nothing
                 self._lives.setdefault(destination, _Life()).take(decode(payload, Body), now_ns)
 
     def _take_digest(self, event: Event) -> None:
@@ -300,7 +300,7 @@ class LawBook:
         return max(self.routed_s.values()) - self.whole_s
 
     def _unrouted(self) -> Iterator[BrokenLaw]:
-        # A planner that has just begun listens for a while before it searches for a target that nobody tracks.
+        # A planner that has just started listens for a while before it searches for an untracked target.
         listens_s = LISTEN_NS / NS_PER_S if self.simulation.scenario.untracked else 0.0
         if self.whole_s is None:
             yield BrokenLaw("processes start again", "a process did not start again")

@@ -35,7 +35,7 @@ SECONDS = 30.0
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of one seed.
+    """Result of one seed.
 
     broken          each law that did not hold
     longest_wait_s  see `laws.LawBook`
@@ -107,7 +107,7 @@ def try_seed(
 
 
 def raised(error: Exception, now_s: float) -> BrokenLaw:
-    """That a service ended by an error."""
+    """Returns the violation that a service ended by an error."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
     return BrokenLaw("a service raised", f"a service raised at {now_s:.1f} s: {text}", now_s)
@@ -131,7 +131,7 @@ def world_of(name: str, seed: int) -> str:
 def run_seeds(
     name: str, seeds: Sequence[int], jobs: int, seconds: float = SECONDS, given: Scenario | None = None
 ) -> Iterator[Verdict]:
-    """Try each seed; yields verdicts as they come. What a seed does depends on nothing but its world and number.
+    """Try each seed; yields verdicts as they come. A seed's run depends on nothing but its world and number.
 
     name   a world, `MIX`, or the name of the scenario that is `given`
     """
@@ -143,8 +143,8 @@ def _try(name: str, seconds: float, given: Scenario | None, seed: int) -> Verdic
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Iterator[R]:
-    """Call `work` with each item, in so many processes at a time; yields results as they come. The processes end
-    with this one, and when the caller stops to read. What `work` raises ends all."""
+    """Calls `work` with each item, in a number of processes at a time; yields results as they come. The processes
+    end with this one, and when the caller stops to read. An exception of `work` ends all."""
     if jobs == 1 or len(items) == 1:
         yield from map(work, items)
         return

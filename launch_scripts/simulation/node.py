@@ -38,7 +38,7 @@ EPOCH_NS = 1_800_000_000 * NS_PER_S
 
 @dataclass(frozen=True)
 class Outside:
-    """What services have outside of them; None where there is none, as of a replay, which says what was read."""
+    """External objects of a service; None where there is none, as in a replay, which takes recorded readings."""
 
     bus: Bus
     worker: Worker
@@ -94,15 +94,15 @@ class Node:
         self._shell: Service | None = None
         """The service, or what records its calls."""
         self._recording: Recording | None = None
-        """Of this life."""
+        """Recording of this life."""
         self.bus: MemoryBus | None = None
         self.store: KeeperStore | None = None
         self.promises: PromiseStore | None = None
         self.skew_ns = skew_ns
         self.retired = False
-        """Whether it never starts again."""
+        """True if it never starts again."""
         self.added: AddedAgent | None = None
-        """What it hosts, if it is an agent that is not in the scenario."""
+        """Vehicles that it hosts, if it is an agent that is not in the scenario."""
         self._simulation = simulation
         self._clock = simulation.scheduler.clock
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
@@ -115,7 +115,7 @@ class Node:
 
     @property
     def works(self) -> bool:
-        """Whether it runs and does not hang."""
+        """True if it runs and does not hang."""
         return self.service is not None and self._waiting is None
 
     def now_ns(self) -> int:
@@ -130,7 +130,7 @@ class Node:
         simulation.log.event(self._clock.now_ns(), "boot", self.name)
         self._offset_ns = self.skew_ns
         self._waiting = None
-        # As the launcher counts lives: a restart is the later one although the clock was put back meanwhile.
+        # Lives are counted as by the launcher: a restart is the later one even if the clock was set back meanwhile.
         self._life = max(self.now_ns(), self._life + 1)
         namespace = simulation.scenario.network.namespace
         bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)

@@ -33,7 +33,7 @@ from swarm.wire.messages.processes import Stats
 
 
 def setup_of(head: Head, folder: Path) -> RoleSetup:
-    """What a recorded process was started with. Raises ConfigError where its scenario cannot be read here, and
+    """Returns the arguments of a recorded process. Raises ConfigError where its scenario cannot be read here, and
     ProtocolError on counts that are none."""
     return RoleSetup(
         scenario=parse_scenario(head.scenario),
@@ -51,7 +51,7 @@ def setup_of(head: Head, folder: Path) -> RoleSetup:
 
 
 class _Costs:
-    """What planners of a machine share that follows from scenario and terrain."""
+    """Data that planners of a machine share and that follows from scenario and terrain."""
 
     def __init__(self, terrain: Terrain, scenario: Scenario) -> None:
         self._of = terrain, scenario.planner
@@ -80,7 +80,7 @@ class Recorded:
 
 @dataclass(frozen=True, kw_only=True)
 class Replayed:
-    """What became of one recording.
+    """Result of replaying one recording.
 
     outcome  None if it could not be replayed, and `why` says why
     """
@@ -91,7 +91,7 @@ class Replayed:
 
     @property
     def same(self) -> bool:
-        """Whether it was replayed to its end without a difference."""
+        """True if it was replayed to its end without a difference."""
         return self.outcome is not None and self.outcome.difference is None and self.outcome.damaged is None
 
 
@@ -166,14 +166,14 @@ def replay_run(folder: Path, process: str | None = None, until_s: float | None =
 
 
 def _ground(setup: RoleSetup) -> tuple[Terrain, Floats]:
-    """Terrain and truth of a scenario; what is prepared of them in the run's folder is taken."""
+    """Returns terrain and ground truth of a scenario; prepared files in the run's folder are used."""
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
     return terrain, load_truth(setup, terrain)
 
 
 def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replaying) -> Service:
-    """The service of a recorded process. What it tells itself is in the recording, too."""
+    """The service of a recorded process. Its own messages are in the recording, too."""
     terrain, truth = ground
     nobody: Any = boundary.nobody
     prepared = cast(PreparedCosts, _Costs(terrain, setup.scenario))

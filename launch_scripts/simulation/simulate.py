@@ -79,8 +79,8 @@ BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
 """Seconds from a crash to the next start; each further crash of the same process doubles them."""
 _STOP_S = 0.1
-"""Seconds from the stop to the end. The recorder hears everything after 1 ms, and whoever talks on is not ticked
-any more: a longer wait would bring nothing but time on the run's clock."""
+"""Seconds from the stop to the end. The recorder receives everything after 1 ms, and ended services are not ticked
+any more: a longer wait would add nothing but time on the run's clock."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Simulation:
         return node
 
     def disturbed(self) -> bool:
-        """Whether a process is dead, hangs or is cut off now."""
+        """True if a process is dead, hangs or is cut off now."""
         return not all(node.works for node in self.nodes.values()) or self.links.any_cut(self.now_s)
 
     def finish(self) -> None:
@@ -222,7 +222,7 @@ class Simulation:
                 self.at(found_s, partial(self.network.relink, partition.nodes, True))
 
     def at(self, seconds: float, action: Callable[[], None]) -> None:
-        """Runs an action so many seconds after the run began."""
+        """Runs an action at a time (s) after the run began."""
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
 
     def _note(self, what: str, *nodes: str) -> None:

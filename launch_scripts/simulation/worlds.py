@@ -31,7 +31,7 @@ def of_file(name: str, settings: Mapping[str, Any] | None = None) -> Scenario:
 SMALL = of_file("small")
 WIDE = of_file("wide")
 ROVERS = "rovers"
-"""A crowd among which 20 rovers drive that look out for nobody."""
+"""A crowd with 20 rovers that avoid no vehicle."""
 MIXED = ("small", "wide", *CROWDS)
 WORLDS = (*MIXED, ROVERS)
 _ROVERS = (

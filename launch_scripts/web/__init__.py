@@ -1,7 +1,7 @@
 """One HTTP server, and what it serves: the page of the live view, health and metrics.
 
 - `server`: answers on loopback, or on an address that an operator names. On loopback only a request whose Host and
-  Origin are this machine is answered, whatever its method: a page of another site can make a browser connect to any
+  Origin are this machine is answered, with any method: a page of another site can make a browser connect to any
   loopback port, and can have its own name lead there (DNS rebinding). Connections are bounded in number and time.
 - `live_page`: the files of rerun's web viewer, and the stream behind them.
 - `health`: from what processes say of themselves to the answer that a probe gets; `probe` is the other end of it.
@@ -21,7 +21,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class Reply(NamedTuple):
-    """The answer to one request: its status, and what is sent."""
+    """Response to one request: its status, and its content."""
 
     code: int
     content_type: str

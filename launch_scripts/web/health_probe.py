@@ -19,7 +19,7 @@ from launch_scripts.plain_text import plain
 from swarm.errors import BusError, ConfigError, SwarmError
 
 NOT_READY = 1
-"""Exit code of a probe that was told so."""
+"""Exit code of a probe for a process that is not ready."""
 _TIMEOUT_S = 5.0
 """Half of what a container's health check grants (10 s, Containerfile), so that the probe itself says why there is
 no answer."""
@@ -31,7 +31,7 @@ _LONGEST = 300
 
 
 class Answer(NamedTuple):
-    """What was told. Nothing of `told` is to be trusted: it came from the network."""
+    """Reply to a probe. Nothing of `told` is to be trusted: it came from the network."""
 
     ok: bool
     told: dict[str, Any]
@@ -50,8 +50,8 @@ class Answer(NamedTuple):
 
 
 def ask(url: str, *, live: bool) -> Answer:
-    """Ask whether processes are ready, or with `live` whether they live. Raises BusError if nobody answers there,
-    ConfigError if that is no address."""
+    """Ask whether processes are ready, or with `live` whether they live. Raises BusError if there is no reply,
+    ConfigError if the address is invalid."""
     host, port, path = _place(url)
     try:
         with socket.create_connection((host, port), _TIMEOUT_S) as connection:

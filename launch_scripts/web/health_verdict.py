@@ -1,4 +1,4 @@
-"""From what processes say of themselves to what a probe is told. No socket."""
+"""Verdict of a probe from the health reports of processes. No socket."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Process(NamedTuple):
         return self.vitals.phase.name.lower(), None, self.vitals.lacks
 
     def fields(self, now_ns: int) -> dict[str, object]:
-        """What is told of the process as JSON."""
+        """Fields of the process as JSON."""
         state, _, lacks = self.seen(now_ns)
         told: dict[str, object] = {"name": self.name, "state": state, "lacks": list(lacks)}
         if self.ended is None and self.vitals is not None and self.vitals.phase is Phase.RUNS:
@@ -51,7 +51,7 @@ class Process(NamedTuple):
 class Verdict(NamedTuple):
     """The answer to a probe.
 
-    missing  what is wrong, or not there, one sentence each; empty if all is well
+    missing  faults and missing parts, one sentence each; empty if all is well
     """
 
     status: str
@@ -70,7 +70,7 @@ class Verdict(NamedTuple):
 
 
 def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Verdict:
-    """Whether processes live (`/healthz`), or are ready (`/readyz`).
+    """Returns whether processes live (`/healthz`), or are ready (`/readyz`).
 
     now_ns  on the monotonic clock of the machine
     """

@@ -48,7 +48,7 @@ class LivePage:
 
     def __init__(self, port: int, stream: tuple[str, int]) -> None:
         self.run: Callable[[], Mapping[str, Any]] = dict
-        """What the page is told of the run whenever it asks, see `run_banner.js`."""
+        """Information about the run that the page polls, see `run_banner.js`."""
         self._files: dict[str, Reply] = {}
         self._fetching = threading.Lock()
         banner = Path(__file__).with_name("run_banner.js").read_bytes()

@@ -1,4 +1,4 @@
-"""What a swarm says of itself, for Prometheus: made into metric families of OpenMetrics, and served.
+"""Metrics of a swarm for Prometheus: made into metric families of OpenMetrics, and served.
 
 Names follow the conventions of Prometheus: the prefix `swarm_`, base units (seconds, bytes, metres, ratios) at the
 end, `_total` on what only grows. A process that its launcher starts again goes on counting; one that was started by
@@ -62,7 +62,7 @@ class Run(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What an observer knows of a run.
+    """Metrics that an observer knows of a run.
 
     run  None where it knows a part of the run only
     up   (role, id) of the processes that are alive
@@ -82,8 +82,8 @@ def figures_of(run: RunInfo | None, latest: LatestState | None) -> Figures:
 
 
 class _Families:
-    """Metric families by name. A name belongs to whoever adds to it first: what processes count has names from the
-    network, and none of them takes the place of ours."""
+    """Metric families by name. The first to add a name owns it: counters of processes have names from the network,
+    and none of them replaces one of ours."""
 
     def __init__(self) -> None:
         self.made: dict[str, tuple[str, Any]] = {}
@@ -185,7 +185,7 @@ def _buckets(buckets: Mapping[int, int], worth: float) -> tuple[list[tuple[str, 
 
 
 class OneScrape(Collector):
-    """What `choose_encoder`'s formats take for a registry."""
+    """Registry interface of `choose_encoder`'s formats."""
 
     def __init__(self, families: Iterable[Metric]) -> None:
         self._families = families
@@ -196,10 +196,10 @@ class OneScrape(Collector):
 
 class MetricsEndpoint:
     """Answers `/metrics`, in the format that the visitor asks for, with what the owner of the figures makes at its
-    next call of `answer`: a visitor's thread only leaves a question and waits. Nobody asks, nothing is made. Probes
-    are answered at once. Raises BusError if the port is taken; 0 is any.
+    next call of `answer`: a visitor's thread only leaves a question and waits. Without a scrape, nothing is made.
+    Probes are answered at once. Raises BusError if the port is taken; 0 is any.
 
-    processes  whose health is told; called on visitors' threads
+    processes  whose health is reported; called on visitors' threads
     """
 
     def __init__(self, port: int, processes: Callable[[], Sequence[Process]], address: str = LOOPBACK) -> None:

@@ -75,8 +75,9 @@ class Server(socketserver.ThreadingTCPServer):
     behind   address of rerun's server, to which requests for the stream are passed
     lasts_s  a connection that does not take the stream is cut after so long
 
-    A visitor beyond the bound is cut where there is a stream. Where there is none, requests are short: it gets in,
-    and the oldest connection is cut for it, so that nobody keeps others out by holding connections open.
+    A visitor beyond the bound is cut where there is a stream. If there is none, requests are short: the new
+    connection is accepted, and the oldest one is closed for it, so that no client keeps others out by holding
+    connections open.
 
     Raises BusError if it cannot listen there. The OSError is its cause.
     """
@@ -182,7 +183,8 @@ class _Visit(BaseHTTPRequestHandler):
         self.connection.settimeout(self.server.lasts_s / 2)
 
     def parse_request(self) -> bool:
-        """Whether a method is to answer: of HTTP/2 nothing more is read here, of a stranger nothing is answered."""
+        """Returns True if a method is to answer: an HTTP/2 request is read no further, a foreign one gets no
+        answer."""
         if self.raw_requestline == _HTTP_2 and self.server.behind is not None:
             self._pass_on(self.server.behind, _HTTP_2)
             return False
@@ -224,7 +226,7 @@ class _Visit(BaseHTTPRequestHandler):
         """Joins the visitor with rerun's server, until one of them has no more to say."""
         self.close_connection = True
         self.connection.settimeout(0.0)
-        head += cast("io.BufferedReader", self.rfile).peek()  # what has been read beyond the head already
+        head += cast("io.BufferedReader", self.rfile).peek()  # bytes read beyond the head
         with socket.create_connection(behind, timeout=SEND_WITHIN_S) as inner:
             self.server.keep(self.connection)
             self.connection.settimeout(SEND_WITHIN_S)

@@ -1,4 +1,4 @@
-"""The core: what a vehicle and the swarm say, and time, become what is said to both. No network, no clock."""
+"""The core: turns messages of a vehicle and the swarm, and time, into messages to both. No network, no clock."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ _MOST_SAID = 64
 _WARN_NS = 4 * NS_PER_S
 """Texts of the vehicle are passed on this often at most: 15 a minute, a quarter of `_MOST_SAID`."""
 _MOST_M_PER_S = 340.0
-"""The speed of sound, as `MOST_M_PER_S` of bodies: the report of one that is told to be quicker is refused by all
-hosts."""
+"""The speed of sound, as `MOST_M_PER_S` of bodies: hosts refuse the report of a faster one."""
 
 
 class Report(Struct, frozen=True):
-    """Where the vehicle is, as `Vehicle.at` has it."""
+    """Position of the vehicle, as `Vehicle.at` has it."""
 
     x_m: float
     y_m: float
@@ -68,14 +67,14 @@ Action = codec.Outgoing | Report | Withdraw | Follow | Unfollow | Tell
 
 
 class Adapter:
-    """`hear`, `hear_way` and `hear_swarm` take what comes, as often as it comes; `tick` returns what is due.
+    """`hear`, `hear_way` and `hear_swarm` take messages at any rate; `tick` returns due actions.
 
-    The vehicle is there once its heartbeat and a place on the terrain were heard, and is gone when either is silent
-    for `lost_s` or it leaves the terrain. Gone means: its target is given up, nothing is said to it but heartbeats,
-    and its body is withdrawn if it flies. One that drives stands where it was heard last, as far as anybody knows:
-    its body stays.
+    The vehicle exists once its heartbeat and a position on the terrain were received. It is lost when either is
+    missing for `lost_s` or it leaves the terrain. Gone means: its target is given up, nothing is said to it but
+    heartbeats, and its body is withdrawn if it flies. One that drives stands where it was heard last, as far as
+    anybody knows: its body stays.
 
-    kind  what was first heard of it; None before
+    kind  its type and make, from its first heartbeat; None before
     """
 
     def __init__(self, frame: Frame, wishes: Wishes) -> None:
@@ -87,16 +86,16 @@ class Adapter:
         """The newest position, and its place in the terrain's frame; None outside of it."""
         self._beat_ns = 0
         self._position_ns: int | None = None
-        """When a position was heard; None before, and again once the vehicle is gone."""
+        """Time of the last position; None before the first, and again once the vehicle is lost."""
         self._there = False
         self._reported: codec.Position | None = None
-        """The newest that was told to the swarm; None while the vehicle is nowhere for it."""
+        """Newest report to the swarm; None while the vehicle has no position for it."""
         self._way: Way = ()
         self._swarm_up = True
         self._guide: Guide | None = None
         """None: the vehicle is not driven."""
         self._arming: Arming | None = None
-        """None: arming and modes are somebody else's."""
+        """None: another controller arms the vehicle and sets its mode."""
         self._tells: list[str] = []
         self._told: set[str] = set()
         """Sentences of this minute."""
@@ -156,7 +155,7 @@ class Adapter:
     # --- what is due ----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> list[Action]:
-        """Returns what is due now, in order. To be called twenty times a second at least."""
+        """Returns due actions, in order. To be called twenty times a second at least."""
         actions: list[Action] = []
         if now_ns >= self._beat_due_ns:
             self._beat_due_ns = now_ns + BEAT_NS
@@ -172,7 +171,7 @@ class Adapter:
         return actions + self._news(now_ns)
 
     def stop(self, now_ns: int) -> list[Action]:
-        """Returns the last words to the vehicle: it is to stop, as nobody avoids it any more."""
+        """Returns the final commands to the vehicle: it is to stop, as other vehicles avoid it no more."""
         self._swarm_up = False
         return self._hold(now_ns, last=True) if self._there else []
 
@@ -220,7 +219,7 @@ class Adapter:
         if self._at is None or (self.kind is not None and flies(self.kind, self._wishes.altitude_m)):
             actions.append(Withdraw())
         else:
-            # Where to it may have gone nobody knows.
+            # Its destination is then unknown.
             actions.append(Report(*self._at[1], None, _speed(self._at[0])))
         # It is back with a place of its own: another vehicle may be the next to speak, and be somewhere else.
         self._at = self._position_ns = self._reported = None
@@ -247,7 +246,7 @@ class Adapter:
         return actions
 
     def _news(self, now_ns: int) -> list[Action]:
-        """Returns what is to be told, each sentence once a minute."""
+        """Returns new sentences for people, each once a minute."""
         if now_ns >= self._minute_ends_ns:
             self._minute_ends_ns = now_ns + _SAY_AGAIN_NS
             self._told.clear()

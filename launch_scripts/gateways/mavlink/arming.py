@@ -1,8 +1,9 @@
-"""Arming and modes, with `--arm` only: the wheel is taken once, and whoever takes it from us keeps it.
+"""Arming and modes, with `--arm` only: command authority is taken once, and any other controller that takes it
+keeps it.
 
-What autopilots have in common with none other is here, too: numbers of modes, where missions begin, who wants a
-stream. Sources: px4_custom_mode.h of PX4, mode.h of ArduCopter, Rover, ArduPlane and ArduSub, and their pages on
-guided and offboard modes.
+Differences between autopilots are here, too: numbers of modes, first items of missions, and required streams.
+Sources: px4_custom_mode.h of PX4, mode.h of ArduCopter, Rover, ArduPlane and ArduSub, and their pages on guided and
+offboard modes.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Modes:
 
 @dataclass(frozen=True)
 class Kind:
-    """How one make of vehicle wants to be driven.
+    """Command sequence of one make of vehicle.
 
     make   MAV_AUTOPILOT
     flies  by its MAV_TYPE; None if that says nothing
@@ -64,7 +65,7 @@ class Kind:
 
     @property
     def first_item(self) -> int:
-        """Of a mission: before it ArduPilot has home."""
+        """First item of a mission: before it ArduPilot has home."""
         return int(self.make == ARDUPILOT)
 
     @property
@@ -100,10 +101,10 @@ class Arming:
     """Brings a vehicle into the mode in which it drives for us, armed, and into hold while there is no way.
 
     Once it has seen the vehicle armed and driving, a mode that it has not set, or a vehicle that is disarmed, is
-    somebody's word (a pilot's, or a fail-safe's): from then on it commands nothing.
+    the command of another (a pilot, or a fail-safe): from then on it commands nothing.
 
     mode       in which the vehicle drives for us; None if it has no modes
-    takeoff_m  height to which it is told to take off; None: it is not, or its mission says so
+    takeoff_m  height for take-off; None: no take-off, or by its mission
     why        it commands nothing any more: half a sentence; empty while it does
     """
 
@@ -116,7 +117,7 @@ class Arming:
         """Times that MISSION_START is still said."""
         self._taken = False
         self._holding = False
-        """What was commanded last is hold, not driving."""
+        """True if the last command was hold, not driving."""
         self._held = False
         """Hold was commanded since driving was seen."""
         self._commands = 0
@@ -157,7 +158,7 @@ class Arming:
         return []
 
     def _check_taken(self, beat: codec.Beat, now_ns: int) -> None:
-        """Whether the vehicle still is as we left it."""
+        """Checks whether the vehicle still is as we left it."""
         modes = self._kind.modes
         if self.why:
             return

@@ -20,7 +20,8 @@ from swarm.client.terrain_frame import Point
 from swarm.clock import NS_PER_S
 
 MOST_POINTS = 60
-"""Of one mission: what lies behind is uploaded when half of it is driven. Uploads take a round trip an item."""
+"""Limit of one mission: further points are uploaded when half of it is driven. Uploads take a round trip an
+item."""
 _STRAIGHT = 1e-9
 _NEXT_NS = 3 * NS_PER_S
 """From one mission to the next: a target that moves changes its routes several times a second."""
@@ -38,12 +39,12 @@ _STREAMED_FIRST_NS = NS_PER_S
 _REPEAT_NS = NS_PER_S
 """ArduPilot drives to the last setpoint; it is said again, as any message may be lost."""
 _HOLDS = 3
-"""Times that a vehicle is told to stay where it is."""
+"""Repetitions of the command to hold."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What is wanted of the vehicle.
+    """Requested state of the vehicle.
 
     target      it follows routes to it; None: it is avoided, and no more
     drive       how it is driven there
@@ -72,7 +73,7 @@ Way = tuple[Point, ...]
 
 
 def flies(kind: Kind, altitude_m: float | None) -> bool:
-    """Whether a vehicle does: one whose type says nothing, if somebody says how high."""
+    """Returns True if a vehicle flies: one of unknown type does if an altitude is given."""
     return altitude_m is not None if kind.flies is None else kind.flies
 
 
@@ -93,7 +94,7 @@ def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Guide | str:
 
 
 def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
-    """Returns what arms a vehicle that can be driven as it is wished; None if that is somebody else's."""
+    """Returns the arming of a vehicle that can be driven as requested; None if another controller arms it."""
     if not wishes.arm:
         return None
     guided = wishes.drive == "guided"
@@ -105,7 +106,7 @@ def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
 
 
 class _Guide:
-    """What missions and setpoints have in common.
+    """Common part of missions and setpoints.
 
     above     of MAVLink: the frame of `height_m`
     height_m  None: the vehicle stays on its ground
@@ -131,7 +132,7 @@ class Upload:
         self.accepted = False
         self.why = ""
         self._said: codec.MissionCount | codec.MissionItem = codec.MissionCount(len(items))
-        """What is said next, or was last."""
+        """The next message, or the last one."""
         self._due_ns: int | None = None
         """When it is said (again); None: at once."""
         self._tries = self._asked = 0
@@ -155,7 +156,7 @@ class Upload:
                 self.accepted = isinstance(self._said, codec.MissionItem) and self._said.seq == len(self.items) - 1
 
     def tick(self, now_ns: int) -> codec.MissionCount | codec.MissionItem | None:
-        """Returns what is to be said now."""
+        """Returns the messages to send now."""
         if self.accepted or self.why or (self._due_ns is not None and now_ns < self._due_ns):
             return None
         if self._tries == MOST_TRIES:
@@ -182,7 +183,7 @@ class Missions(_Guide):
     _due_ns = 0
 
     def forget(self) -> None:
-        """The link is lost: nobody knows what the vehicle has."""
+        """Forgets the vehicle's mission after the link was lost."""
         self._upload, self._seen, self._accepted = None, (), False
 
     def on_mission_message(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
@@ -191,17 +192,17 @@ class Missions(_Guide):
             self._upload.on_mission_message(message)
 
     def ready(self, now_ns: int) -> bool:
-        """Whether the vehicle may be brought into the mode in which it drives for us."""
+        """Returns True if the vehicle may be brought into the mode in which it follows our commands."""
         return self._accepted
 
     def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
-        """Returns what is to be said now as there is no way any more."""
+        """Returns the messages to send now that there is no route any more."""
         under_way = self._upload is not None
         self.forget()
         return [codec.MissionCancelled()] if under_way else []
 
     def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
-        """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
+        """Returns the messages that make the vehicle follow a route, with sentences for people."""
         if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
             left = rest(way, place, self._frame.grid.resolution_m)
             self._seen, self._sent, self._cut = way, left[:MOST_POINTS], len(left) > MOST_POINTS
@@ -257,7 +258,7 @@ class Setpoints(_Guide):
     """(latitude, longitude)"""
 
     def forget(self) -> None:
-        """As of missions, as the others are."""
+        """Same as for missions."""
         self._goal, self._began_ns, self._holds_left = None, None, 0
 
     def ready(self, now_ns: int) -> bool:
@@ -307,8 +308,8 @@ def turns(points: Sequence[Point]) -> list[Point]:
 
 
 def rest(points: Sequence[Point], place: Point, lead_m: float) -> list[Point]:
-    """Returns what is left of a line for whoever is at a place: the point of it that lies `lead_m` after the
-    nearest, and the turns behind that. Its end at least, unless the line is empty."""
+    """Returns the remainder of a line from a location: the point of it that lies `lead_m` after the nearest, and
+    the turns behind that. Its end at least, unless the line is empty."""
     if len(points) < 2:
         return list(points)
     at, share = along(points, place, lead_m)

@@ -1,7 +1,7 @@
 """The link to a vehicle: bytes in and out of UDP, TCP or a serial port, hardly ever waiting.
 
-pymavlink has connections of its own. They answer whoever has sent them anything, keep what strangers name, and wait
-for seconds where a peer is gone.
+pymavlink has connections of its own. They reply to any sender, keep the ids of foreign senders, and wait for
+seconds while a peer is missing.
 """
 
 from __future__ import annotations
@@ -100,15 +100,15 @@ class UdpLink:
                 raise BusError(f"cannot listen at {address}: {error.strerror or error}") from error
 
     def read(self, within_s: float) -> bytes | None:
-        """Returns what has come, after waiting for it for so long; None if nothing has."""
+        """Returns received bytes, after waiting up to a timeout; None if there are none."""
         if select.select([self._socket], [], [], within_s)[0]:
-            with contextlib.suppress(OSError):  # nobody was there for what we have sent
+            with contextlib.suppress(OSError):  # no peer was there for our message
                 data, self._last = self._socket.recvfrom(_MOST_BYTES)
                 return data
         return None
 
     def answer_last(self) -> None:
-        """What was read last is the vehicle's: what is written goes where it came from."""
+        """Remembers the sender of the last message; replies go there."""
         self._peer = self._last
 
     def write(self, data: bytes) -> None:
@@ -121,10 +121,10 @@ class UdpLink:
 
 
 class StreamLink:
-    """A TCP connection or a serial port, opened again once a second while it is gone. All three raise OSError.
+    """A TCP connection or a serial port, opened again once a second while it is closed. All three raise OSError.
 
     made  opens it
-    take  returns what has come on it; nothing if it was closed
+    take  returns received bytes; empty if it was closed
     give  sends bytes on it
     """
 

@@ -1,7 +1,7 @@
 """MAVLink's messages as checked values, and the bytes of a link from and to them.
 
-Whatever comes is hostile until it has passed `Wire.read`. Other vehicles and ground stations on the link are not
-heard. Numbers are those of MAVLink's common.xml.
+Received bytes are hostile until they have passed `Wire.read`. Other vehicles and ground stations on the link are
+not heard. Numbers are those of MAVLink's common.xml.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ARMED = 128
 _WARNING = 4
 _CANCELLED = 15
 _POSITION_ONLY, _PLACE_ONLY = 0x0DF8, 0x0DFC
-"""Type masks of a setpoint: what is ignored. The second ignores the height, too."""
+"""Type masks of a setpoint: the fields that are ignored. The second ignores the height, too."""
 _NOT_KNOWN = 65535
 _SIGNING_EPOCH_S = 1_420_070_400
 """2015-01-01, from which signatures count in units of 10 us."""
@@ -165,7 +165,7 @@ class Wire:
     """One link's MAVLink.
 
     sysid   of the vehicle; None: the first autopilot that is heard
-    key     32 bytes: what is said is signed, and what is not signed by it is not heard; None: no signatures
+    key     32 bytes: messages are signed, and messages without its signature are rejected; None: no signatures
     now_s   Unix time, from which signatures count up
     """
 
@@ -184,7 +184,7 @@ class Wire:
     def read(self, data: bytes, *, whole: bool) -> list[Incoming]:
         """Returns the vehicle's messages in what a link has brought.
 
-        whole  no message goes on in what comes next, as in a datagram
+        whole  no message continues in the next piece, as in a datagram
         """
         try:
             found = self._mav.parse_buffer(data) or []
@@ -242,7 +242,8 @@ class Wire:
 
 
 def _parser(common: Any) -> Any:
-    """pymavlink's, mended: a forged signature of a late time shut out the vehicle, whose own times are earlier."""
+    """pymavlink's parser with one fault repaired: a forged signature of a late time shut out the vehicle, whose own
+    times are earlier."""
 
     class Parser(common.MAVLink):  # type: ignore[misc]
         def check_signature(self, msgbuf: bytearray, src_system: int, src_component: int) -> bool:

@@ -15,9 +15,9 @@ from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, V
 
 _TURN_S = 0.02
 _MOST_READ = 200
-"""Pieces read in one turn, so that a flood leaves time for what is due."""
+"""Pieces read in one turn, so that a flood leaves time for due work."""
 _LAST_WORDS = 3
-"""Times that the last words are said: nobody answers them."""
+"""Repetitions of the final commands, which have no reply."""
 
 
 def read_key(path: Path) -> bytes:
@@ -58,7 +58,7 @@ def run(
         try:
             shell = Shell(swarm, link, Wire(sysid, key, time.time()), wishes, tell)
             tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
-            with stop_requests() as stopping:  # so that the vehicle is told to stop
+            with stop_requests() as stopping:  # the vehicle is commanded to stop
                 try:
                     while not stopping():
                         shell.turn()
@@ -71,7 +71,7 @@ def run(
 
 
 class Shell:
-    """One turn after the other: what the link and the swarm have brought, then what is due."""
+    """One turn after the other: input of the link and the swarm, then due actions."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Shell:
         swarm.on_problem(tell)
 
     def turn(self) -> None:
-        """Reads what has come, and does what is due."""
+        """Reads input, and performs due actions."""
         within_s = _TURN_S
         for _ in range(_MOST_READ):
             data = self._link.read(within_s)
@@ -111,7 +111,7 @@ class Shell:
         for action in self._adapter.tick(self._now_ns()):
             try:
                 self._perform(action)
-            except SwarmError as error:  # what is said to the vehicle is said all the same
+            except SwarmError as error:  # messages to the vehicle are sent nevertheless
                 failure = error
         if failure is not None:
             raise failure

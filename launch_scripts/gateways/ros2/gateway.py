@@ -1,7 +1,7 @@
-"""What ROS is told of a swarm: its state and the time in, messages to put out. Core: no bus, no clock.
+"""Outgoing side of the gateway: the swarm's state and the time in, messages to publish out. Core: no bus, no clock.
 
-Each row of the table of topics has a function here which yields its messages. It is called at the row's rate; what
-comes late is left out, never made up for. Topics of vehicles and targets come and go with them.
+Each row of the table of topics has a function here which yields its messages. It is called at the row's rate; late
+calls are skipped, never repeated. Topics of vehicles and targets come and go with them.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from swarm.clock import NS_PER_S
 from swarm.grid import Window
 
 MOST_VEHICLES = 1000
-"""More are not told: each has topics of its own, and each topic a token."""
+"""Limit of published vehicles: each has topics of its own, and each topic a token."""
 MOST_CUBES = 5000
 """The marked cells of each kind that are drawn; all of them are in the map."""
 _STEP_HZ, _SELDOM_HZ = 10.0, 1.0
-"""What has no rate of its own is looked at so often; what is large less often."""
+"""Rates of topics without a rate of their own, and of large ones."""
 _SELDOM = ("map", "plan")
 _STANDS_NS = NS_PER_S // 2
-"""A vehicle of which no other place was told for so long stands."""
+"""A vehicle without another position for this time is at rest."""
 _BAD_STATES = ("stranded", "lost")
 ToWgs84 = Callable[[float, float], tuple[float, float]]
 
@@ -76,11 +76,11 @@ Action = Declare | Remove | Put
 
 @dataclass(frozen=True)
 class Health:
-    """What the shell knows of its two sides.
+    """State of the gateway's two sides, as the shell knows it.
 
     run         id of the run
     swarm_up, ros_up  whether the links to the routers are up
-    counts      what was put, dropped and refused since the start
+    counts      messages published, dropped and refused since the start
     """
 
     run: str = ""
@@ -90,7 +90,7 @@ class Health:
 
 
 class _Now(NamedTuple):
-    """The moment of a tick, and what is seen then."""
+    """Time and view of a tick."""
 
     now_ns: int
     stamp_ns: int
@@ -104,16 +104,16 @@ _Told = Iterator[tuple[str | None, Any]]
 
 
 class Moving:
-    """One vehicle as ROS is told of it. Its speed is the difference of the last two places that were told, by a
-    clock that never leaps: so are all times here.
+    """State of one vehicle as published to ROS. Its speed is the difference of its last two positions, by a clock
+    that never leaps: so are all times here.
 
     id              in the swarm
     frames          the one that does not move, and its own
-    place           a heading of None is told as the last known
+    place           a heading of None is published as the last known one
     speed_m_per_s   forward; negative backwards
     turn_rad_per_s  clockwise
     route           float64 (n, 2): x, y; what it follows
-    route_is_new    it was not told yet
+    route_is_new    it was not published yet
     """
 
     def __init__(self, id: str, frames: tuple[str, str], seen: SeenVehicle, now_ns: int, made: RosMessages) -> None:
@@ -133,7 +133,7 @@ class Moving:
             if now_ns - self._moved_ns > _STANDS_NS:
                 self.speed_m_per_s = self.turn_rad_per_s = 0.0
             return
-        # Of two places that were told long apart the first was left at an unknown time: no less than a report ago.
+        # Of two positions far apart in time, the first was left at an unknown time: no less than a report ago.
         since_s = (now_ns - self._moved_ns) / NS_PER_S
         if since_s > 0:
             east_m, north_m = seen.x_m - x_m, seen.y_m - y_m
@@ -148,10 +148,10 @@ class Moving:
 
 
 class Gateway:
-    """What one gateway tells of one run.
+    """Outgoing topics of one gateway about one run.
 
-    settings  what is forwarded, and as what
-    map       the frame in which places are told
+    settings  forwarded topics, and their types
+    map       frame of published positions
     feed      the shared map
     to_wgs84  (latitude, longitude) of a place of the terrain; None where there are none
     """
@@ -168,19 +168,19 @@ class Gateway:
         self._targets: dict[str, str] = {}
         """Name in ROS -> id."""
         self._refused: set[str] = set()
-        """Vehicles and targets that are not told; said once each."""
+        """Vehicles and targets that are not published; each is reported once."""
         self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
         self._pose = ros_messages.packed_pose(self._messages)
         self._transforms: dict[str | None, PackedPlaces] = {}
-        """Of each group, since vehicles have come or gone last."""
+        """Of each group, since its vehicles changed last."""
         self._fresh: list[Window] = []
         """Windows that have changed since markers were put last."""
         self._changed: list[Window] = []
         """Windows that have changed since the map or its updates were put last."""
         self._due_ns = dict.fromkeys(self._rows, 0)
-        """When each row is told again, by the clock that never leaps."""
+        """Due time of each row, by the clock that never leaps."""
         always = tuple(self._channel(row.name) for row in self._rows.values() if row.per is None)
         self._first: list[Action] = [Declare(always)]
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
@@ -209,12 +209,12 @@ class Gateway:
         health: Health,
         robots: Collection[str] = (),
     ) -> list[Action]:
-        """Returns what is to be done now, in order.
+        """Returns due actions, in order.
 
         now_ns        by a clock that never leaps, by which all rates are kept
         stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
         swarm_now_ns  by the swarm's clocks, by which marks expire
-        robots        vehicles which are not told, as they tell ROS themselves where they are
+        robots        vehicles which are not published, because they publish their own positions to ROS
         """
         due = {name for name, at_ns in self._due_ns.items() if now_ns >= at_ns}
         if not due:
@@ -241,8 +241,8 @@ class Gateway:
     # --- who is there ---------------------------------------------------------------------------------------------
 
     def _follow(self, now: _Now) -> list[Action]:
-        """Takes in who is where. Topics of vehicles that are new are declared, of those that have left taken down.
-        A target of a scenario stays."""
+        """Updates positions. Topics of vehicles that are new are declared, of those that have left taken down. A
+        target of a scenario stays."""
         gone = [name for name, moving in self._vehicles.items() if moving.id not in now.vehicles]
         actions: list[Action] = [Remove(self._channels(VEHICLE, name)) for name in gone]
         for name in gone:
@@ -262,7 +262,8 @@ class Gateway:
         return actions
 
     def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
-        """Returns the name of a vehicle that is told from now on; None of one that is known, or not told."""
+        """Returns the name of a vehicle that is published from now on; None for a known one, or one that is not
+        published."""
         name = ros_name(id)
         moving = self._vehicles.get(name)
         if moving is not None and moving.id == id:
@@ -340,7 +341,8 @@ class Gateway:
         points_m = np.array([each.place[:2] for each in told], np.float64).reshape(-1, 2)
         yield None, self._messages.pose_array(now.stamp_ns, points_m, [each.place[2] for each in told])
 
-    # --- targets. What nobody tracks may be anywhere: it is told again when somebody does -------------------------
+    # --- targets. An untracked target may be anywhere: it is published again when a tracker returns
+    # -------------------------
 
     def _tracked(self, now: _Now) -> dict[str, SeenTarget]:
         """By name in ROS."""
@@ -383,7 +385,7 @@ class Gateway:
     # --- how all are ----------------------------------------------------------------------------------------------
 
     def _tell_diagnostics(self, now: _Now) -> _Told:
-        """Of vehicles, targets, map and gateway: whether each is well, a sentence, and values."""
+        """Publishes for vehicles, targets, map and gateway: whether each is well, a sentence, and values."""
         states = Counter(each.state for each in now.vehicles.values())
         bad = ", ".join(f"{states[state]} {state}" for state in _BAD_STATES if states[state])
         lost = sorted(each.id for each in now.targets.values() if each.lost)

@@ -23,7 +23,7 @@ from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M
 
 ROS_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where rmw_zenohd listens unless it is told otherwise: the same as a swarm's router."""
+"""Default endpoint of rmw_zenohd: the same as a swarm's router."""
 MOST_HZ, MOST_ROBOT_HZ = 100.0, 50.0
 """Bounds of rates. A robot's topic is read once a turn of the gateway, which takes `TICK_S`, 0.02 s: more than 50
 times a second the swarm cannot hear of it. Bounds of topics to ROS are twice that and are never reached."""
@@ -42,7 +42,7 @@ Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
 class RosSide(Section, frozen=True, kw_only=True):
     """The ROS side.
 
-    endpoint      of its Zenoh router, rmw_zenohd; a swarm's router has the same port unless told otherwise
+    endpoint      of its Zenoh router, rmw_zenohd; a swarm's router has the same port by default
     in_the_clear  the endpoint may be on another machine: ROS nodes hear and say all unencrypted there
     domain        ROS_DOMAIN_ID of the nodes
     distribution  of the nodes; messages of one are not heard by another whose types differ
@@ -70,7 +70,7 @@ class Frames(Section, frozen=True, kw_only=True):
 
 
 class SwarmSide(Section, frozen=True, kw_only=True):
-    """The swarm's side. What options of the command say counts more.
+    """The swarm's side. Options of the command take precedence.
 
     connect      endpoint of a router of the swarm; if not given, the newest run of this machine that runs
     namespace    first chunk of the swarm's keys; if not given, that of the run, or `swarm`
@@ -90,7 +90,7 @@ class SwarmSide(Section, frozen=True, kw_only=True):
 
 
 class TopicSettings(Section, frozen=True, kw_only=True):
-    """What is changed of a topic of the table.
+    """Changes to a topic of the table.
 
     topic  its name in ROS, with {vehicle} or {target} where the table has them; empty: as in the table
     hz     how often, at most; 0: as in the table
@@ -114,9 +114,10 @@ class Robots(Section, frozen=True, kw_only=True):
     hz         the swarm hears of it at most so often
     group      whose it is
     vehicle_class  whose routes it gets: one of the scenario's classes
-    target     whom it follows; not given: nobody, until it is given a goal
+    target     the target that it follows; not given: none, until it is given a goal
     plan       topic of its route
-    goal       topic of the place to go: put when it follows a target, heard when somebody gives it a goal
+    goal       topic of the goal: published when it follows a target, subscribed when another program gives it a
+               goal
     """
 
     id: RosName | None = None
@@ -152,7 +153,7 @@ class ZoneSettings(Section, frozen=True, kw_only=True):
 
     name          of the zone
     topic         of the polygon, geometry_msgs/PolygonStamped
-    pace_s_per_m  how long a metre takes there; not given: nobody enters
+    pace_s_per_m  pace there; not given: lethal
     for_s         it ends by itself so long after it was drawn last; not given: it stands until it is taken away
     """
 
@@ -178,7 +179,7 @@ class GridSettings(Section, frozen=True, kw_only=True):
 
 
 class IncomingSettings(Section, frozen=True, kw_only=True):
-    """What may come in.
+    """Allowed incoming topics.
 
     robots        vehicles of the swarm which ROS moves
     targets       external targets of the scenario that ROS moves
@@ -217,7 +218,7 @@ class Settings(Section, frozen=True, kw_only=True):
 
     vehicles  ids of vehicles that ROS hears of, with * and ?
     forward   names of topics of the table that are forwarded; empty: all
-    topics    what is changed of topics of the table, by name
+    topics    changes to topics of the table, by name
     incoming  what may come in from ROS; nothing unless it is named
     """
 
@@ -274,7 +275,7 @@ def load_settings(path: Path | None, options: Mapping[str, object] | None = None
 
 
 def parse_settings(text: str, source: str = "settings", options: Mapping[str, object] | None = None) -> Settings:
-    """As `load_settings`, of a text."""
+    """Like `load_settings`, from a text."""
     raw = parse_toml(text, source, ConfigError)
     said = {key: value for key, value in (options or {}).items() if value is not None}
     for key, value in said.items():
@@ -347,7 +348,7 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
 
 
 def _check_topic(topic: str, part: str | None, where: str) -> None:
-    """Zenoh refuses what is none: empty parts between slashes, a slash at the end.
+    """Zenoh refuses invalid topics: empty parts between slashes, a slash at the end.
 
     part  what must stand in it once, such as VEHICLE; None: nothing
     """
@@ -360,7 +361,7 @@ def _check_topic(topic: str, part: str | None, where: str) -> None:
 
 
 def _check_ros_endpoint(ros: RosSide, where: str) -> None:
-    """Raises ConfigError on what is no endpoint, and on another machine unless that is allowed."""
+    """Raises ConfigError on an invalid endpoint, and on another machine unless that is allowed."""
     match = re.fullmatch(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", ros.endpoint)
     if match is None or not 0 < int(match[2]) <= 65535:
         raise ConfigError(f"{where}: {ros.endpoint!r} is not an endpoint such as {ROS_ENDPOINT}")

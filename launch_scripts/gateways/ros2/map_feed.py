@@ -1,4 +1,4 @@
-"""The shared map for ROS: a replica that merges what an observer hears, and what has changed of it. Core: no bus.
+"""The shared map for ROS: a replica that merges the marks of an observer, and its changes. Core: no bus.
 
 With the terrain of the run its cost map is that of every process. Without it the map holds marks alone, and all
 else is unknown.
@@ -57,13 +57,13 @@ class MapFeed:
         self._best_s_per_m = float(passable.min()) if len(passable) else QUICK_S_PER_M
         self._told_ns: int | None = None
         self._changed = False
-        """Since the whole map was told last, at `_told_ns`."""
+        """Changes since the whole map was published last, at `_told_ns`."""
         self._marked: dict[int, tuple[_Cells, _Cells, _Cells]] = {}
         """Tile -> cells of it that are marked as lethal, and with a pace, and those of zones."""
         self._redraw_due_ns = 0
 
     def merge(self, sets: Sequence[MarkSet], now_ns: int, swarm_now_ns: int) -> None:
-        """Takes in sets of marks, and lets expire what has expired.
+        """Merges mark sets, and drops expired marks.
 
         now_ns        by a clock that never leaps
         swarm_now_ns  by the swarm's clocks
@@ -98,7 +98,7 @@ class MapFeed:
         return windows
 
     def whole_is_due(self, now_ns: int) -> bool:
-        """Whether the whole map is to be told now; then it is told.
+        """Returns True if the whole map is to be published now, and counts it as published.
 
         now_ns  by a clock that never leaps
         """

@@ -2,7 +2,7 @@
 
 Our row 0 is in the north, that of nav_msgs/OccupancyGrid and map_msgs/OccupancyGridUpdate in the south, so rows are
 flipped, once each way: here. A drawing says what to draw in metres of the terrain. All drawings of an instant make
-one visualization_msgs/MarkerArray which first takes away what was drawn before: so nobody needs to remember it.
+one visualization_msgs/MarkerArray which first deletes the previous drawings: no client has to remember them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def occupancy_of(pace_s_per_m: NDArray[np.floating[Any]], best_s_per_m: float) -
     0 is as quick as can be, 50 half as quick, 98 fifty times slower or worse. It depends on no other cell, so a
     window of an update has the values that it would have in the whole map. Lethal (inf) is 100, NaN unknown, -1.
 
-    pace_s_per_m  float, s/m; inf where nobody may go, NaN where nothing is known
+    pace_s_per_m  float, s/m; inf where no vehicle may go, NaN where it is unknown
     best_s_per_m  pace of the quickest ground there may be, above 0
     """
     pace = np.asarray(pace_s_per_m)
@@ -59,7 +59,7 @@ def occupancy_of(pace_s_per_m: NDArray[np.floating[Any]], best_s_per_m: float) -
 
 
 def flipped(window: Window, rows: int) -> Window:
-    """A window of a grid of so many rows, with its rows counted from the other side. Its own inverse."""
+    """Returns a window of a grid with `rows` rows, with its rows counted from the other side. Its own inverse."""
     return Window(rows - window.row1, window.col0, rows - window.row0, window.col1)
 
 
@@ -102,7 +102,7 @@ def _flat(occupancy: Occupancy) -> NDArray[np.int8]:
 
 
 class Form(enum.IntEnum):
-    """How points are drawn: the numbers are ROS's."""
+    """Form of drawn points: the numbers are ROS's."""
 
     LINE = 4
     """Through all points."""
@@ -116,7 +116,7 @@ class Form(enum.IntEnum):
 class Drawing:
     """One thing to draw.
 
-    layer     what can be switched on and off together, such as "routes" or "zones"
+    layer     group that is switched on and off together, such as "routes" or "zones"
     points_m  float64 (n, 2): x, y
     size_m    width of a line, or side of a cube
     """

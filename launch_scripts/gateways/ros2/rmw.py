@@ -26,7 +26,7 @@ _NODE_PARTS = 9
 
 
 class Kind(StrEnum):
-    """What an endpoint is, as its token says it."""
+    """Kind of an endpoint, as in its token."""
 
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
@@ -43,7 +43,7 @@ class Qos(Enum):
     DEFAULT = "1:2:1,10:,:,:,,"
     """Reliable, volatile, the last 10."""
     LATCHED = "1:1:1,1:,:,:,,"
-    """Reliable, transient local, the last one: who comes late gets it."""
+    """Reliable, transient local, the last one: a late subscriber gets it."""
     SENSOR = "2:2:1,5:,:,:,,"
     """Best effort, volatile, the last 5."""
     TRANSFORMS = "1:2:1,100:,:,:,,"
@@ -131,7 +131,7 @@ def type_name_of(dds: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """What goes with each message, request and reply.
+    """Attachment of each message, request and reply.
 
     sequence   counted by the sender from 1 on; a reply repeats its request's
     stamp_ns   when it was sent, since 1970
@@ -184,7 +184,7 @@ _MEETS_AND_DOES = {
     Kind.CLIENT: (Kind.SERVICE, "asks"),
 }
 MOST_TOLD = 1000
-"""Sentences, after which nothing more is told."""
+"""Limit of sentences, after which no more are reported."""
 
 
 class PeerWatch:
@@ -194,8 +194,8 @@ class PeerWatch:
         self._told: set[str] = set()
 
     def sentences(self, seen: Endpoint, ours: Iterable[Endpoint]) -> list[str]:
-        """What keeps a peer's endpoint from meeting one of ours of the same name: one sentence; none if nothing
-        does, or if it was told before."""
+        """Returns one sentence about the reason why a peer's endpoint does not match one of ours of the same name;
+        empty if there is none, or if it was reported before."""
         meets, does = _MEETS_AND_DOES[seen.kind]
         faults = [_why_not(seen, mine) for mine in ours if mine.topic == seen.topic and mine.kind is meets]
         if not faults or None in faults:

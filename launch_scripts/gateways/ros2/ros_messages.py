@@ -38,7 +38,7 @@ Place = tuple[float, float, float | None]
 
 
 class Level(enum.IntEnum):
-    """How bad something is: of diagnostics."""
+    """Level of a diagnostic message."""
 
     OK = 0
     WARN = 1
@@ -46,7 +46,7 @@ class Level(enum.IntEnum):
 
 
 class Severity(enum.IntEnum):
-    """How bad something is: of log messages."""
+    """Severity of a log message."""
 
     INFO = 20
     WARN = 30
@@ -58,7 +58,7 @@ class Severity(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class RosMap:
-    """The frame in which all is told: its origin is the outer south-west corner of the grid.
+    """Frame of all published positions: its origin is the outer south-west corner of the grid.
 
     It is not that of the terrain's system, as RViz computes in float32: half a metre at 5,200 km north.
 
@@ -70,7 +70,8 @@ class RosMap:
 
     @property
     def origin_m(self) -> tuple[float, float]:
-        """Where the frame's origin lies in metres of the terrain: what `TERRAIN_FRAME` -> `frame` translates by."""
+        """Position of the frame's origin in metres of the terrain: the translation of `TERRAIN_FRAME` ->
+        `frame`."""
         return self.grid.west_m, self.grid.north_m - self.grid.rows * self.grid.resolution_m
 
     def to_ros(self, x_m: Metres, y_m: Metres) -> tuple[Metres, Metres]:
@@ -112,7 +113,7 @@ def heading_of(yaw_rad: float) -> float:
 
 
 def quaternion_of(heading_rad: float | None) -> tuple[float, float, float, float]:
-    """(x, y, z, w) of what stands level and looks there; without a heading it looks east, along x."""
+    """Returns (x, y, z, w) of a level pose with this heading; without a heading it looks east, along x."""
     if heading_rad is None:
         return _LEVEL
     half_rad = yaw_of(heading_rad) / 2
@@ -120,7 +121,7 @@ def quaternion_of(heading_rad: float | None) -> tuple[float, float, float, float
 
 
 def heading_of_quaternion(x: float, y: float, z: float, w: float) -> float | None:
-    """The heading of what is turned so, whatever its roll and pitch; None if all four are 0, or one is no number.
+    """Returns the heading of a quaternion, with any roll and pitch; None if all four are 0, or one is not a number.
 
     It need not be of length 1, as what others send is not always.
     """
@@ -153,7 +154,7 @@ class RosMessages:
     """Makes messages. Parts of them are dicts, which `RosTypes.make` reads.
 
     types  of the distribution that hears them
-    map    the frame in which places are told
+    map    frame of published positions
     """
 
     def __init__(self, types: RosTypes, map: RosMap) -> None:
@@ -162,8 +163,8 @@ class RosMessages:
         """By number of poses."""
 
     def stamp(self, stamp_ns: int) -> dict[str, int]:
-        """builtin_interfaces/Time of ns since 1970, or since a simulation began. It has 31 bits of seconds: what is
-        after 2038 is told as the last second there is."""
+        """builtin_interfaces/Time of ns since 1970, or since a simulation began. It has 31 bits of seconds: times
+        after 2038 are published as the last possible second."""
         sec, nanosec = divmod(min(max(stamp_ns, 0), _LAST_NS), NS_PER_S)
         return {"sec": sec, "nanosec": nanosec}
 
@@ -211,7 +212,7 @@ class RosMessages:
     def odometry(
         self, stamp_ns: int, frames: tuple[str, str], place: Place, speed_m_per_s: float, turn_rad_per_s: float
     ) -> Any:
-        """nav_msgs/Odometry of a vehicle. Covariances are zeros, which readers take for "not told".
+        """nav_msgs/Odometry of a vehicle. Covariances are zeros, which readers take for "unknown".
 
         frames          of the pose, and of the twist
         speed_m_per_s   forward
@@ -256,7 +257,7 @@ class RosMessages:
         return self.types.make(status, level=int(level), name=name, message=message, values=told)
 
     def log(self, stamp_ns: int, severity: Severity, name: str, text: str) -> Any:
-        """rcl_interfaces/Log: a line of /rosout. Who says it is `name`."""
+        """rcl_interfaces/Log: a line of /rosout. The sender is `name`."""
         log = "rcl_interfaces/msg/Log"
         return self.types.make(log, stamp=self.stamp(stamp_ns), level=int(severity), name=name, msg=text)
 
@@ -276,9 +277,9 @@ _MARKS = _STAMP.pack(*divmod(_MARK_NS, NS_PER_S)), struct.pack("<3d", *_MARK_M, 
 class PackedPlaces:
     """CDR of a message of which only stamps and places change, written into bytes made before.
 
-    It is for what is put at every tick for every vehicle, and for routes: objects take ten times as long for 100
-    vehicles. rosbags packs the first message, with a mark in the place of each stamp and each pose. Names and
-    lengths stay, and so all stays where it was. Any thread may call `at`.
+    It serves messages that are published at every tick for every vehicle, and routes: objects take ten times as
+    long for 100 vehicles. rosbags packs the first message, with a mark in the place of each stamp and each pose.
+    Names and lengths stay, and so all stays where it was. Any thread may call `at`.
     """
 
     def __init__(self, messages: RosMessages, message: Any, type_name: str) -> None:

@@ -49,7 +49,7 @@ class Publisher:
 
 
 class Newest:
-    """What came last on a topic and was not taken yet. Made by `Node.newest`."""
+    """Last message of a topic that was not taken yet. Made by `Node.newest`."""
 
     def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
         self.endpoint = endpoint
@@ -97,13 +97,13 @@ class Node:
 
     @property
     def endpoints(self) -> list[Endpoint]:
-        """Those that are declared now."""
+        """Endpoints that are declared now."""
         with self._lock:
             return list(self._declared)
 
     @property
     def connected(self) -> bool:
-        """Whether a router is connected now. Zenoh connects again by itself, and declares all anew there."""
+        """True if a router is connected now. Zenoh connects again by itself, and repeats all declarations there."""
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT) -> Publisher:
@@ -131,7 +131,7 @@ class Node:
         endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
         newest = Newest(self, endpoint, most_bytes)
         made: Any
-        # What this node puts itself is not for it: a topic may go both ways.
+        # This node ignores its own messages: a topic may go both ways.
         if qos is Qos.LATCHED:
             made = ext.declare_advanced_subscriber(
                 self._session,
@@ -151,8 +151,8 @@ class Node:
         """Answers a service.
 
         `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is called once, then or
-        later, on any thread, with a response or its CDR. A client of ROS waits for ever for what is never answered,
-        so errors go into the response.
+        later, on any thread, with a response or its CDR. A client of ROS waits for ever for a missing reply, so
+        errors go into the response.
         """
         endpoint = self._endpoint(Kind.SERVICE, name, type_name, Qos.DEFAULT)
 
@@ -195,7 +195,7 @@ class Node:
         )
 
     def remove(self, endpoint: Endpoint) -> None:
-        """Takes an endpoint back. What it has put last is not repeated to late readers any more."""
+        """Takes an endpoint back. Its last message is not repeated to late subscribers any more."""
         with self._lock:
             declared = self._declared.pop(endpoint, [])
         for each in declared:
@@ -219,7 +219,7 @@ class Node:
             self._declared[endpoint] = [token, made]
 
     def dropped(self, topic: str, error: ProtocolError) -> None:
-        """Counts what is none of its type."""
+        """Counts messages of another type."""
         self.counts["dropped"] += 1
         log.debug("%s: %s", topic, error)
 

@@ -19,7 +19,7 @@ from launch_scripts.gateways.ros2.rmw import NO_HASH
 from swarm.errors import ProtocolError
 
 LARGEST_MESSAGE_BYTES = 1 << 24
-"""What a peer sends is not even looked at beyond it. A grid of 4096 x 4096 cells has as many."""
+"""Larger messages of a peer are dropped unread. A grid of 4096 x 4096 cells has as many."""
 _DTYPES = {"byte": "uint8", "char": "uint8", "string": "object"}
 REQUEST, RESPONSE, _EVENT = "_Request", "_Response", "_Event"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
@@ -94,7 +94,7 @@ class RosTypes:
 
     @property
     def names(self) -> list[str]:
-        """Of all types: messages, and the parts of services."""
+        """Names of all types: messages, and the parts of services."""
         return sorted(self._store.fielddefs)
 
     def hash_of(self, name: str) -> str:
@@ -108,7 +108,7 @@ class RosTypes:
     def make(self, name: str, /, **fields: Any) -> Any:
         """Returns a message of a type, such as make("geometry_msgs/msg/Point", x=1.0).
 
-        What is not given is 0, false or empty. A dict stands for a message which is within.
+        Missing fields are 0, false or empty. A dict stands for a message which is within.
         """
         made = {
             field: self._value(node, inner, fields.pop(field, None))
@@ -138,7 +138,7 @@ class RosTypes:
         return message if isinstance(message, bytes) else bytes(self._store.serialize_cdr(message, name))
 
     def unpack(self, content: bytes, name: str) -> Any:
-        """A message that somebody sent. Raises ProtocolError on what is none of this type."""
+        """Decodes a received message. Raises ProtocolError if it is not of this type."""
         if len(content) > LARGEST_MESSAGE_BYTES:
             raise ProtocolError(f"{name} has {len(content)} bytes, expected at most {LARGEST_MESSAGE_BYTES}")
         try:

@@ -1,7 +1,7 @@
 """The process of `swarm ros2`: one session to the swarm, one to ROS, and the gateway between them. Shell only.
 
-Both sides may come and go. What ROS hears is put without waiting, so a ROS side that hangs costs the swarm nothing,
-and misses messages.
+Both sides may come and go. Messages to ROS are published without waiting, so a ROS side that hangs costs the swarm
+nothing, and misses messages.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def serve(
 
     connect  opens a connection to the swarm
     runs     folder of the runs of this machine, where the terrain may be
-    say      is told what people should know, a sentence each
+    say      receives sentences for people, one at a time
     """
     with open_ros(settings.ros.endpoint) as ros:
         swarm: Swarm | None = connect()
@@ -112,7 +112,7 @@ class _Run:
             self._incoming = Incoming(self._node, swarm, settings.incoming, map, map_now, lambda: observer.vehicles)
 
     def turn(self) -> None:
-        """Does what is due. Nothing here waits for ROS."""
+        """Performs due work. Nothing here waits for ROS."""
         for side, up in (("swarm", self._swarm.connected), ("ROS", self._node.connected)):
             if up != self._up[side]:
                 self._up[side] = up

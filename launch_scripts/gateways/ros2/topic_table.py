@@ -44,7 +44,7 @@ class TopicRow:
 
     @property
     def per(self) -> str | None:
-        """What there is one for each of: VEHICLE, TARGET, or None."""
+        """Unit of which each has one: VEHICLE, TARGET, or None."""
         return next((each for each in (VEHICLE, TARGET) if each in self.topic), None)
 
 

@@ -1,7 +1,7 @@
-"""What colours the terrain has in each layer of the view: arrays in, pixels out.
+"""Colours of the terrain in each layer of the view: arrays in, pixels out.
 
-Colours are those of Okabe and Ito where they carry meaning; what is known beforehand is hatched, what was found is
-filled, so that the two differ without colour, too.
+Colours with a meaning are those of Okabe and Ito; known hazards are hatched, found ones filled, so that the two
+differ without colour, too.
 
 Cost-to-go of targets is that of a coarse grid, as their planners answer it: the monitor grows no tree. It asks for
 the costs of at most `_MOST_SAMPLES` cells, of one target at a time.
@@ -39,7 +39,7 @@ UNREACHED = (70, 60, 66)
 _HATCH_TEXELS = 7
 _CIVIDIS = "#00224e #1a386f #434e6c #61656f #7d7c78 #9b9476 #bcae6c #dec958 #fee838"
 COST_COLOURS = tuple(_CIVIDIS.split())
-"""From dear to cheap."""
+"""From high to low cost."""
 _VIRIDIS = "#fde725 #aadc32 #5cc863 #27ad81 #21908d #2c718e #3b518b #472c7a #440154"
 COST_TO_GO_COLOURS = tuple(_VIRIDIS.split())
 """From the target outwards."""
@@ -51,18 +51,18 @@ Ints = NDArray[np.int64]
 _MOST_SAMPLES = 64 * 64
 _BESIDE = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 _ON_THE_WAY = np.linspace(0, 1, 9)[1:-1]
-"""Where between two samples it is looked for lethal cells."""
+"""Positions between two samples at which lethal cells are looked for."""
 _LEAST_BRANCH = 3
 """Samples whose way leads through one from which a line is drawn."""
 _PIXELS = 160
-"""Of a picture's longer side: some for each sample, so that slopes are smooth."""
+"""Longer side of a picture, in pixels: some for each sample, so that slopes are smooth."""
 _BANDS = 10
 _SHOWN_PERCENT = 97
-"""Of the places lie within the scale: a few that are far off must not take half of it."""
+"""Percentage of the values within the scale: a few outliers must not take half of it."""
 
 
 class GroundColours:
-    """The layers' pixels. What is known now is read from the shared map's ground, which changes in place.
+    """The layers' pixels. Current knowledge is read from the shared map's bare cost, which changes in place.
 
     now      float32 (rows, cols)  the ground as the map knows it; inf is lethal
     truth    the ground as it is, where this process knows it
@@ -112,7 +112,7 @@ class GroundColours:
         return photo
 
     def cost_of(self, window: Window) -> Bytes:
-        """What a metre costs, dark where it is dear, and hatched where nothing drives."""
+        """Returns pixels of the pace, dark where it is high, and hatched where it is lethal."""
         side, now = self._mesh.texel, self._now[_cells(window)]
         low, high = np.log(self.quickest_s_per_m), np.log(self.slowest_s_per_m)
         with np.errstate(divide="ignore"):
@@ -123,7 +123,7 @@ class GroundColours:
         return image
 
     def known_of(self, window: Window) -> Bytes:
-        """What the map knows against what is true, on grey relief."""
+        """Returns pixels of the map's knowledge against ground truth, on grey relief."""
         assert self._truth is not None
         now, before, true = (each[_cells(window)] for each in (self._now, self._prior, self._truth))
         texels = self._texels(window)
@@ -137,8 +137,8 @@ class GroundColours:
         return image
 
     def learned_of(self, window: Window) -> Bytes:
-        """By what the prior pace is multiplied, by what vehicles have measured of each kind of ground: on grey
-        relief, orange where it is slower and blue where it is quicker."""
+        """Returns pixels of learned factors on the prior pace: on grey relief, orange for slower and blue for
+        faster."""
         part, side = _cells(window), self._mesh.texel
         before, prior = (np.asarray(each[part])[::side, ::side] for each in (self._known_before, self._prior))
         with np.errstate(invalid="ignore"):
@@ -166,7 +166,7 @@ class GroundColours:
         return image
 
     def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:
-        """Whether the map says that these rows and columns of cells are lethal: bool (rows, cols)."""
+        """Returns True for each of these rows and columns of cells that is lethal by the map: bool (rows, cols)."""
         lethal: Bools = np.isinf(self._now[rows[:, None], cols])
         return lethal
 
@@ -203,7 +203,7 @@ class GroundColours:
 
 
 def between(colours: Sequence[str], steps: int) -> Floats:
-    """So many colours evenly between those named, float32 (steps, 3), 0 to 255."""
+    """Returns evenly spaced colours between those named, float32 (steps, 3), 0 to 255."""
     named = np.array([rgb(colour) for colour in colours], np.float32)
     at = np.linspace(0, len(named) - 1, steps)
     channels = [np.interp(at, np.arange(len(named)), named[:, n]) for n in range(3)]
@@ -242,7 +242,7 @@ class CostSamples:
         self._asked = 0
 
     def hear_target(self, target: str) -> None:
-        """A planner told its state."""
+        """Takes a planner's state."""
         if target not in self.targets:
             self.targets.append(target)
 
@@ -352,8 +352,8 @@ class TargetPictures:
         return self._colours.on_relief(pixels, self._rows, self._cols)
 
     def tree(self, target: str) -> tuple[Floats, Floats]:
-        """Where the cost falls most between samples, as a river that ends at the target: lines float32 (n, 2, 3),
-        and their radii as rerun takes those in points of the window, float32 (n,)."""
+        """Returns the steepest descent of the cost between samples, as a river that ends at the target: lines
+        float32 (n, 2, 3), and their radii as rerun takes those in points of the window, float32 (n,)."""
         ends, through = coarse_tree(self._samples.costs_s[target], self._samples, self._colours.lethal_at)
         cells = ends[..., 0] * self._mesh.grid.cols + ends[..., 1]
         radii = -(0.25 + 0.16 * np.log2(through / 2)).astype(np.float32)

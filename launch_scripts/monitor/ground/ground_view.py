@@ -63,9 +63,9 @@ _MOST_EDGES = 20_000
 """Sides of texels along a border that is drawn. A zone with more is named, and hatched if closed."""
 _LARGEST_FILE = 1 << 25
 _EVERY_S = {"photo": 1.0, "cost": 5.0, "known": 5.0, "learned": 5.0, "nearest": 8.0, "question": 2.0}
-"""How often tiles of a layer that are out of date are drawn, and a planner is asked for costs."""
+"""Interval at which outdated tiles of a layer are drawn, and a planner is asked for costs."""
 _UNSEEN = 4
-"""While nobody looks the ground is drawn so many times as seldom, for the recording."""
+"""Factor by which the ground is drawn less often without viewers, for the recording."""
 _TILES_AT_ONCE = 80
 _NAMES_SHOWN = 40
 _MOST_TARGETS = 256
@@ -74,7 +74,7 @@ _MARGIN_COLOUR = (200, 206, 214)
 _LINE_PX = 1.3
 _WHOLE_SIDE = 112
 _BAR_SHARE = 0.25
-"""Of the terrain's width, at most."""
+"""Largest share of the terrain's width."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +97,7 @@ class Area:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a run is drawn with, and what is known of it beforehand.
+    """Inputs of drawing a run that are known beforehand.
 
     layers  tabs of the view
     truth   the true ground, where this process knows it
@@ -140,7 +140,7 @@ class GroundView:
             LEARNED: colours.learned_of,
         }
         self._tiled = {layer: picture for layer, picture in drawn_by.items() if layer in scene.layers}
-        """What draws a tile of each layer of tiles."""
+        """Function that draws a tile of each layer of tiles."""
         self._stale: dict[str, dict[int, None]] = {layer.name: {} for layer in self._tiled}
         """Name of a layer -> its tiles that are out of date. Marks come many times a second to the same tiles, and
         each of their pictures is drawn once for all; one that looks as before is not logged again."""
@@ -152,7 +152,7 @@ class GroundView:
         self._zones_version = 0
 
     def begin(self) -> None:
-        """Draws all of it. What never changes is static: the shape of the ground, legends, styles."""
+        """Draws all of it. Constant data is static: the shape of the ground, legends, styles."""
         self._pen.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
@@ -196,7 +196,7 @@ class GroundView:
             self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int, watched: bool) -> str | None:
-        """Draws what has changed, now and then. Returns the target whose planner is to be asked for costs now."""
+        """Draws changes, at intervals. Returns the target whose planner is to be asked for costs now."""
         slower = 1 if watched else _UNSEEN
         self._take_changes()
         if self._zones_version != self._replica.zones_version:
@@ -232,9 +232,9 @@ class GroundView:
         self._pen.log(f"{entity}/{tile}", texture)
 
     def _legend(self, layer: Layer) -> None:
-        """Draws what stands below a layer: once, but for a cost-to-go whenever its scale changes."""
+        """Draws the legend below a layer: once, but for a cost-to-go whenever its scale changes."""
         scale, pictures = None, self._pictures
-        if layer == COST:  # from dear to cheap, evenly in the logarithm of the pace
+        if layer == COST:  # from high to low, evenly in the logarithm of the pace
             paces = np.geomspace(self._colours.slowest_s_per_m, self._colours.quickest_s_per_m, 5)
             scale = Scale(COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces])
         elif layer == LEARNED:
@@ -333,7 +333,7 @@ def closed_cells(areas: Iterable[Area]) -> NDArray[np.int64]:
 
 
 def title_places(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:
-    """Where the zones' names stand: over the cell of each that is next to its middle."""
+    """Returns the positions of the zones' names: over the cell of each that is next to its middle."""
     places = []
     for area in areas:
         rows, cols = np.divmod(area.cells, mesh.grid.cols)

@@ -86,7 +86,7 @@ class TerrainMesh:
 
     @property
     def said_heights(self) -> str:
-        """How high heights are drawn, in words."""
+        """Returns the exaggeration of heights, in words."""
         return "heights to scale" if self.stretch == 1 else f"heights x {self.stretch:.2g}"
 
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
@@ -108,7 +108,7 @@ class TerrainMesh:
         return self.tile_rows * self.tile_cols
 
     def mesh_tiles(self, coarser: int = 1) -> list[MeshTile]:
-        """All tiles of the terrain's mesh, with vertices so many times as far apart."""
+        """Returns all tiles of the terrain's mesh, with vertices `every` cells apart."""
         step = coarser * self.step
         windows = [self.tile_window(index) for index in range(self.tiles)]
         return [
@@ -121,7 +121,7 @@ class TerrainMesh:
         ]
 
     def whole(self, side: int) -> MeshTile:
-        """The terrain in one piece, with at most so many vertices along a side."""
+        """Returns the terrain in one piece, with a bounded number of vertices along a side."""
         rows, cols = (
             np.unique(np.linspace(0, count - 1, min(side, count)).astype(np.int64))
             for count in (self.grid.rows, self.grid.cols)

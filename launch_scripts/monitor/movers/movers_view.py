@@ -1,4 +1,4 @@
-"""The moving half of the view: hears who is where, and draws it frame by frame.
+"""Moving half of the view: receives positions, and draws them frame by frame.
 
 Targets are pins with a label, hidden ones rings where they were seen, bodies discs, beliefs balls that are the more
 opaque the likelier a target is there, alarms poles with their words.
@@ -40,9 +40,9 @@ OVER_S = 8.0
 _MOST_MARKS = 24
 """The serious come first, as in the list of alarms."""
 _UNSEEN = 2
-"""While nobody looks pins, routes and sentences are drawn so many times as seldom, for the recording."""
+"""Factor by which pins, routes and sentences are drawn less often without viewers, for the recording."""
 SILENT_NS = 5 * NS_PER_S
-"""A planner that searches tells its belief once a second: what is older is drawn no more."""
+"""A planner that searches publishes its belief once a second: an older belief is drawn no more."""
 _FAINT, _FULL = 40, 235
 """Opacity of the least and of the likeliest place of a belief."""
 _CIRCLE_POINTS = 33
@@ -79,7 +79,7 @@ class MoversView:
         self._trails = trails_of(scenario, pen.mesh, level)
         self._sightings = Sightings(filter)
         self._believed: dict[str, tuple[Believed, int]] = {}
-        """Target that nobody sees -> where it is believed to be, and when that was heard."""
+        """Unseen target -> its believed position, and the time of that belief."""
         self._bodies = Bodies(pen.mesh.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._targets: set[str] = set()
@@ -90,7 +90,7 @@ class MoversView:
         self._limit = RateLimit({"pins": 0.2, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
 
     def begin(self) -> None:
-        """Logs styles; all else is drawn anew."""
+        """Logs styles, and starts all drawings from scratch."""
         self._vehicles.begin()
         self._pen.style("world/trails/targets", 1.6 * self._level.line_px)
         self._pen.style("world/targets/poles", 2.2)
@@ -140,7 +140,7 @@ class MoversView:
         self._pen.points("world/alarms/marks", positions=tops, labels=[shown(text, 60) for text in marks.values()])
 
     def tick(self, now_ns: int, watched: bool) -> None:
-        """Draws what is due in one frame."""
+        """Draws one frame's due parts."""
         slower = 1 if watched else _UNSEEN
         observed = self._figures.observed
         if self._fleets_new:
@@ -160,7 +160,7 @@ class MoversView:
         self._draw_bodies(self._bodies.reports, now_ns)
 
     def _draw_targets(self, places_m: Mapping[str, Place], lost: Collection[str], now_ns: int) -> None:
-        """Draws the targets whose trackers told where they are, of which nobody tracks `lost` now, and those that
+        """Draws the targets with published positions, of which those in `lost` have no tracker now, and those that
         vehicles saw."""
         seen = self._sightings.best(now_ns)
         pins, labels = target_labels(places_m, lost, seen)
@@ -180,7 +180,7 @@ class MoversView:
                 self._pen.trail("world/trails/targets", trails, colours[drawn])
 
     def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
-        """Draws as many labels as can be read, so many `scale_m` above places."""
+        """Draws as many labels as can be read, at this height (`scale_m`) above their positions."""
         above_m = np.array([0, 0, above * self._mesh.scale_m], np.float32)
         self._pen.points(entity, positions=places[:MOST_LABELS] + above_m, labels=texts[:MOST_LABELS])
 
@@ -207,7 +207,8 @@ class MoversView:
         self._pen.points("world/searched", {"searched": sentences}, **its)
 
     def _draw_followed(self, vehicles: VehicleColumns) -> None:
-        """Draws the vehicle or target that the camera follows, where it is now; nothing while nobody knows."""
+        """Draws the vehicle or target that the camera follows at its current position; nothing while that is
+        unknown."""
         if self._follow is None:
             return
         place_m = self._figures.observed.targets().get(self._follow)
@@ -251,8 +252,8 @@ def target_labels(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Labels at pins and at sightings, by target. No target has two, and none that is drawn has none.
 
-    posed  targets that have a place because a tracker told it
-    lost   those of them that nobody tracks now
+    targets whose position a tracker published
+    lost   those of them that no tracker publishes now
     seen   targets that vehicles saw
     """
     tracked = {id for id in posed if id not in lost}

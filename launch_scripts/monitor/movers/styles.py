@@ -1,4 +1,4 @@
-"""How everything that moves looks, how much of it is drawn and how often, and what the legend says of it. No rerun.
+"""Styles of moving entities, their level of detail and rate, and their entries in the legend. No rerun.
 
 The one place of these colours. They are Okabe and Ito's, which the colour-blind tell apart. Hue says whose a
 vehicle is, brightness how it does, shape what something is.
@@ -27,9 +27,9 @@ HUES: tuple[Colour, ...] = tuple(
 )
 """In turn for groups, or targets. Blue and vermilion are lighter than theirs: the ground is dark."""
 NOBODY: Colour = (170, 176, 182)
-"""Of vehicles without a target, where hues are targets."""
+"""Colour of vehicles without a target, where hues are targets."""
 TARGET_COLOUR: Colour = (255, 255, 255)
-"""Of all targets, where hues are groups."""
+"""Colour of all targets, where hues are groups."""
 LOST_COLOUR: Colour = (120, 124, 130)
 BODY_COLOUR: Colour = (118, 84, 60)
 SIGHTED_COLOUR: Colour = (255, 255, 255)
@@ -53,7 +53,7 @@ SHADES: dict[VehicleState, tuple[Colour, float, str | None]] = {
     VehicleState.OUTDATED: ((128, 132, 138), 0.85, None),
     VehicleState.SEARCHING: ((255, 255, 255), 0.35, "searches"),
 }
-"""What is mixed into a hue, its share, and the legend's words; None where another state's entry says it."""
+"""Colour mixed into a hue, its share, and the legend's words; None if another state's entry has them."""
 
 
 class Look(NamedTuple):
@@ -76,13 +76,13 @@ def shaded(hue: Colour, state: VehicleState) -> Colour:
 
 
 def dimmed(colours: Bytes) -> Bytes:
-    """Of trails: darker than the vehicles that leave them."""
+    """Returns the colour of trails: darker than the vehicles that leave them."""
     darker: Bytes = (colours * np.float32(0.62)).astype(np.uint8)
     return darker
 
 
 class Looks:
-    """The colours of one run. Where all vehicles are of one group, hues are targets: vehicles, their routes and the
+    """The colours of one run. If all vehicles are of one group, hues are targets: vehicles, their routes and the
     target that they chase have one. With several groups they are groups, and all targets look alike."""
 
     def __init__(self, groups: Sequence[str], target_ids: Sequence[str]) -> None:
@@ -110,12 +110,12 @@ class Looks:
         return self._hue.get(id, TARGET_COLOUR) if self.by_target else TARGET_COLOUR
 
     def route(self, target: str) -> Colour:
-        """Of routes to a target: darker than its vehicles, which are on top of them."""
+        """Returns the colour of routes to a target: darker than its vehicles, which are on top of them."""
         hue = self._hue.get(target, ROUTE_COLOUR) if self.by_target else ROUTE_COLOUR
         return mixed(hue, (0, 0, 0), 0.15)
 
     def legend(self) -> list[Look]:
-        """What is drawn of all that moves."""
+        """Returns the legend of all moving entities."""
         first, target = next(iter(self._hue.values()), NOBODY), next(iter(self.target_ids), "")
         if self.by_target:
             who = [Look("ball", first, "vehicle, hue by target")]
@@ -138,17 +138,17 @@ class Looks:
 
 
 class Level(NamedTuple):
-    """How much is drawn of each vehicle: the less, the more vehicles there are.
+    """Level of detail of each vehicle: the less, the more vehicles there are.
 
     most            vehicles for which it is used, at most
     radius_px       of a vehicle's ball, in points of the viewer's window
     line_px         of trails and routes
-    frames          vehicles are drawn in every so many frames
+    frames          vehicles are drawn in every n-th frame
     trail_every_s   a piece of each trail is drawn so often
     trail_s         so long a trail is seen
-    details_s       who each vehicle is and what it does is told again so often
+    details_s       interval of each vehicle's description and state
     routes_s        all routes are drawn once in this time
-    route_stride    a route has a point for so many cells
+    route_stride    cells between two points of a route
     names           whether vehicles' ids are shown all the time
     """
 
@@ -174,5 +174,5 @@ LEVELS = (
 
 
 def level_for(vehicles: int) -> Level:
-    """The level of detail for so many vehicles."""
+    """Returns the level of detail for a number of vehicles."""
     return next(level for level in LEVELS if vehicles <= level.most)

@@ -1,6 +1,6 @@
 """Draws vehicles, who they are, their trails and routes, as they are due.
 
-Few entities with many instances each; of each only what has changed: see docs/decisions/0053-what-moves.md.
+Few entities with many instances each; of each only changes: see docs/decisions/0053-what-moves.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 
 Cells = NDArray[np.int64]
 _ROUTES_KEPT = 1 << 15
-"""Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
+"""Vehicles whose routes are remembered. Beyond this number all are forgotten: their agents never had as many."""
 _DOES = {
     VehicleState.IDLE: "idle",
     VehicleState.WAITING: "waits for a route",
@@ -46,7 +46,7 @@ class Trails:
     def __init__(self, longest_m: float) -> None:
         self._longest_m = longest_m
         self._last: dict[str, Floats] = {}
-        """Where each was at the end of its trail, float32 (3,)."""
+        """Position of each at the end of its trail, float32 (3,)."""
 
     def advance(self, ids: list[str], positions: Floats) -> tuple[Strips, NDArray[np.bool_]]:
         """Lines from the last places to these, and whose they are; none for ids which stand still, are new, or
@@ -68,7 +68,7 @@ def cells_at(grid: GridSpec, east_m: Floats, south_m: Floats) -> Cells:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteNow:
-    """A route that a vehicle has begun, or what is left of it.
+    """A route that a vehicle has begun, or the remainder of it.
 
     cells     int32 (n,)
     places    float32 (n, 2)  rows and columns that it leads over, whole numbers in the middles of cells; those of a
@@ -85,7 +85,8 @@ class RouteNow:
 
     @classmethod
     def of(cls, followed: Followed, grid: GridSpec, now_ns: int) -> RouteNow:
-        """The route that a vehicle told. Raises ValueError or OutsideGridError where it leaves the grid."""
+        """Builds the route that a vehicle published. Raises ValueError or OutsideGridError where it leaves the
+        grid."""
         cells = np.array(walk(grid, followed.start, followed.directions), np.int32)
         places = np.stack(np.divmod(cells, grid.cols), axis=1).astype(np.float32)
         turns = np.cumsum([0, *np.frombuffer(followed.legs, "<u4")])
@@ -110,7 +111,7 @@ class RouteLines:
     """
 
     def __init__(self, mesh: TerrainMesh, stride: int) -> None:
-        """stride  a line has a point for so many cells"""
+        """stride number of cells between two points of a line"""
         self._mesh = mesh
         self._stride = stride
         self._drawn = np.zeros(mesh.grid.cells, np.bool_)
@@ -147,13 +148,13 @@ class VehiclesView:
         self._pen, self._mesh, self._level, self._looks = pen, pen.mesh, level, looks
         self._target_ids = scenario.target_ids
         self._ids: list[str] = []
-        """Those that were drawn last, and what is looked up anew only when vehicles come or go."""
+        """Vehicles that were drawn last, and their metadata. Rebuilt when a vehicle joins or leaves."""
         self._who: dict[str, str] = {}
         """Vehicle -> its group, and its class where that is not "ground"."""
         self._rows = np.empty(0, np.intp)
-        """Of `Looks.vehicles`, by group."""
+        """Rows of `Looks.vehicles`, by group."""
         self._aloft: list[tuple[NDArray[np.intp], Floats]] = []
-        """Of each class that flies the places of its vehicles in `_ids`, and `TerrainMesh.aloft_m`."""
+        """For each flying class the indices of its vehicles in `_ids`, and `TerrainMesh.aloft_m`."""
         self._routes: dict[str, RouteNow] = {}
         self._route_lines = RouteLines(self._mesh, level.route_stride)
         self._next_target = 0
@@ -180,10 +181,10 @@ class VehiclesView:
         self._routes[followed.vehicle] = RouteNow.of(followed, self._mesh.grid, now_ns)
 
     def draw(self, vehicles: VehicleColumns, observed: LatestState, now_ns: int, slower: int) -> None:
-        """Draws what is due; once for each frame in which something is new.
+        """Draws due parts; once for each frame with a change.
 
         observed  says of which group and class they are
-        slower    by how many times as seldom as for somebody who looks routes and sentences are drawn
+        slower    factor by which routes and sentences are drawn less often than for viewers
         """
         self._frame += 1
         if vehicles.ids != self._ids:
@@ -226,7 +227,7 @@ class VehiclesView:
         self._limit.all_due()
 
     def _draw_routes(self, vehicles: VehicleColumns, cells: Cells, target: str) -> None:
-        """Draws what is left of the routes to a target."""
+        """Draws the remainder of the routes to a target."""
         chasing = vehicles.chasing(target).tolist()
         begun = ((n, self._routes.get(vehicles.ids[n])) for n in chasing)
         ahead = [
@@ -238,8 +239,8 @@ class VehiclesView:
 def vehicle_details(
     vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. What matters comes first: a
-    viewer may cut off the end.
+    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most important comes
+    first: a viewer may cut off the end.
 
     who  vehicle -> what is said of whose it is
     """

@@ -44,7 +44,8 @@ _DEAF_TO_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 @contextlib.contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """A cluster of so many processes, all on loopback. One that dies is started again; all end with the block."""
+    """Starts a cluster of local processes, all on loopback. One that dies is started again; all end with the
+    block."""
     with (
         dask.config.set(_SETTINGS),
         tempfile.TemporaryDirectory(prefix="swarm-sweep-") as folder,
@@ -78,8 +79,8 @@ def client_of(address: str) -> Iterator[Client]:
 
 def run_trials(client: Client, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Result | None]]:
     """The result of each trial, as they come; None of one that is given up (`MOST_DEATHS`). A worker that dies
-    loses nothing: what it had goes to another. Raises what a trial raises, and BusError if the scheduler
-    is gone."""
+    loses nothing: what it had goes to another. Raises the exception of a trial, and BusError if the scheduler has
+    ended."""
     rest = iter(trials)
     given: dict[str, Trial] = {}
     done = as_completed(loop=client.loop)

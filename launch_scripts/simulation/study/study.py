@@ -45,7 +45,7 @@ _hash = partial(hashlib.blake2b, digest_size=12)
 
 
 class Study(Section, frozen=True, kw_only=True):
-    """What is simulated.
+    """Cases and outcomes of a study.
 
     name        what the summary calls it; the file's name if not given
     about       what it asks, in a sentence, for the summary
@@ -99,7 +99,7 @@ def study_path(name: str) -> Path:
 
 
 def study_names() -> list[str]:
-    """Of the project's own."""
+    """Returns the names of the project's own studies."""
     return sorted(file.stem for file in STUDIES.glob("*.toml"))
 
 
@@ -110,7 +110,7 @@ def load_study(path: Path) -> Study:
 
 
 def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
-    """As `load_study`, of a text.
+    """Like `load_study`, from a text.
 
     name  of the study if the text gives none
     """
@@ -127,7 +127,7 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
 
 
 def _faults(study: Study, seeds: int) -> Iterator[str]:
-    """What is wrong with a study beyond what its types say, the most important first."""
+    """Returns faults of a study beyond those of its types, the most important first."""
     varied = dict(flat(study.parameters))
     settings = [(name, key) for name, of in study.variants.items() for key, _ in flat(of)]
     settled = {key for _, key in settings} | varied.keys()
@@ -204,8 +204,8 @@ def _planned(
 
 
 def _settings(scenario: Scenario) -> Any:
-    """All that a scenario says but its seed and seconds, which a trial has of its own; the content of a file
-    instead of its place."""
+    """Returns all settings of a scenario but its seed and seconds, which a trial has of its own; the content of a
+    file instead of its path."""
     settings = msgspec.to_builtins(scenario)
     del settings["seed"], settings["seconds"]
     settings["plugin_folder"] = {place: _file_digest(path) for place, path in plugin_files(scenario).items()}

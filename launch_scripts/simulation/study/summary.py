@@ -23,7 +23,8 @@ from launch_scripts.simulation.study.trials import Result, Trial
 
 LEVEL = 0.95
 MOST_BOOTSTRAPPED = 1000
-"""Of more values than this the mean is as good as normal, and Student's t says the same in no time."""
+"""Above this number of values the mean is practically normal, and Student's t gives the same result without
+delay."""
 _RESAMPLES = 9999
 _SAME = 1e-12
 """Values that differ by less, relative to the largest, are one: rounding."""
@@ -60,7 +61,7 @@ def mean(values: Sequence[float]) -> Estimate | None:
         return Estimate(middle, middle, middle)
     if len(data) > MOST_BOOTSTRAPPED:
         return _between(middle, stats.t.interval(LEVEL, len(data) - 1, middle, stats.sem(data)))
-    # Of values at the limits of floats there is no interval.
+    # Values at the limits of floats have no interval.
     with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore", category=stats.DegenerateDataWarning):
         chance = np.random.default_rng(0)
         found = stats.bootstrap((data,), np.mean, n_resamples=_RESAMPLES, rng=chance, batch=1000)
@@ -82,7 +83,7 @@ def share(hits: int, count: int) -> Estimate:
 
 
 OUTCOMES = {False: ("captures", "marks", "routes_served"), True: ("captures", "longest_wait_s", "routed_after_s")}
-"""With faults or without: what is told where a study names no outcomes."""
+"""Outcomes, with faults or without, of a study that names none."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -207,7 +208,7 @@ def _failure(case: Case, trial: Trial, result: Result) -> Failure:
 
 SHOWN_FAILURES = 100
 MOST_ROWS = 60
-"""Of more cases there is no picture: nobody reads it."""
+"""With more cases there is no picture: it could not be read."""
 
 
 def document(summary: Summary, pictures: Mapping[str, str]) -> str:
@@ -273,7 +274,7 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _number(value: float | None, sign: str = "") -> str:
-    """Four significant digits, all digits of what is 1,000 or more."""
+    """Returns four significant digits, all digits of numbers of 1,000 or more."""
     if value is None:
         return "-"
     value = value + 0.0  # no minus zero

@@ -1,4 +1,4 @@
-"""A sweep from a study's file to its folder: what is missing is simulated, then all of it is summed up."""
+"""A sweep from a study's file to its folder: missing trials are simulated, then all are summed up."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ResultStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Reads what is there. Raises StoreError."""
+        """Reads existing results. Raises StoreError."""
         self.path = folder / KEPT
         self.results: dict[str, Result] = {}
         try:
@@ -104,9 +104,9 @@ class Sweep:
         self.missing = [trial for key, trial in unique.items() if key not in self.store.results]
 
     def run(self, workers: int, scheduler: str | None, told: Callable[[Trial, Result | None], None]) -> None:
-        """Simulate what is missing. Results are kept as they come, whatever ends this.
+        """Simulates missing trials. Results are kept as they come, whatever ends this.
 
-        scheduler  address of a cluster that is there; None: so many workers of this machine
+        scheduler  address of an existing cluster; None: local workers of this number
         told       called with each trial that has ended; None: it was given up
         """
         if not self.missing:

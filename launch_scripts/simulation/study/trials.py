@@ -38,7 +38,7 @@ chance, and the name stays short enough to read."""
 @cache
 def code_version() -> str:
     """Hexadecimal digits, the same on machines with the same sources and versions. Documentation in the sources
-    counts, too: what is simulated once more costs less than what is wrongly kept."""
+    counts, too: a repeated simulation costs less than a wrongly kept result."""
     digest = hashlib.blake2b(digest_size=_VERSION_BYTES)
     for name in _PACKAGES:
         folder = Path(importlib.import_module(name).__path__[0])
@@ -55,12 +55,12 @@ LAWS = {
     "lethal_entries": "no lethal entry",
     "driven_into": "bodies are avoided",
 }
-"""Figure of a report that must be 0 -> the law. Of trials without faults."""
+"""Figure of a report that must be 0 -> the law. Outcomes of trials without faults."""
 _LEFT_OUT = ("by_vehicle", "seed")
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """What a worker is asked for.
+    """Request to a worker.
 
     key       digest of all that decides the result, the version of the code included
     world     name of a small world, or that of the scenario
@@ -78,7 +78,7 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker answers.
+    """Reply of a worker.
 
     figures  every number of the run's report, by dotted key, but those of single vehicles
     broken   the laws that did not hold

@@ -1,7 +1,7 @@
 """The referee: finds collisions and lethal entries in what vehicles report. Pure.
 
-A report of a vehicle holds from its stamp until the vehicle's next report. Where reports between two are missing
-(the sequence number jumps) and the vehicle moved meanwhile, the older one is known to hold at its stamp only.
+A report of a vehicle holds from its stamp until the vehicle's next report. If reports between two are missing (the
+sequence number jumps) and the vehicle moved meanwhile, the older one is known to hold at its timestamp only.
 
 A report of a body holds from when it was heard until the next one or the end of its lease. Vehicles tell when they
 were on a cell by their agents' clocks, bodies are timed by the referee's: overlaps which late messages explain do
@@ -31,8 +31,8 @@ _REMEMBER_NS = 5 * NS_PER_S
 """Stays and bodies that ended longer ago are forgotten, which bounds memory and the time of a look. It is more than
 twice the 2 s after which a silent link counts as gone, so late reports find what they are compared with."""
 _APART_NS = 2 * NS_PER_S
-"""Two who meet again within this time are counted once: a vehicle takes about a second to cross a cell, and one
-encounter is told of by several reports."""
+"""Two that meet again within this time are counted once: a vehicle takes about a second to cross a cell, and
+several reports state one encounter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def _is_new(encounters: Encounters, pair: tuple[str, str], until_ns: int) -> boo
 
 
 def _forget(at: dict[int, list[On]], is_over: Callable[[On], bool]) -> None:
-    """Drops what is over from the lists of all cells, and cells without any."""
+    """Drops expired entries from the lists of all cells, and cells without any."""
     for cell in list(at):
         at[cell] = [each for each in at[cell] if not is_over(each)]
         if not at[cell]:
@@ -287,7 +287,7 @@ class BodyReferee:
         return self._covers
 
     def check(self, stay: Stay) -> Iterator[BodyHit]:
-        """What a vehicle's stay on a cell proves."""
+        """Returns violations proven by a vehicle's stay on a cell."""
         for cover in self._covers.get(stay.cell, ()):
             end_ns = min(stay.end_ns, cover.end_ns)
             if end_ns - max(stay.begin_ns, cover.begin_ns) <= _LATE_NS:

@@ -1,4 +1,4 @@
-"""The simulated rovers: outside vehicles that say where they are and look out for nobody.
+"""Simulated rovers: external vehicles that publish their positions and avoid no vehicle.
 
 `Rovers` is a core; `service` puts what it returns on the bus. A rover drives straight, stops where the ground ahead
 is lethal or by chance, stands for a while or turns on the spot, and says where it goes before it sets out.
@@ -17,13 +17,13 @@ from swarm.wire.messages.vehicles import MOST_M_PER_S, Body
 
 LEASE_S = 2.0
 TURN_S = 0.6
-"""It turns for so long, and has told its new heading meanwhile."""
+"""Time of a turn, during which its new heading is published already."""
 _LONGEST_REST_S = 8.0
 """Rests are drawn from half a second up to this. Vehicles wait for a body at rest for a second and then drive
 around it (decision 39): both are to happen, the second more often."""
 _TOLD_AGAIN_NS = NS_PER_S // 2
-"""A rover at rest is told of this often. Hosts that have just begun listen for a second for every body (decision
-39), and a report that is lost must not end the lease."""
+"""Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every body
+(decision 39), and a report that is lost must not end the lease."""
 _LONGEST_TICK_S = 1.0
 """After a longer pause of its process a rover does not make up for the rest: a leap keeps the old place closed
 until the lease ends."""
@@ -31,8 +31,7 @@ _LEGS_PER_S = 0.25
 """Chance per second that a leg ends: it takes 4 s in the mean, so within seconds a rover drives, stands and
 turns."""
 _TRIES = 12
-"""Headings that are tried before it stands. Where a quarter of all directions is free, 97 of 100 rovers find
-one."""
+"""Headings that are tried before it stands. If a quarter of all directions is free, 97 of 100 rovers find one."""
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +65,7 @@ class Rovers:
         self.incarnation = incarnation
         self._terrain = terrain
         self._time_scale = scenario.time_scale
-        """As of the last tick; 0 while the run is paused."""
+        """Factor of the last tick; 0 while the run is paused."""
         self._ticked_ns: int | None = None
         self.all = [self._begin(id, each, scenario.seed) for each in scenario.rovers for id in ids_of(each)]
         self._by_id = {rover.id: rover for rover in self.all}
@@ -85,7 +84,7 @@ class Rovers:
             rover.seq = max(rover.seq, body.seq)
 
     def tick(self, time_scale: float, now_ns: int) -> list[Body]:
-        """Move all rovers, so many seconds on the terrain per second. Returns what they say now."""
+        """Moves all rovers by a time (s) on the terrain. Returns what they say now."""
         self._time_scale = time_scale
         passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
         self._ticked_ns = now_ns

@@ -27,15 +27,15 @@ from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 _MOVED_CELLS = 0.25
 """A share of a cell, which trackers of others are asked for, too (decision 37, docs/operate/trackers.md)."""
 _AGAIN_NS = NS_PER_S // 2
-"""A target at rest is told of this often (decision 37): four times within the lease of a pose, 2 s."""
+"""Interval at which a target at rest is published (decision 37): four times within the lease of a pose, 2 s."""
 
 
 class PoseThrottle:
-    """Of the poses of each tick lets through those of targets that have come to another cell, have moved by a
-    quarter of one, were captured, or have not been told of for half a second.
+    """Of the poses of each tick, passes those of targets that have entered another cell, have moved by a quarter of
+    one, were captured, or were published last more than half a second ago.
 
-    Every agent hears the poses of all targets: told ten times a second they were a fifth of all that is delivered,
-    though a target needs seconds for a cell.
+    Every agent receives the poses of all targets: at ten per second they were a fifth of all deliveries, though a
+    target needs seconds for a cell.
     """
 
     def __init__(self, resolution_m: float) -> None:
@@ -43,7 +43,7 @@ class PoseThrottle:
         self._told: dict[str, TargetPose] = {}
 
     def is_news(self, pose: TargetPose) -> bool:
-        """Whether to tell this pose; if so, later ones are compared with it."""
+        """Returns True if this pose is to be published; if so, later ones are compared with it."""
         told = self._told.get(pose.target)
         if told is not None:
             late = not 0 <= pose.stamp_ns - told.stamp_ns < _AGAIN_NS
@@ -56,8 +56,8 @@ class PoseThrottle:
 
 
 TICK_HZ = 10.0
-"""Ten poses a second are enough for any planner (docs/operate/trackers.md). Most of them are not told, as a target
-takes seconds for a cell."""
+"""Ten poses a second are enough for any planner (docs/operate/trackers.md). Most of them are not published, as a
+target takes seconds for a cell."""
 _ASK_NS = NS_PER_S // 2
 """Planners are asked this often where the targets were: twice within `targets.LISTEN_NS`, so one lost question is
 no lost target."""
@@ -159,7 +159,7 @@ class TargetsService:
         self._member.publish_stats(now_ns)
 
     def _obey(self, now_ns: int) -> None:
-        """Go by what is ordered. Nothing moves before it is known whether the swarm is paused."""
+        """Applies orders. Nothing moves before it is known whether the swarm is paused."""
         orders, version = self._obedience, self._obeyed_version
         if not orders.known:
             self._world.paused = True

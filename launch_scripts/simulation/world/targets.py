@@ -99,7 +99,7 @@ class TargetWorld:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
 
     leads   false for a standby, which follows the poses that another tells and does nothing itself
-    paused  nothing moves, and nobody is captured
+    paused  no target moves, and none is captured
     faults  what plug-ins did wrong, for the owner to tell and clear
     homes   `homes_of` terrain and truth, where they have been found already
     """
@@ -132,7 +132,7 @@ class TargetWorld:
         self._target_bodies = TargetBodies(scenario, terrain.grid)
         self._rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
-        # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
+        # Trackers of external targets, and for a standby the leader; and the highest incarnation of a leader.
         self._trackings = Trackings(terrain.grid)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
@@ -164,9 +164,9 @@ class TargetWorld:
         return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
-        """Go by what is ordered: who is there, and who was put somewhere else.
+        """Applies orders: added and removed targets, and moved ones.
 
-        first  what was ordered before this process began: its targets are where planners last saw them
+        first  orders from before this process began: its targets are at the positions where planners last saw them
         """
         self._time_scale = book.setting("time_scale", scenario.time_scale)
         self.paused = book.paused
@@ -195,8 +195,8 @@ class TargetWorld:
     def lead(self, leads: bool) -> None:
         """Take over where the poses of the one before ended, or leave it to another.
 
-        The poses told from now on supersede those: an incarnation above theirs. One that leaves no room above it is
-        no process's; what follows it is heard once it has been silent.
+        Takes the lead: poses from now on supersede those, with an incarnation above theirs. One that leaves no room
+        above it is no process's; what follows it is heard once it has been silent.
         """
         self.leads = leads
         self._started_ns = None
@@ -205,7 +205,7 @@ class TargetWorld:
 
     @property
     def ready(self) -> bool:
-        """Whether it is known where all simulated targets are."""
+        """True if the positions of all simulated targets are known."""
         return all(target.placed for target in self._targets.values() if target.config.is_simulated)
 
     def hear_planner(self, id: str, cell: int | None) -> None:
@@ -219,7 +219,7 @@ class TargetWorld:
         target.unheard_of = not target.placed
 
     def begin_anew(self) -> None:
-        """Places all targets at the next tick: nobody can have seen them before."""
+        """Places all targets at the next tick, for a run that no process has seen before."""
         for target in self._targets.values():
             target.unheard_of = not target.placed
 
@@ -231,11 +231,11 @@ class TargetWorld:
 
     @property
     def listening(self) -> bool:
-        """Whether a planner may still answer where an unplaced target was."""
+        """Returns True if a planner may still reply with the position of an unplaced target."""
         return any(not t.placed and not t.unheard_of and t.config.is_simulated for t in self._targets.values())
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Takes the pose of an external target; as a standby also where whoever leads has moved one of ours."""
+        """Takes the pose of an external target; as a standby also one of ours that the leader has moved."""
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
@@ -318,7 +318,7 @@ class TargetWorld:
 
     def _catchers(self, fleet: Fleet, now_ns: int) -> list[tuple[int, str]]:
         """(target's index, first vehicle within reach of it) of the targets that a report says are chased. A target
-        whose tracker is lost may be anywhere: nobody captures it.
+        whose tracker is lost may be anywhere: it is not captured.
 
         A vehicle that says ARRIVED is believed at twice the range: it compares cells, and the target may have moved
         on since it looked.

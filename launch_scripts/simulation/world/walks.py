@@ -1,7 +1,7 @@
-"""How simulated targets move over the true terrain. Pure: time and chance are arguments.
+"""Motion of simulated targets over the true terrain. Pure: time and chance are arguments.
 
 Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never past the corner of one,
-never up or down what is too steep. Where steps cost by what they climb, so do theirs.
+never up or down a slope that is too steep. If steps cost by their climb, so do theirs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FEAR_CELLS = 40
 """An evader wanders while no vehicle is this near. One at this distance counts a 1,300th of one on a neighbouring
 cell, so a wider look would decide nothing else but when it begins to flee."""
 _STEPS_PER_TICK = 1000
-"""Bounds the time of a tick for a quick target on small cells, or after a long pause. What is left of the tick is
+"""Bounds the time of a tick for a quick target on small cells, or after a long pause. The remainder of the tick is
 lost."""
 
 
@@ -58,7 +58,7 @@ class TrueTerrain:
         self.grid = grid
         self.climb = climb
         self.pace_s_per_m = pace_s_per_m.view()
-        self.pace_s_per_m.flags.writeable = False  # walks are told it
+        self.pace_s_per_m.flags.writeable = False  # motion models receive it
         passable = np.isfinite(pace_s_per_m)
         if not passable.any():
             raise TerrainError("every cell of the terrain is lethal: no target could stand on it")
@@ -105,7 +105,7 @@ class TrueTerrain:
         return self.grid.resolution_m * (1.0 if straight else math.sqrt(2))
 
     def step_s(self, cell: int, to: int) -> float:
-        """How long a vehicle takes for the step, as `Driver` has it."""
+        """Returns the time of a vehicle for the step, as `Driver` has it."""
         level_s = self.length_m(cell, to) * self.pace_s_per_m.item(to)
         return level_s if self.climb is None else level_s * self.climb.driven(cell, to)
 
@@ -143,7 +143,7 @@ class TrueTerrain:
         cells = (row + window.row0) * self.grid.cols + col + window.col0
         d_row, d_col = np.array(STEP_ROW)[:, None], np.array(STEP_COL)[:, None]
         ahead = padded[row + 1 + d_row, col + 1 + d_col]
-        # What is beside a step's corner is, of a straight step, the two cells between which it leads.
+        # The cells beside the corner of a straight step are the two cells that it connects.
         beside = np.maximum(padded[row + 1 + d_row, col + 1], padded[row + 1, col + 1 + d_col])
         own = padded[row + 1, col + 1]
         way, tail = np.nonzero(np.isfinite(np.maximum(np.maximum(ahead, beside), own)))
@@ -168,7 +168,7 @@ class Budget:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkWorld:
-    """What the walk of one target is made with.
+    """Arguments of the motion of one target.
 
     target   its id
     terrain  the true pace, and the steps that are possible
@@ -276,7 +276,7 @@ WALKS: Mapping[str, Callable[[WalkWorld], Walk]] = {
     "evade": Flee,
     "external": Still,
 }
-"""The built-in walks. That of an external target is another process's."""
+"""The built-in walks. The motion of an external target belongs to another process."""
 
 
 def walk_of(plugin: Plugin, world: WalkWorld, tell: Tell) -> Walk:

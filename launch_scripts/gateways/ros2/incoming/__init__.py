@@ -1,7 +1,8 @@
-"""What comes in from ROS: robots, goals, targets, areas and services.
+"""Incoming side from ROS: robots, goals, targets, areas and services.
 
 `Incoming` is the shell: it finds robots and calls all parts at ticks. Each topic is an `Input`: the newest message
 alone is kept until a tick, so that a flood costs no more than one message, and why it is refused is said once.
-`readings` makes checked places and areas of messages; what it refuses is a ConfigError with a sentence. What may
-wait (an order until it is obeyed, a route until its planner answers) is done by a `WorkQueue`, which is bounded.
+`readings` makes checked places and areas of messages; what it refuses is a ConfigError with a sentence. Requests
+that may wait (an order until it is obeyed, a route until its planner replies) are done by a `WorkQueue`, which is
+bounded.
 """

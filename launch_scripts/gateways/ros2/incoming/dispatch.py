@@ -1,4 +1,4 @@
-"""The shell of what comes in: finds robots, gives each message to its part, and calls them at ticks."""
+"""Shell of the incoming side: finds robots, gives each message to its part, and calls them at ticks."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ MOST_ROBOTS = 256
 _LOOK_NS = NS_PER_S // 2
 """The swarm's own vehicles are looked at so often."""
 _MOST_ASKED = 16
-"""All who asked are answered at the next tick, 0.02 s later: more than a few that wait come from a peer that
-floods, and each of them is a copy of the map on the network."""
+"""All askers get a reply at the next tick, 0.02 s later: more than a few that wait come from a peer that floods,
+and each of them is a copy of the map on the network."""
 _MOST_NEWS = 1 << 14
 """Endpoints that come or go between two ticks: 64 of each of `MOST_ROBOTS`, when all robots start together."""
 _MOST_ORDERS = 8
@@ -38,13 +38,13 @@ _TRIGGER = "std_srvs/srv/Trigger"
 
 
 class Incoming:
-    """All that comes in, until `close`. `tick` is called by one thread, some twenty times a second.
+    """All incoming topics, until `close`. `tick` is called by one thread, some twenty times a second.
 
     node      of the ROS side
     swarm     a connection; it is not closed here
     settings  checked
     map       the frame in which ROS has the terrain
-    map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: nobody can ask for the map
+    map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: the map is not served
     vehicles  ids of those that the swarm has now
     """
 
@@ -72,8 +72,8 @@ class Incoming:
         """Robots that were said not to be taken in."""
         self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
-        """Names in ROS of vehicles that agents of the swarm have. What another gateway tells of one looks like a
-        robot, and would be a body where the vehicle itself is."""
+        """Names in ROS of vehicles that agents of the swarm have. A vehicle published by another gateway looks like
+        a robot, and would be a body at the position of the vehicle itself."""
         self._taken_due_ns = 0
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
@@ -100,12 +100,12 @@ class Incoming:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many robots are vehicles now, and what was refused of those that are known."""
+        """Returns the number of robots that are vehicles now, and counts of refused messages of known robots."""
         robots = self._robots.values()
         return {"robots": sum(each.present for each in robots), "refused": sum(each.refused for each in robots)}
 
     def tick(self, now_ns: int) -> None:
-        """Takes in what has come.
+        """Processes received messages.
 
         now_ns  by time.monotonic_ns
         """
@@ -119,20 +119,20 @@ class Incoming:
         for each in self._inputs:
             each.tick(now_ns)
         if self._asked and self._map_now is not None:
-            # All who ask get one map. Of more than _MOST_ASKED the oldest get none: their question ends so.
+            # All askers get one map. Of more than _MOST_ASKED the oldest get none: their query ends.
             response = self._node.types.make(f"{MAP_SERVER.type_name}_Response", map=self._map_now())
             while self._asked:
                 self._asked.popleft()(response)
 
     def close(self) -> None:
-        """Answers what waits. All that was declared or told ends with the node and the connection."""
+        """Answers what waits. All declarations and reports end with the node and the connection."""
         self._routes.close()
         self._orders.close()
 
     # --- robots ---------------------------------------------------------------------------------------------------
 
     def _hear(self, seen: Endpoint, there: bool) -> None:
-        """An endpoint of somebody has come or gone."""
+        """Handles an endpoint that has appeared or disappeared."""
         if seen.kind is not Kind.PUBLISHER or seen.node.name == self._node.name.name:
             return  # a gateway like this one tells of vehicles that the swarm has already
         for robots in self._settings.robots:

@@ -19,7 +19,7 @@ _AT_ONCE = 6
 _TICK_S = 0.02
 MOST_WAITING = 64
 _THREADS = 16
-"""A route takes milliseconds; only one to a place where nobody may stand takes as long as `PATIENCE_S`."""
+"""A route takes milliseconds; only one to a location where no vehicle can be takes as long as `PATIENCE_S`."""
 Answer = Callable[[Route | str], None]
 """Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 
@@ -27,7 +27,7 @@ Answer = Callable[[Route | str], None]
 class PlaceRoutes:
     """A few external targets, lent to those who need a route to a place. One serves all who go to the same cell.
 
-    A target that nobody needs stays where it is, so that its tree is good for the next one who goes there.
+    An unused target stays where it is, so that its tree can be reused for the next request to that location.
 
     goal_targets  their ids
     queue         does the waiting for planners
@@ -36,7 +36,7 @@ class PlaceRoutes:
     def __init__(self, swarm: Swarm, goal_targets: Sequence[str], queue: WorkQueue | None = None) -> None:
         self._swarm = swarm
         self._cells: dict[str, int | None] = dict.fromkeys(goal_targets)
-        """Where each stands; None before it was lent first."""
+        """Cell of each; None before its first use."""
         self._users: Counter[str] = Counter()
         self._targets: dict[str, Target] = {}
         self._lock = threading.Lock()
@@ -63,7 +63,7 @@ class PlaceRoutes:
             return id
 
     def give_back(self, target: str) -> None:
-        """What was lent is needed no more."""
+        """Returns a target to the pool."""
         with self._lock:
             self._users[target] -= 1
 

@@ -1,6 +1,6 @@
 """Messages of ROS as places and areas of the terrain. Pure.
 
-Whatever numbers and names are in a message, what becomes of it is valid, or a ConfigError that says why it is not.
+Any numbers and names in a message become a valid value, or a ConfigError that states the fault.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from swarm.wire.messages.orders import MOST_CORNERS
 from swarm.wire.messages.vehicles import MOST_M_PER_S
 
 _STANDS_M_PER_S = 0.05
-"""What is slower does not drive anywhere: odometry of a robot that stands is seldom 0."""
+"""A slower robot is at rest: odometry at rest is seldom exactly 0."""
 _MOST_M = 1e12
 _LEAST_GAP_NS, _MOST_GAP_NS = NS_PER_S // 50, 2 * NS_PER_S
 """Two poses tell a speed if they are not nearer in time, nor further apart."""
 MOST_CELLS = 1 << 16
-"""Of the terrain, that one grid may close."""
+"""Limit of terrain cells that one grid may close."""
 _MOST_WORK = 1 << 25
 """Numbers that resampling may hold at once."""
 _LEAST_SIDE_M = 1e-3
@@ -44,7 +44,7 @@ _COVERED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where something is, in metres of the terrain.
+    """Position, in metres of the terrain.
 
     heading_rad    clockwise from north: where it looks, or drives to if it moves; None if it does not tell
     speed_m_per_s  0 ... MOST_M_PER_S
@@ -57,7 +57,7 @@ class Place:
 
 
 class FrameReader:
-    """Reads places that are told in the map frame, in that of the terrain, or in one of somebody's own.
+    """Reads positions in the map frame, in that of the terrain, or in a frame of the sender's.
 
     own       name of that frame; empty: there is none
     offset_m  where its origin lies in the map frame
@@ -70,7 +70,7 @@ class FrameReader:
         self._map, self._own, self._offset_m, self._turn_rad = map, own.strip("/"), offset_m, turn_rad
 
     def pose(self, header: Any, pose: Any) -> Place:
-        """Of a geometry_msgs/Pose under a std_msgs/Header. Raises ConfigError."""
+        """Reads a geometry_msgs/Pose under a std_msgs/Header. Raises ConfigError."""
         towards = pose.orientation
         x_m, y_m = self.point(header, pose.position.x, pose.position.y)
         heading_rad = heading_of_quaternion(towards.x, towards.y, towards.z, towards.w)
@@ -108,7 +108,7 @@ class FrameReader:
 
 
 def robot_place(reader: FrameReader, message: Any) -> Place:
-    """Of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped. Raises ConfigError."""
+    """Reads nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped. Raises ConfigError."""
     with_covariance = hasattr(message.pose, "covariance")
     place = reader.pose(message.header, message.pose.pose if with_covariance else message.pose)
     twist = getattr(message, "twist", None)
@@ -122,7 +122,7 @@ def robot_place(reader: FrameReader, message: Any) -> Place:
         return place
     heading_rad = place.heading_rad
     if heading_rad is not None:
-        # Where it goes, not where it looks: what drives backwards endangers what is behind.
+        # Direction of motion, not heading: a robot that reverses endangers the cells behind it.
         heading_rad = heading_of(yaw_of(heading_rad) + math.atan2(left, forward))
     return Place(place.x_m, place.y_m, heading_rad, speed)
 
@@ -132,8 +132,8 @@ class Track:
 
     Only the time of arrival counts: clocks of robots may be simulated, leap or stand still.
 
-    lease_s  it is gone so long after its last good message
-    place    where it was said to be last; None before the first message and once it is gone
+    lease_s  time after its last valid message at which it counts as ended
+    place    its last reported position; None before the first message and once it has ended
     """
 
     def __init__(self, reader: FrameReader, lease_s: float) -> None:
@@ -153,7 +153,7 @@ class Track:
         return found
 
     def gone(self, now_ns: int) -> bool:
-        """Whether its lease has ended. Said once: it may come back."""
+        """True if its lease has ended. Said once: it may come back."""
         if self.place is None or now_ns - self._heard_ns <= self._lease_s * NS_PER_S:
             return False
         self.place = None
@@ -176,7 +176,7 @@ def corners_of(reader: FrameReader, message: Any) -> list[tuple[float, float]]:
 
 def closed_cells(map: RosMap, message: Any, occupied: int) -> list[int]:
     """Cells of the terrain that a nav_msgs/OccupancyGrid closes, in order: those of which half or more lies under
-    cells of the grid from `occupied` up to 100. What is unknown (-1) or beyond the grid closes nothing.
+    cells of the grid from `occupied` up to 100. Cells that are unknown (-1) or beyond the grid close nothing.
 
     Areas are exact: any resolution and origin in the map frame is resampled. Raises ConfigError, also on a turned
     grid.

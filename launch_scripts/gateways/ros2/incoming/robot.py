@@ -32,8 +32,8 @@ _TARGET_FRAMES = "targets/"
 
 
 class Robot:
-    """Made when a robot is found, closed when it is gone. One thread calls `tick`, and owns all state; what answers
-    on others is posted to it.
+    """Made when a robot is found, closed when it has left. One thread calls `tick`, and owns all state; what
+    answers on others is posted to it.
 
     topic     where it says where it is
     is_taken  whether a vehicle of the swarm's own is called so in ROS
@@ -63,9 +63,9 @@ class Robot:
         self._goal: tuple[str, int] | None = None
         """Target that is lent for its goal, and its cell; None while it has no goal of its own."""
         self._goal_cell: int | None = None
-        """Of the goal_pose that was put last."""
+        """Cell of the last published goal_pose."""
         self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
-        """What is to be done at the next tick."""
+        """Work for the next tick."""
         self._poses = Input(node, self.topic, POSE_TYPES[robots.type], robots.hz, self._hear_pose, qos=Qos.SENSOR)
         self._goals = Input(node, own(robots.goal), _POSE, _GOAL_HZ, self._hear_goal)
         self._plan = node.publisher(own(robots.plan), "nav_msgs/msg/Path", Qos.LATCHED)
@@ -76,7 +76,7 @@ class Robot:
 
     @property
     def present(self) -> bool:
-        """Whether it is a vehicle of the swarm now."""
+        """True if it is a vehicle of the swarm now."""
         return self._vehicle is not None
 
     @property
@@ -198,7 +198,7 @@ class Robot:
         self._put(self._certificate, certificate)
 
     def _put(self, publisher: Publisher, message: Any) -> None:
-        """What a lost link does not take is lost."""
+        """Messages are lost while the link is down."""
         with suppress(BusError):
             publisher.put(message)
 
@@ -225,7 +225,8 @@ class Robot:
             answer(f"{what}: {error}")
 
     def _start_of(self, start: Any) -> Place:
-        """Where a plan begins: where it says, or without a frame where the robot is. Raises ConfigError."""
+        """Returns the start of a plan: the stated one, or without a frame the position of the robot. Raises
+        ConfigError."""
         if start.header.frame_id:
             return self._reader.pose(start.header, start.pose)
         if (place := self._track.place) is None:

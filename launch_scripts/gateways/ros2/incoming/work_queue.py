@@ -60,7 +60,7 @@ class WorkQueue:
 class Input:
     """The newest message of a topic, taken at ticks and at most so often.
 
-    take   is called with it, and the time by time.monotonic_ns. Raises SwarmError on what is refused
+    take   is called with it, and the time by time.monotonic_ns. Raises SwarmError on a refused message
     queue  `take` may wait, and is called by its thread; None: it is called by `tick`
     """
 
@@ -83,11 +83,11 @@ class Input:
         self._period_ns = int(NS_PER_S / hz)
         self._due_ns = 0
         self._held: Any = None
-        """What the queue had no room for."""
+        """Message for which the queue had no room."""
         self._said: str | None = None
 
     def tick(self, now_ns: int) -> None:
-        """Takes in what has come, if that is due."""
+        """Processes received messages, if that is due."""
         if now_ns < self._due_ns:
             return
         message = self.newest.take() or self._held
