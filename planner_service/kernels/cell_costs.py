@@ -18,8 +18,8 @@ from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BOX, INF
 
 CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)
-"""What a cell costs at least and at most, s: a picosecond, 35,000 years. So no way over the largest grid, and no
-quotient of two costs, leaves float32."""
+"""Lowest and highest cost of a cell, s: a picosecond, 35,000 years. No path over the largest grid, and no quotient
+of two costs, therefore leaves float32."""
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
 BLOCK = 1 << 10
@@ -28,7 +28,7 @@ BLOCK = 1 << 10
 
 @helper
 def _cell_cost(pace, resolution, extra):
-    """What a cell of this pace costs: between `CHEAPEST_S` and `DEAREST_S`, inf where it is lethal."""
+    """Returns the cost of a cell of this pace: between `CHEAPEST_S` and `DEAREST_S`, inf where it is lethal."""
     cost = min(max(pace * resolution, CHEAPEST_S) + extra, DEAREST_S)
     return cost if pace < INF else INF
 
@@ -132,8 +132,8 @@ def merge_window(part, box, offset, old_root, cost, stride):
     """Lower a tree's costs, which are stored less `offset` (s), to those of a window grown around a new root
     (`part`).
 
-    Only what gets cheaper is rewritten, and the old root, so that costs stay upper bounds of what is driven and
-    grow strictly along every way.
+    Only cells that get cheaper are rewritten, and the old root, so that costs stay upper bounds of the cost driven
+    and grow strictly along every path.
     """
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2

@@ -1,7 +1,7 @@
-"""What a step's rise does to its cost: the one function by which all kernels price a step.
+"""Effect of a step's rise on its cost: the one function by which all kernels price a step.
 
-Where cost depends on direction, a step from v into its neighbour u costs cell_cost[u] * step_price(climbs, v, u,
-way), which holds its length, too; `way` is its direction 0..7. A step that u offers v leads back: its way is that
+With direction-dependent costs, a step from v into its neighbour u costs cell_cost[u] * step_price(climbs, v, u,
+way), which includes its length; `way` is its direction 0..7. A step that u offers v leads back: its way is that
 from u to v, turned round.
 
     height  float32  (size,)           m, padded; NaN is a void, and a step from or to it is level
@@ -50,13 +50,13 @@ def _half_of(begins):
 
 @helper
 def is_windy(climbs):
-    """Whether each way has a table of its own."""
+    """Returns True if each direction has a table of its own."""
     return climbs[3][2] != climbs[3][0]
 
 
 @helper
 def step_price(climbs, v, u, way):
-    """What the step from v into its neighbour u, in direction `way`, costs, in cell costs of u."""
+    """Returns the cost of the step from v into its neighbour u, in direction `way`, in cell costs of u."""
     height, prices, scale, begins = climbs[0], climbs[1], climbs[2], climbs[3]
     entry = _entry(height[u] - height[v], scale[way & 1], _half_of(begins))
     return prices[np.uint64(begins[way] + entry)]
@@ -64,8 +64,8 @@ def step_price(climbs, v, u, way):
 
 @helper
 def offered(base, own, climbs, v, u, way, length):
-    """What a cell u, which costs `base` and whose cell cost is `own`, offers its neighbour v, which enters it in
-    direction `way`, s.
+    """Returns the cost that a cell u, which costs `base` and whose cell cost is `own`, offers its neighbour v,
+    which enters it in direction `way`, s.
 
     climbs  None where entering a cell costs the same from everywhere: then a step costs its length
     """

@@ -1,10 +1,10 @@
-"""How this folder is compiled: each kernel once, for one signature, with a disk cache that watches all sources.
+"""Compilation of this folder: each kernel once, for one signature, with a disk cache that watches all sources.
 
 numba's own cache (`numba.njit(cache=True)`) compares a function's file with what it was when compiled. It does
 not see that a helper or a constant of another file has changed, although both are compiled into the function. The
 stamp here is a hash of every source of this package, so that kernels can share helpers and constants. It is part
 of the files' names: numba writes its index before the code that this names, so that under one name a process could
-find code of older sources meanwhile. That several processes compile one kernel at once does no harm: it has one
+find code of older sources meanwhile. Several processes may compile one kernel at the same time: it has one
 signature, so that they write the same.
 """
 
@@ -30,7 +30,8 @@ from numba.extending import intrinsic
 
 
 def _stamp() -> tuple[str, bool]:
-    """What compiled code depends on, beside what numba's index knows: sources, and whether indices are checked."""
+    """Returns the dependencies of compiled code beyond those of numba's index: sources, and whether indices are
+    checked."""
     digest = hashlib.sha256()
     for source in sorted(resources.files(__package__).iterdir(), key=lambda entry: entry.name):
         if source.name.endswith(".py"):
@@ -63,11 +64,11 @@ class _FolderCacheImpl(caching.CompileResultCacheImpl):
     )
 
     linked = True
-    """Whether other compiled functions call this one, so that compiling them takes its bitcode."""
+    """True if other compiled functions call this one, so that compiling them takes its bitcode."""
 
     def rebuild(self, target_context, payload):
-        """As numba's. Of what nothing links to, only the machine code is read: to parse the bitcode beside it, and
-        to list what that defines, takes more than half of loading a kernel."""
+        """As numba's. If no other function links to it, only the machine code is read: parsing the bitcode beside
+        it, and listing its definitions, takes more than half of loading a kernel."""
         if self.linked:
             return super().rebuild(target_context, payload)
         (name, kind, (code, _)), fndesc, *rest = payload
@@ -83,8 +84,8 @@ def _no_bitcode() -> Any:
 
 class _WholeFiles(caching.IndexDataCacheFile):
     """numba's, for which a file that is not as it was written is one that is not there, so that the kernel is
-    compiled and written once more. A disk that fails or a machine that loses power leaves such files; numba raises
-    what `pickle` makes of one, at every start anew, and calls machine code with a wrong byte."""
+    compiled and written once more. A failing disk or a power loss leaves such files. Numba raises the exceptions of
+    `pickle` on one at every start, and calls machine code with a wrong byte."""
 
     def _load_index(self):
         try:
@@ -96,7 +97,7 @@ class _WholeFiles(caching.IndexDataCacheFile):
         data = Path(self._data_path(name)).read_bytes()
         digest, code = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
         if hashlib.sha256(code).digest() != digest:
-            raise OSError(f"{name} is not as it was written")  # which numba takes for a file that is gone
+            raise OSError(f"{name} is not as it was written")  # which numba takes for a missing file
         return pickle.loads(code)
 
     def _save_data(self, name, data):
@@ -116,7 +117,7 @@ class _FolderCache(caching.FunctionCache):
         self._cache_file = _WholeFiles(self.cache_path, base, _STAMP)
 
     def load_overload(self, sig, target_context):
-        """As numba's, but without its registries, which only a compilation needs and which take 0.5 s to load."""
+        """Like numba's, but without its registries, which only a compilation needs and which take 0.5 s to load."""
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 
@@ -125,7 +126,7 @@ class _FolderCache(caching.FunctionCache):
         return isinstance(self._impl.locator, _ReadOnlyLocator)
 
     def save_overload(self, sig, data):
-        """As numba's, where there is a place for it."""
+        """Like numba's, if there is a folder for it."""
         if not self.read_only:
             super().save_overload(sig, data)
 
@@ -140,7 +141,7 @@ def _compiled(function: Any, **options: bool) -> Any:
 
 
 def helper(function: Any) -> Any:
-    """What only kernels call: compiled for the types that they call it with. Python cannot."""
+    """Decorates a function that only kernels call: compiled for the types that they call it with. Python cannot."""
     return _compiled(function, no_cpython_wrapper=True)
 
 
@@ -157,7 +158,7 @@ _ARRAYS = {
     "DoubleRows": "f8[:, ::1]",
     "int": "i8",
 }
-"""What `layout` calls arrays -> as numba writes their types."""
+"""Names of arrays in `layout` -> types in numba's notation."""
 
 
 def type_of(named: Any) -> Any:
@@ -173,16 +174,16 @@ def _types(arguments: Iterable[Any]) -> tuple[Any, ...]:
 
 
 def kernel(*signature: Any) -> Callable[[Any], Any]:
-    """What Python calls: compiled for these types alone, without the GIL, and kept on disk.
+    """Decorates a function that Python calls: compiled for these types alone, without the GIL, and kept on disk.
 
     signature  as numba reads one, of the arguments, or each on its own, where one is a `type_of`; any other type is
                a TypeError
 
-    It is compiled, or loaded, by `load`, or else by its first call. Where no folder can be written to, every
-    process compiles for itself what NUMBA_CACHE_DIR lacks. With NUMBA_DISABLE_JIT the function stays as it is.
+    It is compiled, or loaded, by `load`, or else by its first call. If no folder can be written to, every process
+    compiles kernels that NUMBA_CACHE_DIR lacks for itself. With NUMBA_DISABLE_JIT the function stays as it is.
 
     Kernels and helpers allocate nothing, so that no references need to be counted: arrays to write to are handed
-    in. That halved the time to compile them all.
+    in. That halved the compile time of all.
     """
 
     def declare(function: Any) -> Any:
@@ -214,7 +215,7 @@ class StepKernel:
 
 
 def step_kernel(signature: str, climbs: str) -> Callable[[Any], StepKernel]:
-    """As `kernel`, for both kinds of map: `CLIMBS` in the signature stands for `climbs`, or for nothing."""
+    """Like `kernel`, for both kinds of map: `CLIMBS` in the signature stands for `climbs`, or for nothing."""
 
     def declare(function: Any) -> StepKernel:
         # A function of another name, as a cache and a builder's claim are found by that.
@@ -251,7 +252,7 @@ def is_loaded(compiled: Any) -> bool:
 
 
 def is_on_disk(compiled: Any) -> bool:
-    """Whether some process has compiled the kernel for this machine."""
+    """Returns True if a process has compiled the kernel for this machine."""
     # Planners ask many times a second until it is: the rest takes a hundred times as long as this.
     if not isinstance(compiled._cache, _FolderCache) or not Path(compiled._cache._cache_file._index_path).exists():
         return False
@@ -262,12 +263,13 @@ def is_on_disk(compiled: Any) -> bool:
 
 
 def cache_folder() -> Path | None:
-    """Where compiled code is kept; None where no folder can be written to."""
+    """Returns the folder of compiled code; None if no folder can be written to."""
     return next((Path(each.cache_path) for each in _caches() if not each.read_only), None)
 
 
 def code_folder() -> Path | None:
-    """Where compiled code is looked for: `cache_folder`, or NUMBA_CACHE_DIR where it can only be read."""
+    """Returns the folder that is searched for compiled code: `cache_folder`, or NUMBA_CACHE_DIR if that is
+    read-only."""
     return next((Path(each.cache_path) for each in _caches()), None)
 
 
@@ -277,7 +279,7 @@ def _caches() -> list[_FolderCache]:
 
 
 _READ, _KEEP, _DATA = 0, 3, 1
-"""As llvm.prefetch has them: for reading; to stay in all caches; data, not instructions."""
+"""Constants of llvm.prefetch: for reading; to stay in all caches; data, not instructions."""
 
 
 def _nothing(array, index):

@@ -1,10 +1,10 @@
 """Make a tree exact from the parents that it has, whatever windows, moves and repairs it went through.
 
-When the root moves a cell, over 99 % of all cells keep their parents, and nearly all costs change. So costs are
-computed anew along the parents, and the few cells that are then offered less than they cost take the offer. It is
-policy iteration on shortest paths (R. A. Howard, "Dynamic Programming and Markov Processes", 1960): to evaluate the
-whole tree costs a fourth of growing it, to improve it everywhere, which vectorises, a fifteenth. What hangs on an
-improved cell is evaluated along the parents, too; what is then left to improve spreads as in a repair.
+When the root moves a cell, over 99 % of all cells keep their parents, and nearly all costs change. Costs are
+therefore recomputed along the parents, and the few cells that are then offered less than they cost take the offer.
+It is policy iteration on shortest paths (R. A. Howard, "Dynamic Programming and Markov Processes", 1960): to
+evaluate the whole tree costs a fourth of growing it, to improve it everywhere, which vectorises, a fifteenth.
+Descendants of an improved cell are evaluated along the parents, too; further improvements spread as in a repair.
 
 Arrays, beside those of `layout` and `repair`:
     children  uint8    (size,)    of each cell, bit k: its neighbour in direction k leads to it
@@ -51,7 +51,7 @@ _AHEAD = np.uint64(24)
 _PART = np.uint64(64)
 """Cells of a row that are looked through at once."""
 _TURNS = 12
-"""How often a tree is improved before a growth costs less: half as often is rare (decision 60)."""
+"""Rounds of improvement after which a full search costs less: half as many are rare (decision 60)."""
 
 Walk = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
 """(children, steps, lengths, ways, many)."""
@@ -90,7 +90,7 @@ def _find_children(parent, stride, children):
 
 @helper
 def _evaluate(grid, climbs, cost, root, walk, queue, keys):
-    """Costs := what is driven along the parents, of all cells that have a way. Returns the largest."""
+    """Sets costs to those driven along the parents, for all cells with a path. Returns the largest."""
     cell_cost = grid[0]
     children, steps, lengths, ways, many = walk
     half = np.uint64(queue.size >> 1)
@@ -210,8 +210,8 @@ def mend(grid, climbs, labels, buckets, farthest, most, scratch, walk):
     walk      as `make_walk` returns it
 
     Costs and parents are then those of a tree grown from scratch, bit for bit. Returns (cells visited, a cost, s,
-    that none exceeds, whether the tree is exact). It is not where that would take longer than growing it: then no
-    cost is less than what is driven along the parents, and more than its parent's by the step at least.
+    that none exceeds, whether the tree is exact). It is not exact if that would take longer than a full search:
+    then each cost is at least the one driven along the parents, and more than its parent's by the step at least.
     """
     cell_cost, _, stride, _, _ = grid
     cost, parent, root = labels

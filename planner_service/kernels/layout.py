@@ -1,4 +1,4 @@
-"""What all kernels agree on: how arrays are laid out, which steps there are, what the special values mean.
+"""Conventions of all kernels: layout of arrays, steps, sentinels.
 
 Arrays are flat and padded. A grid of `rows` x `cols` takes `(rows + 2) * stride` cells, stride = cols + 2, with a
 border of lethal cells, so that no neighbour of an inner cell needs a bounds check. "Padded cell" is an index into
@@ -35,7 +35,7 @@ SQRT2_EXACT = 1.4142135623730951
 INF = np.float32(np.inf)
 HUGE = np.float32(3.4028235e38)
 WALL = np.float32(-np.inf)
-"""While growing, the cost of a lethal cell. No minimum lifts it; and max(key, -WALL) is inf, an offer that nobody
+"""While growing, the cost of a lethal cell. No minimum lifts it; and max(key, -WALL) is inf, an offer that no cell
 takes, without a branch."""
 
 Bytes = NDArray[np.uint8]
@@ -55,7 +55,7 @@ TOO_FINE = -1
 
 
 PaddedGrid = tuple[NDArray[np.float32], NDArray[np.int64], int, int, bool]
-"""What a search runs on: (cell_cost, offsets, stride, rule, corners).
+"""Input of a search: (cell_cost, offsets, stride, rule, corners).
 
 offsets  int64 (8,), what each direction 0..7 (north, then clockwise) adds to a padded cell
 rule     RULE_FOUR, RULE_PAPER or RULE_OCTILE
@@ -65,7 +65,7 @@ long to read a NumPy scalar.
 """
 
 Labels = tuple[NDArray[np.float32], NDArray[np.uint8], int]
-"""What a search writes: (cost, parent, root), a tree's labels and the padded cell where it leads."""
+"""Output of a search: (cost, parent, root), a tree's labels and its padded root cell."""
 
 Buckets = tuple[float, int]
 """Size of a bucket queue: (width, count). Keys less than `width` (s, rounded to float32) apart share a bucket."""
@@ -99,14 +99,15 @@ def step_length(rule, odd):
 
 @helper
 def cuts_corner(v, way, x, offsets):
-    """Whether the step from padded cell `v` in direction `way` is a diagonal one that passes beside cell `x`."""
+    """Returns True if the step from padded cell `v` in direction `way` is a diagonal one that passes beside cell
+    `x`."""
     return way & 1 == 1 and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
 
 
 @helper
 def check_cells(cells, size):
-    """Raises ValueError unless these are padded cells (int64): indices into arrays of so many. Called by kernels
-    that are handed cells, because from Python it would take a microsecond."""
+    """Raises ValueError unless these are padded cells (int64): valid indices into arrays of this size. Called by
+    kernels that are handed cells, because from Python it would take a microsecond."""
     outside = 0
     for i in range(cells.size):
         outside += cells[i] < 0 or cells[i] >= size

@@ -1,13 +1,13 @@
 """Lower bounds on the optimum, for many cells at once; docs/certificates.md proves them.
 
-`_by_heuristic` is the landmark bound of ALT (A. V. Goldberg, C. Harrelson, "Computing the shortest path: A*
-search meets graph theory", SODA 2005) with one landmark, an earlier root: its exact costs are a consistent
-heuristic, so that no way from v to the root costs less than it falls between the two. A window around the root adds
+`_by_heuristic` is the landmark bound of ALT (A. V. Goldberg, C. Harrelson, "Computing the shortest path: A* search
+meets graph theory", SODA 2005) with one landmark, an earlier root: its exact costs are a consistent heuristic, so
+that no path from v to the root costs less than the heuristic falls between the two. A window around the root adds
 that a way either stays inside, or comes in over the window's rim for the last time.
 
 Arrays, beside those of `layout`:
     starts     int64    (n,)     padded cells
-    cost       float64  (n,)     s; what is driven from each start, or inf
+    cost       float64 (n,) s; the cost driven from each start, or inf
     bound      float64  (n,)     s; proven lower bound on the cost from each start
     heuristic  float32  (size,)  s; as `cost`; no step costs less than it falls by. Size 0 if there is none
 """
@@ -21,8 +21,7 @@ from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BOX, INF, check_cells
 
 WindowBound = tuple[NDArray[np.float32], tuple[int, int, int, int], NDArray[np.int64], NDArray[np.float64]]
-"""What a window around the root costs on its own, a lower bound on every way that stays inside: (part, box, rim,
-rim_cost).
+"""Lower bound of a window around the root on every path that stays inside: (part, box, rim, rim_cost).
 
 part      float32  (cells,)  s; cost of the window's cells as a padded grid of its own; exact inside it
 box       (row0, col0, row1, col1) of the window

@@ -1,10 +1,10 @@
 """Parents from costs: every cell leads to the neighbour that offers it least.
 
-Where costs are exact such parents are a shortest-path tree. Costs grow strictly along them, backwards, so that they
+With exact costs such parents are a shortest-path tree. Costs grow strictly along them, backwards, so that they
 cannot form a cycle. Arrays are laid out as `layout` says.
 
-Where a step costs less than the rounding of the way behind it, a cell may cost what its parent does, and parents
-that follow from costs alone may lead in a circle. `untie_parents` gives such cells others: from where costs do tell
+If a step costs less than the rounding of the path behind it, a cell may cost as much as its parent, and parents
+that follow from costs alone may form a cycle. `untie_parents` gives such cells others: from where costs do tell
 them onward, over steps that cost exactly what their cells differ by. Every cell with a way has such steps all the
 way to the root: its cost is what one neighbour offered it, which cost less, or as much and was served before it.
 """
@@ -51,7 +51,7 @@ def _parents_of_four(cell_cost, cost, s, first, last, parent, least):
 
 @helper
 def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
-    """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
+    """A diagonal counts if the more expensive of its two corners costs at most `limit`. Free of branches: it
     vectorises."""
     for i in range(first, last):
         north = cost[i - s] + cell_cost[i - s]
@@ -89,7 +89,7 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, leas
 
 @helper
 def _take_less(climbs, n, code):
-    """Where a row's offer is less than the best so far, take it, and whose it is."""
+    """Takes a row's offer, and its origin, where it is less than the best up to now."""
     keys, best, codes = climbs[4], climbs[5], climbs[6]
     for i in range(n):
         codes[i] = code if keys[i] < best[i] else codes[i]
@@ -98,7 +98,7 @@ def _take_less(climbs, n, code):
 
 @helper
 def _shut_diagonals(cell_cost, climbs, first, n, one, other):
-    """No offer where one of the cells beside a diagonal step, so many further (unsigned), is lethal."""
+    """Blocks offers over a diagonal step if one of the cells beside it, at this (unsigned) offset, is lethal."""
     keys = climbs[4]
     for i in range(n):
         v = first + i
@@ -107,7 +107,7 @@ def _shut_diagonals(cell_cost, climbs, first, n, one, other):
 
 @helper
 def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
-    """As the others here, direction by direction, so that it vectorises."""
+    """Like the others here, direction by direction, so that it vectorises."""
     cell_cost, offsets, _, rule, corners = grid
     best, codes = climbs[5], climbs[6]
     n = last - first
@@ -130,9 +130,9 @@ def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
 
 @helper
 def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
-    """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out.
+    """Like `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out.
 
-    least  float32 (last - first,), written: the least that each is offered, s; None where nobody asks
+    least  float32 (last - first,), written: the lowest offer to each, s; None if not needed
     """
     cell_cost, _, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
@@ -159,7 +159,8 @@ def point_to_parents(grid, climbs, cost, root, box, parent):
 
 @helper
 def _leads_on(grid, climbs, labels, v, k):
-    """Whether a cell's step in direction k is one of its cheapest, and leads to a cell whose parent is right."""
+    """Returns True if a cell's step in direction k is one of its cheapest, and leads to a cell whose parent is
+    right."""
     cell_cost, offsets, _, rule, corners = grid
     cost, parent, root = labels
     odd = k & 1
@@ -173,7 +174,7 @@ def _leads_on(grid, climbs, labels, v, k):
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
 def untie_parents(grid, climbs, labels, queue):
-    """Of exact costs, and of parents that follow from them: replace those that cost as much as their cells.
+    """Replaces parents that cost as much as their cells, for exact costs and parents that follow from them.
 
     queue  uint32 (2 * size,), scratch: padded cells that need another parent; behind them, those that have got one
     """

@@ -1,18 +1,18 @@
 """A tree cut into pieces at the borders of tiles: what it consists of, and what its cells cost inside a tile.
 
 When the root of a tree moves a cell, nearly all cells keep their parent, and the costs of whole trunks change by
-one number each. So the map is partitioned into tiles of `SIDE` x `SIDE` cells. All cells of a tile whose ways leave
-it over the same cell, the *exit*, are a *piece*. A cell's cost is the piece's total, of its exit, and its offset,
-what it costs to go from the cell to the exit. The piece that an exit leads into is its *successor*. A move
-evaluates the totals, some 2 % of the cells; what a cell costs inside its tile changes only where parents do.
+one number each. The map is therefore partitioned into tiles of `SIDE` x `SIDE` cells. All cells of a tile whose
+ways leave it over the same cell, the *exit*, are a *piece*. A cell's cost is the piece's total, of its exit, and
+its offset, what it costs to go from the cell to the exit. The piece that an exit leads into is its *successor*. A
+move evaluates the totals, some 2 % of the cells; what a cell costs inside its tile changes only where parents do.
 
 A piece is named by where on the tile's border its exit is, 0..251, or `ROOT_PIECE`; so names last. Costs are
-float64: what is stated is what is driven, and all comparisons are of sums that differ by a few units in the last
+float64: stated costs are those driven, and all comparisons are of sums that differ by a few units in the last
 place. Tiles are numbered row by row, `across` in a row; n is their number.
 
 A move or a change of the map, step by step:
 1. `partition_search.merge_parents` takes over parents of a window, `cut_parents` takes parents away.
-2. `relabel_tiles` labels the tiles anew in which a parent has changed.
+2. `relabel_tiles` labels again the tiles in which a parent has changed.
 3. `partition_totals.evaluate_totals` adds up what each piece costs, along successors.
 4. `partition_totals.queue_checks` finds the tiles in which a cell may be offered less than it costs by now.
 5. `partition_search.improve_tiles` improves these, and begins again at 3 until there are none.
@@ -62,7 +62,7 @@ NO_PIECE = np.uint8(255)
 CHECK, RELINK, RELINK_INTO, CUT_OFF, RECHECK, CHECKED_CUT_OFF, RECONNECTED = (
     np.uint8(1 << bit) for bit in range(7)
 )
-"""Bits of `Tiles.wanted`, what is to be done to a tile or known of it:
+"""Bits of `Tiles.wanted`, pending work or known facts of a tile:
 
 CHECK            it may hold a cell that is offered less than it costs
 RELINK           its pieces may have another successor, or another way to it
@@ -77,17 +77,18 @@ LINKING, SUMMING, CHANGED, NOTED, NEARBY, CHECKING = range(6)
 added up; whose totals have changed; have, and are so noted; about which something has changed; which are to be
 checked."""
 DEARER, ALTERED = np.uint8(1), np.uint8(2)
-"""What has changed in a tile: cells got dearer, or lost their way; or anything else, perhaps that too."""
+"""Kinds of change in a tile: cells got more expensive, or lost their path; or any other change, perhaps that
+too."""
 FINEST = 2.0**-46
-"""Of a cost: what is offered less than by this is not taken. Sums of the same numbers in another order differ by a
-32nd of it; it keeps costs within so much a step of the optimum."""
+"""Fraction of a cost: offers that are less by a smaller difference are not taken. Sums of the same numbers in
+another order differ by a 32nd of it; it keeps costs within so much a step of the optimum."""
 MOST_SLACK = 8 * FINEST
-"""Of the farthest cost: no cell of an exact tree is offered less than it costs by more than this. It holds both of
-these and the rounding of sums."""
+"""Fraction of the farthest cost: no cell of an exact tree is offered less than it costs by more than this. It holds
+both of these and the rounding of sums."""
 
 
 class Tree(NamedTuple):
-    """Where each cell leads, and what each piece costs."""
+    """Parent of each cell, and cost of each piece."""
 
     parent: Bytes
     """(size,) padded; direction of the next cell, NONE at the root and where there is no way."""
@@ -96,11 +97,11 @@ class Tree(NamedTuple):
     and beyond the grid."""
     rim: Doubles
     """(n * PIECES,) s; from each cell on the border of a tile to its piece's exit, by the name that a piece has
-    whose exit it is. What cells inside cost follows from the parents."""
+    whose exit it is. The cost of cells inside follows from the parents."""
     total: DoubleRows
-    """(n * PIECES, 4) s; of each piece: TOTAL, from its exit to the root, inf of NO_PIECE and where there is no
-    way; BEFORE, what that was before the last evaluation that has changed a total of its tile, and where it had no
-    way, less than 0, what it was when it had one; OFFSET, from its exit to the exit of its successor."""
+    """(n * PIECES, 4) s; of each piece: TOTAL, from its exit to the root, inf of NO_PIECE and without a path;
+    BEFORE, its value before the last evaluation that has changed a total of its tile, and without a path, less than
+    0, its value when it had one; OFFSET, from its exit to the exit of its successor."""
     successor: IntRows
     """(n * PIECES, 8) the same memory, for what of a piece is used together to lie together: SUCCESSOR, the piece
     that its exit leads into, -1 at the root; STAMP, the evaluation by which TOTAL is right."""
@@ -109,7 +110,7 @@ class Tree(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """What is known of each tile."""
+    """State of each tile."""
 
     exits: Bytes
     """(n * PIECES,) names of the pieces that a tile has, as many as `many` says."""
@@ -118,10 +119,11 @@ class Tiles(NamedTuple):
     span: Doubles
     """(n,) s; no cell of a tile costs more inside it."""
     wanted: Bytes
-    """(n,) what is to be done to a tile before the tree is right again: `CHECK` and others."""
+    """(n,) pending work on a tile before the tree is right again: `CHECK` and others."""
     falls: DoubleRows
     """(3, n) s; the least and the greatest change of a piece's total while these are noted, else 0, or inf and -inf
-    where there is no piece; and how much less a cell may be offered by all changes since its tile was checked."""
+    without a piece; and the largest amount by which all changes since its tile was checked may lower an offer to a
+    cell."""
     ends: DoubleRows
     """(2, n) s; the least and the greatest total of a tile; inf and 0 if there is none."""
     across: int
@@ -180,14 +182,14 @@ class Schedule(NamedTuple):
     sets: ByteRows
     """(6, k) whether a tile is in `LINKING` and others, by its place; k is n or a few more."""
     words: LongRows
-    """(6, k / 8) the same memory, so that what is empty is passed over by eight."""
+    """(6, k / 8) the same memory, so that empty entries are skipped by eight."""
 
 
 TREE, TILES, SCRATCH, SCHEDULE = (type_of(each) for each in (Tree, Tiles, Scratch, Schedule))
 
 
 def make_scratch(tiles: int, most: int) -> Scratch:
-    """Of a map of so many tiles, of which offsets are kept for so many at most."""
+    """Makes the scratch for a map of `tiles` tiles, with offsets for a bounded number of them."""
     tile = np.arange(CELLS, dtype=np.int16).reshape(SIDE, SIDE)
     border = np.zeros(PIECES, np.int16)
     border[: 4 * SIDE - 4] = np.concatenate((tile[0], tile[-1], tile[1:-1, 0], tile[1:-1, -1]))
@@ -212,7 +214,7 @@ def make_scratch(tiles: int, most: int) -> Scratch:
 
 
 def make_totals(tiles: int) -> tuple[DoubleRows, IntRows]:
-    """(total, successor) of so many tiles without a piece."""
+    """Returns (total, successor) of `tiles` tiles without a piece."""
     total = np.full((tiles * PIECES, 4), np.inf)
     successor = total.view(np.int32)
     successor[:, SUCCESSOR], successor[:, STAMP] = -1, 0
@@ -227,7 +229,7 @@ def step_cost(rule, own, code):
 
 @helper
 def border_index(cell):
-    """Of the piece whose exit is this cell on the border of a tile."""
+    """Returns the index of the piece whose exit is this cell on the border of a tile."""
     row, col = cell >> BITS, cell & INSIDE
     if row == 0:
         return col
@@ -313,8 +315,8 @@ def _load_own(t, grid, across, scratch):
 
 @helper
 def _load_parents(t, grid, tree, across, scratch):
-    """Put the parents of a tile on the scratch. What its cells cost inside it is less than 0 until known, and they
-    have no name."""
+    """Put the parents of a tile on the scratch. The costs of its cells inside it are less than 0 until known, and
+    they have no piece."""
     stride, parent = grid[2], tree.parent
     inner, code, name = scratch.inner, scratch.code, scratch.name
     origin, rows, cols = corner_of(grid, across, t)
@@ -467,9 +469,9 @@ def request_around(tiles, t, what):
 
 @kernel(GRID, TREE, TILES, SCRATCH, "i8[::1]", "u1[::1]")
 def relabel_tiles(grid, tree, tiles, scratch, which, changed):
-    """Label these tiles anew, whose parents or cell costs have changed, and have them looked at; and those about
-    them, unless all that has changed is that cells got dearer (`changed` is `DEARER`, uint8 (n,)): that offers
-    nobody less, and whoever leads there sees its totals rise."""
+    """Labels these tiles again, whose parents or cell costs have changed, and schedules a check of them. Tiles
+    about them are checked, too, unless cells only got more expensive (`changed` is `DEARER`, uint8 (n,)): that
+    lowers no offer, and a piece that leads there sees its totals rise."""
     wanted = tiles.wanted
     for i in range(which.size):
         t = which[i]

@@ -2,12 +2,12 @@
 
 A cell is *offered less* where a neighbour's cost and the step to it are less than what it costs. Tiles that may
 hold such a cell, which `partition_totals` finds, are checked: with one cell around, by vectors; and cells that are
-offered less take it, and spread it inside the tile, by a label-correcting search. What that offers to cells of
-other tiles is left to these.
+offered less take it, and spread it inside the tile, by a label-correcting search. Offers to cells of other tiles
+are left to these.
 
-The invariant: **what a cell costs is at least what its parent offers**. It holds where costs are what is driven; a
-cell that takes less takes whoever offers it as its parent, so that its children are offered no more than
-they cost; and only falls. Steps cost something, so costs fall strictly along parents: there is never a cycle.
+The invariant: **what a cell costs is at least what its parent offers**. It holds if costs are those driven; a cell
+that takes less takes the offering cell as its parent, so that its children are offered no more than they cost; and
+only falls. Steps cost something, so costs fall strictly along parents: there is never a cycle.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _mark_improvable(cost, own, begin, end, diagonal, corners, least, less):
 
 @helper
 def _open(own, around, rule, corners, at, code):
-    """Whether there is a step between a passable cell on the scratch and the one in this direction."""
+    """Returns True if there is a step between a passable cell on the scratch and the one in this direction."""
     if not code & 1:
         return True
     if rule == RULE_FOUR:
@@ -214,7 +214,7 @@ def _spread(t, grid, tree, tiles, scratch, count, least):
             u = at + around[code]
             offer = cost[at] + step_cost(rule, own[at], code)
             child = parent[v + offsets[code]] == (code + 4) & 7
-            # A child always follows, so that what a cell is said to cost is what is driven.
+            # A child always follows, so that the stated cost of a cell is the one driven.
             if not offer + (0.0 if child else least) < cost[u] or not own[u] < np.inf:
                 continue
             if not child and not _open(own, around, rule, corners, at, code):
@@ -270,7 +270,7 @@ def _improve_tile(t, grid, tree, tiles, scratch):
         return False
     _spread(t, grid, tree, tiles, scratch, count, least)
     store_offsets(t, tree, scratch)
-    # Exits whose way leads on inside the tile by now are none any more; nobody leads over them.
+    # Exits whose path leads on inside the tile by now are none any more; no piece leads over them.
     kept = 0
     for j in range(many[t]):
         name = np.int64(exits[t * PIECES + j])
@@ -283,7 +283,7 @@ def _improve_tile(t, grid, tree, tiles, scratch):
 
 @helper
 def _is_next(t, across, schedule):
-    """Whether no tile about this one, of those to be looked at, has an earlier turn."""
+    """Returns True if no tile about this one, of those to be checked, has an earlier turn."""
     place, turn, sets = schedule.place, schedule.turn, schedule.sets
     row, col = t // across, t % across
     down = place.size // across
@@ -297,7 +297,7 @@ def _is_next(t, across, schedule):
 
 @helper
 def _any_cut_off(t, wanted, across):
-    """Whether a piece of a tile, or of those about it, has no way."""
+    """Returns True if a piece of a tile, or of those about it, has no path."""
     row, col = t // across, t % across
     down = wanted.size // across
     what = np.uint8(0)
@@ -309,9 +309,8 @@ def _any_cut_off(t, wanted, across):
 
 @kernel(GRID, TREE, TILES, SCRATCH, SCHEDULE, "f8")
 def improve_tiles(grid, tree, tiles, scratch, schedule, most):
-    """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at;
-    one that was mended counts three times. Returns (tiles looked at, mended, rounds, whether some are left to be
-    looked at).
+    """Evaluates totals, checks tiles and repairs them, until the tree is optimal or `most` tiles have been checked;
+    a repaired one counts three times. Returns (tiles checked, tiles repaired, rounds, whether some are left).
 
     schedule  (order, place, turn, now, stack, sets, words):
            order  int64 (n,), all tiles, those nearest the root first

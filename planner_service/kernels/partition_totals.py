@@ -1,14 +1,14 @@
-"""What the pieces of a tree cost, and where their totals have come apart, so that a tile is to be checked.
+"""Costs of the pieces of a tree, and pairs of pieces whose totals have come apart, so that a tile is to be checked.
 
-Where no cell was offered less, one is by a cell of another piece only if its own piece's total has risen by more
-than that one's. So a tile is checked where two pieces *meet*, have cells beside each other, and one of them has
-risen by more than the other. What is known of a tile is one number, how much less a cell may be offered by all
-changes since it was checked (`Tiles.falls`).
+If no cell was offered less, a cell of another piece is the source of a better offer only if its own piece's total
+has risen by more than that one's. A tile is therefore checked where two pieces *meet*, have cells beside each
+other, and one of them has risen by more than the other. The state of a tile is one number, the largest amount by
+which all changes since its check may lower an offer to a cell (`Tiles.falls`).
 
-Of a piece that loses its way it is kept what it cost, and once it has one again its change is reckoned from that: a
-branch behind a closed way mostly comes back as it was, at a higher cost, and is then checked along its edge only.
-What a tile's cells are offered by a piece without a way is not seen when the tile is checked. It is
-`CHECKED_CUT_OFF` then, and checked again when a piece about it has found one.
+A piece that loses its path keeps its last cost, and once it has a path again its change is reckoned from that: a
+branch behind a closed path mostly comes back as it was, at a higher cost, and is then checked along its edge only.
+Offers to a tile's cells by a piece without a path are not seen when the tile is checked. It is `CHECKED_CUT_OFF`
+then, and checked again when a piece about it has found one.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ from planner_service.kernels.partition import (
 
 _ONE = np.uint64(1)
 _DRIFT = 4.0
-"""How many times `FINEST` a tile's totals may come apart before it is looked at."""
+"""Multiple of `FINEST` by which a tile's totals may come apart before it is checked."""
 _EVEN = 2.0**-4
-"""How many times `FINEST` changes may differ and be taken for the same number: they are differences of sums."""
+"""Multiple of `FINEST` by which changes may differ and count as equal: they are differences of sums."""
 
 
 @helper
@@ -119,8 +119,8 @@ def _differ(a, b):
 
 @helper
 def _meet_inside(t, tree, tiles, scratch, fine):
-    """Whether two pieces of a tile lie beside each other whose totals have changed by different numbers, which are
-    more than `fine` apart."""
+    """Returns True if two pieces of a tile beside each other have totals that changed by different numbers, more
+    than `fine` apart."""
     piece, total = tree.piece, tree.total
     exits, many = tiles.exits, tiles.many
     less, name, changes = scratch.less, scratch.name, scratch.changes
@@ -157,8 +157,8 @@ def _meet_inside(t, tree, tiles, scratch, fine):
 
 @helper
 def _meet(t, other, way, tree, schedule, fine):
-    """Whether along the border of a tile a piece's total has risen by more than that of one beside it, of tile
-    `other`, which lies `way`, so many tiles down and to the right; by more than `fine`."""
+    """Returns True if along the border of a tile a piece's total has risen by more than that of one beside it, of
+    tile `other`, which lies `way`, this number of tiles down and to the right; by more than `fine`."""
     piece, total = tree.piece, tree.total
     place, sets = schedule.place, schedule.sets
     down, right = way
@@ -183,8 +183,8 @@ def _meet(t, other, way, tree, schedule, fine):
 
 @helper
 def _any_meet(t, tree, tiles, scratch, schedule, fine):
-    """Whether a piece of a tile has risen by more than one that lies beside it, in the tile or about it; by more
-    than `fine`."""
+    """Returns True if a piece of a tile has risen by more than one beside it, in the tile or about it; by more than
+    `fine`."""
     falls, across = tiles.falls, tiles.across
     row, col = t // across, t % across
     down = falls.shape[1] // across
@@ -202,8 +202,8 @@ def _any_meet(t, tree, tiles, scratch, schedule, fine):
 
 @helper
 def _rise(t, tiles):
-    """By how much more a piece of a tile has risen than another in it or about it, s. What is wanted of the tile is
-    taken down, too."""
+    """By how much more a piece of a tile has risen than another in it or about it, s. Pending work on the tile is
+    noted, too."""
     wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
     row, col = t // across, t % across
     down = wanted.size // across
@@ -372,12 +372,12 @@ def _add_up_all(tree, tiles, schedule):
 
 @helper
 def evaluate_totals(grid, tree, tiles, names, schedule, now):
-    """Totals := what is driven from each exit to the root, after what has changed about tiles of `LINKING`.
+    """Sets totals to the cost driven from each exit to the root, after changes about tiles of `LINKING`.
 
     now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
     If not, tiles about one whose totals have changed are added up, those nearest the root first. That takes a tenth
-    of the time where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way
-    it ends, as no piece leads to itself.
+    of the time if few change; if all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it
+    ends, as no piece leads to itself.
     """
     across = tiles.across
     order, place, sets, words = schedule.order, schedule.place, schedule.sets, schedule.words
@@ -398,7 +398,7 @@ def evaluate_totals(grid, tree, tiles, names, schedule, now):
 
 @helper
 def begin(tiles, schedule):
-    """Make the sets from what is wanted of tiles."""
+    """Makes the sets from the pending work on tiles."""
     wanted, falls, across = tiles.wanted, tiles.falls, tiles.across
     order, place, sets = schedule.order, schedule.place, schedule.sets
     for n in range(order.size):

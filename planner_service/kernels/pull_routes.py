@@ -1,12 +1,12 @@
 """Pulling routes straight: which of its cells a vehicle turns in, when it drives segments from centre to centre.
 
 A segment costs the integral of the pace of the cells that it crosses, found by Amanatides and Woo, "A fast voxel
-traversal algorithm" (1987), with crossings compared as integers. Of what flies that integral is multiplied by the
-factor of the wind in the segment's direction, and each border between cells costs what it climbs: as much as the
+traversal algorithm" (1987), with crossings compared as integers. For flying classes that integral is multiplied by
+the factor of the wind in the segment's direction, and each border between cells costs its climb: as much as the
 step over it does, wherever it is crossed. Arrays, of n routes over a map of rows x cols, of which the longest has m
 cells:
     pace       float32  (rows * cols,)  s for a metre; inf is lethal
-    flight     None of what drives; of what flies (height, factors, per_metre, wind):
+    flight     None for ground classes; for flying ones (height, factors, per_metre, wind):
         height     float32  (rows * cols,)  m, of the surface on which it flies
         factors    float32  (entries,)      of a step by its rise in still air, 1 of a level one in the middle
         per_metre  float32  (2,)   entries of it per metre of rise, of straight steps and of diagonal ones
@@ -18,9 +18,9 @@ cells:
     costs      float64  (2, m)   in paces times cells, from its first cell to each: along the route, and pulled
     before     int64    (m,)     index of the cell in which the cheapest pulled way to each one turned last
     turns      int64    (m,)     indices of the cells in which the pulled route turns, its first and last included
-    pulled     (directions uint8 (2 * sum of steps,), ends int64 (n,), legs uint32 (2 * sum of steps,),
-               many int64 (1,)): steps along the cells that each pulled route crosses, and of each of its
-               segments over how many of them it goes; how many segments there are
+    pulled     (directions uint8 (2 * sum of steps,), ends int64 (n,), legs uint32 (2 * sum of steps,), many int64
+               (1,)): steps along the cells that each any-angle route crosses, and the number of them in each of its
+               segments; the number of segments
     prices     float64  (3, n)   of each route: cost pulled, cost along the route, both as above, and the length
                                  of the segments in cells
 """
@@ -34,7 +34,8 @@ import numpy as np
 from planner_service.kernels.compile import helper, step_kernel
 
 LOOK_BACK = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
-"""How many cells back a segment may begin, beside the cell before and where the way to that one turned."""
+"""Largest number of cells back at which a segment may begin, beside the cell before and the last turn of the path
+to that one."""
 NO_CORNERS, OPEN_CORNERS, ALL_CORNERS = range(3)
 """Through an exact corner a segment passes never, between two passable cells only, or always."""
 
@@ -110,8 +111,9 @@ def segment_cost(pace, flight, cols, corners, start, end, limit):
 
 @helper
 def _pull(pace, flight, cols, corners, scratch, size):
-    """Write `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never dearer
-    than the route itself: each cell's pulled cost is at most that of the cell before plus the step between."""
+    """Write `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never
+    costlier than the route itself: the any-angle cost of each cell is at most that of the cell before plus the step
+    between."""
     cells, costs, before, turns = scratch
     along, pulled = costs[0], costs[1]
     along[0] = pulled[0] = 0.0
@@ -150,7 +152,7 @@ def _pull(pace, flight, cols, corners, scratch, size):
 
 @helper
 def _goes_straight(cols, a, b, c):
-    """Whether a way over three centres does not turn in the second one."""
+    """Returns True if a path over three centres does not turn in the second one."""
     down, right = b // cols - a // cols, b % cols - a % cols
     further_down, further_right = c // cols - b // cols, c % cols - b % cols
     same_line = down * further_right == right * further_down

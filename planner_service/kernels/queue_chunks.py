@@ -31,8 +31,8 @@ QUEUE = "Tuple((u4[::1], u4[::1], u4[::1], u8[::1], u8[::1], u8[::1]))"
 
 
 def make_queue(entries: int, buckets: int) -> Queue:
-    """(pool, link, spare, head, tail, counts), for so many entries at once: the system keeps no page that was not
-    written."""
+    """Returns (pool, link, spare, head, tail, counts), for a number of entries: the system keeps no page that was
+    not written."""
     chunks = buckets + (entries >> _CHUNK_BITS) + 1
     pool = np.empty(chunks << _CHUNK_BITS, np.uint32)
     link, spare = np.empty(chunks, np.uint32), np.empty(chunks, np.uint32)
@@ -42,7 +42,7 @@ def make_queue(entries: int, buckets: int) -> Queue:
 
 @helper
 def empty(queue, buckets):
-    """Let nothing wait in a queue of so many buckets."""
+    """Empties a queue of `count` buckets."""
     _, _, _, head, tail, counts = queue
     for b in range(np.uint64(buckets)):
         head[b] = b << _SHIFT

@@ -10,10 +10,10 @@ Arrays, beside those of `layout`:
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `queue_chunks`; `make_scratch` says how large
 
-What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
+The form of the loops was measured, and small changes cost much. Cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
-out of the chunks of their bucket into one row before they make their offers. So the four and eight offers are
-written out here, and share no function with the offers of other kernels.
+out of the chunks of their bucket into one row before they make their offers. The four and eight offers are
+therefore written out here, and share no function with the offers of other kernels.
 
 Indices are unsigned 64-bit: signed ones make numba test for negative ones, which blocks vectorisation. A uint64
 meets only uint64 here, because with an int64 it would silently become float64.
@@ -109,7 +109,7 @@ def offer_straight(cell_cost, cost, s, batch, n, touched):
 
 @helper
 def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
-    """As `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
+    """Like `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
@@ -140,7 +140,7 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
 
 @helper
 def offer_around(cell_cost, cost, s, corners, batch, n, touched):
-    """As `offer_straight`, to eight neighbours, all a step of length 1 away: paper steps in one pass over the
+    """Like `offer_straight`, to eight neighbours, all a step of length 1 away: paper steps in one pass over the
     batch, which `./launch_scripts/bench peers` shows to be a fifth faster than straight and diagonal ones one after
     the other."""
     count = _ZERO

@@ -47,9 +47,9 @@ _AHEAD = 8
 _PIECE = np.uint64(1 << 6)
 """Cells that make their offers before what these touched is put into the queue."""
 WIDTH = 0.9
-"""Of a bucket, in cheapest steps. A cell in a bucket that is being served must not be offered less by another,
-whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
-of the cost. Up to `_SURE` that is a tenth of a bucket."""
+"""Width of a bucket, in cheapest steps. A cell in a bucket that is being served must not be offered less by
+another, whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most
+2^-24 of the cost. Up to `_SURE` that is a tenth of a bucket."""
 _SURE = np.uint64(1 << 19)
 BASE_BITS = 7
 """Buckets of each level: 2 to the power of this."""
@@ -59,9 +59,9 @@ _MASK = np.uint64((1 << 32) - 1)
 _LEVELS = np.uint64(-(-63 // BASE_BITS))
 _NEAR, _MOST_INDEX = np.float32(2.0**30), np.float32(2.0**62)
 _FEW, _SHARE = np.uint64(8), np.uint64(5)
-"""A bucket is served in parts while so many of its cells may lead into it, and of n cells n >> _SHARE more."""
+"""A bucket is served in parts while this number of its cells may lead into it, and of n cells n >> _SHARE more."""
 _ONE_BY_ONE = np.uint64(4)
-"""Up to so many cells make their offers one by one."""
+"""Up to this number, cells make their offers one by one."""
 _ALL = np.float32(-1.0)
 _SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), u8[::1], {QUEUE}))"
 
@@ -172,8 +172,8 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
 
 @helper
 def _offer_one_by_one(grid, cost, climbs, batch, n, touched):
-    """As `_offer`, of the first `n` cells of a batch, for few: there passes and what is asked for ahead cost more
-    than branches do."""
+    """Like `_offer`, for the first `n` cells of a small batch: there passes and prefetches cost more than branches
+    do."""
     cell_cost, offsets, _, rule, corners = grid
     every = 2 if rule == RULE_FOUR else 1
     count = _ZERO

@@ -68,9 +68,9 @@ def arrivals(cell_cost, offsets, diagonal, start, cost, heap):
     cell_cost  float32 (n,), padded; inf is lethal, and the border
     cost       float32 (n,), written, from the start to each cell; inf where there is no way
     heap       (keys, items, place), each (n,); place is -1 everywhere
-    Trees lead to their root: a step is priced by the cell that it enters on the way there. What drives away from a
-    cell pays for those that it enters on the way out, which no tree knows. Corners of lethal cells are cut: nothing
-    comes sooner than this.
+    Trees lead to their root: a step is priced by the cell that it enters on the way there. A path away from a cell
+    pays for the cells entered on the way out, which no tree knows. Corners of lethal cells are cut: nothing comes
+    sooner than this.
     """
     keys, items, place = heap
     for i in range(cost.size):

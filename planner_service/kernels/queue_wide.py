@@ -2,21 +2,21 @@
 "Shortest paths algorithms: theory and experimental evaluation", Mathematical Programming 73, 1996, 129-174) whose
 width follows the map.
 
-As in `queue_dial`, all neighbours of a cell are offered the same exit key per kind of step, and cells are served
-a bucket at a time. But a bucket may be wider than the cheapest steps: a cell whose exit key falls back into the
+As in `queue_dial`, all neighbours of a cell are offered the same exit key per kind of step, and cells are served a
+bucket at a time. But a bucket may be wider than the cheapest steps: a cell whose exit key falls back into the
 bucket that touched it is served again at once, until none is offered less (label correction). Then all that the
 bucket has touched is final, as later keys are larger, and waits once under its exit keys, as there.
 
-So any width is exact, and the width is chosen by what is met. After each circle of buckets it grows where these
-held few cells. A bucket in which too many are served again is undone: what it touched loses its cost, and all that
-waits is put into narrower ones. What does not fit into a circle waits behind it, until the circle is filled anew
-from its lowest key on; cells without a neighbour that could still be touched are then dropped.
+Any width is therefore exact, and the width is chosen by the costs met. After each circle of buckets it grows where
+these held few cells. A bucket in which too many are served again is undone: what it touched loses its cost, and all
+that waits is put into narrower ones. Keys beyond a circle wait behind it, until the circle is filled again from its
+lowest key on; cells without a neighbour that could still be touched are then dropped.
 
 Arrays, beside those of `layout`:
     touched         uint32  (size + AHEAD,)  padded cells that got their cost from the last bucket
     batch, slanted  uint32  (size + AHEAD,)  those of the bucket that is served, by straight and by diagonal steps
     places          uint32  (size + AHEAD,)  where in the queue cells go; a ring of those to serve again
-    queue           as of `queue_chunks`; of each kind of step `CIRCLE` buckets and one for what is behind them
+    queue           as in `queue_chunks`; for each kind of step `CIRCLE` buckets and one for the keys behind them
 
 While a bucket is served, the cost of a cell that waits to be served again is negative, and WALL on lethal cells.
 """
@@ -61,12 +61,12 @@ _STRAIGHT, _DIAGONAL = np.uint64(0), np.uint64(CIRCLE + 1)
 _BEHIND = np.uint64(CIRCLE)
 """Counted from there, the one behind the circle."""
 _LAST = 1 << 20
-"""Buckets are counted anew beyond this one: float32 tells so many apart."""
+"""Buckets are counted from 0 again beyond this one: float32 distinguishes this number."""
 _SPARSE = np.uint64(32)
 """Buckets that hold fewer cells, in the mean of a circle, get wider."""
 _WIDER, _NARROWER = np.float32(8.0), np.float32(1 / 8)
 _FEW, _AGAIN = np.uint64(1024), np.uint64(2)
-"""So many may be served again in a bucket, and so many for each cell of it."""
+"""Number of cells that may be served again in a bucket, and for each cell of it."""
 _ANY = np.uint64(1 << 62)
 _SCRATCH = f"Tuple((u4[::1], u4[::1], u4[::1], u4[::1], {QUEUE}))"
 
@@ -112,9 +112,9 @@ def _put_behind(queue, cells, count, first, places):
 
 @helper
 def _gather(grid, cost, queue, kind, length, first, least, cells, batch):
-    """Take all that wait by a kind of step (1 of diagonal ones, 2 of both) out of the queue, and keep those of
-    whose neighbours one has no cost yet: where most cells are dear, most wait in vain. Returns (how many are in
-    `cells`, the lowest of their exit keys and `least`)."""
+    """Takes all entries that wait by a kind of step (1 of diagonal ones, 2 of both) out of the queue, and keeps
+    those with a neighbour that has no cost yet: if most cells are expensive, most wait in vain. Returns (how many
+    are in `cells`, the lowest of their exit keys and `least`)."""
     cell_cost, offsets, _, _, _ = grid
     kept = _ZERO
     for b in range(first, first + _BEHIND + _ONE):
@@ -224,7 +224,7 @@ def grow_by_wide_buckets(grid, cost, root, narrowest, scratch):
     waiting = turned = served = again = _ZERO
     s = np.uint64(stride)
     while True:
-        # What the last bucket has touched is final.
+        # Cells touched by the last bucket are final.
         era = base, _ONE32 / width
         waiting += _file(cell_cost, cost, _ONE32, _STRAIGHT, era, current, touched, count, queue, batch, places)
         if octile:

@@ -2,11 +2,11 @@
 Planning A*", Artificial Intelligence 155, 2004) without its heuristic; and of G. Ramalingam, T. Reps, "An
 incremental algorithm for a generalization of the shortest-path problem", Journal of Algorithms 21, 1996.
 
-Cells whose way led over a dearer cell are detached: they lose cost and parent. They, and the cells beside what got
-cheaper, take the least that they are offered. What has fallen spreads by a label-correcting search over approximate
-buckets (Cherkassky, Goldberg, Radzik 1996), whose last one overflows: it holds all that costs more than the others
-reach. Memory and time follow what has changed, not the grid; so the queue keeps entries, not cells, and what became
-obsolete is skipped when its turn comes.
+Cells whose path led over a cell with a higher cost are detached: they lose cost and parent. They, and the cells
+beside what got cheaper, take the least that they are offered. Lower costs spread by a label-correcting search over
+approximate buckets (Cherkassky, Goldberg, Radzik 1996), whose last one overflows: it holds all costs beyond the
+others. Memory and time follow the changes, not the grid; the queue therefore keeps entries, not cells, and obsolete
+ones are skipped when their turn comes.
 
 Arrays, beside those of `layout`:
     changed   int64    (n,)  padded cells whose cost changed, without repetition
@@ -122,7 +122,7 @@ def span_near(first, last, stride, row):
 
 @helper
 def _key(cell_cost, cost, climbs, v, u, way, length):
-    """What v is offered by its neighbour u, which lies in direction `way`."""
+    """Returns the offer to v by its neighbour u, which lies in direction `way`."""
     return offered(cost[u], cell_cost[u], climbs, v, u, way, length)
 
 
@@ -327,7 +327,7 @@ def row_factor(stride):
 
 @helper
 def _detach(grid, cost, parent, changed, before, limit, detached):
-    """Take cost and parent from the cells whose way leads over a cell that got dearer.
+    """Takes cost and parent from the cells whose path leads over a cell that got more expensive.
 
     Writes them to `detached`. Returns how many; more than `limit` if that is so, and then not all.
     """

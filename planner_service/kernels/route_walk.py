@@ -31,9 +31,9 @@ from planner_service.kernels.layout import (
 )
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
-"""What became of a route that was asked for."""
+"""Result of a requested route."""
 BROKEN = -2
-"""What `walk_routes` returns instead of a number of steps."""
+"""Returned by `walk_routes` instead of a number of steps."""
 
 Moves = tuple[NDArray[np.uint64], NDArray[np.float64]]
 Ways = tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float64], int, int]
@@ -44,7 +44,7 @@ _WALKS = "Tuple((u1[::1], i8[::1], f8[::1], f8[::1], i8[::1]))"
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
 def relabel(grid, climbs, labels, trail):
-    """Costs := what is really driven from each cell along its parents. They are written whole; parents are read.
+    """Sets costs to those driven from each cell along its parents. They are written whole; parents are read.
     `trail` has room for all cells."""
     cell_cost, offsets, _, rule, _ = grid
     cost, parent, root = labels
@@ -76,7 +76,8 @@ def _driven(cell_cost, climbs, lengths, before, cell, code):
 
 
 def moves_of(stride: int, rule: int) -> Moves:
-    """Of each direction code, what it adds to a padded cell (uint64) and its length in straight steps (float64).
+    """Returns for each direction code the offset of a padded cell (uint64) and the length in straight steps
+    (float64).
 
     Unsigned, as sums of a cell and a signed offset would be floating-point numbers; they wrap.
     """
@@ -114,7 +115,7 @@ def walk_routes(cell_cost, climbs, ways, starts, most, metres, walks, directions
 
     starts      padded cells that have a way; or, if `status` is not empty, any numbers of cells of the grid. Then
                 these become padded cells, and `status` is written
-    most        (steps of a route, 0 for all of it; no route can be longer than so many)
+    most        (steps of a route, 0 for all of it; the longest possible route)
     metres      (resolution, m; length of a diagonal in straight steps)
     walks       (status, ends, driven, length, last), written; inf, 0 m and the root where `status` says that there
                 is no route
@@ -166,13 +167,13 @@ def _hash(cell):
     f"(f4[::1], CLIMBS, {_WAYS}, i8[::1], Tuple((u4[::1], f8[::1])), Tuple((u4[::1], f8[::1])), f8[::1])", CLIMBS
 )
 def drive_rests(cell_cost, climbs, ways, starts, known, trail, rests):
-    """What is driven from each start along the parents to the root, in float64; inf where there is no way.
+    """Computes the cost driven from each start along the parents to the root, in float64; inf without a path.
 
     known  (cells, sums), the rests that are known already of a 16th of all cells, the milestones: their routes
            share their trunks. Cells are 0 before; there are a power of two, at most 2**16. Written
     trail  (cells, sums) of the milestones that one route meets first; room for all cells
-    rests  float64 (n,), s; written whole
-    A rest is the sum up to the first milestone plus the milestone's own, and so the same whoever else is asked for.
+    rests  float64 (n,), s; written whole A rest is the sum up to the first milestone plus the milestone's own, and
+           so does not depend on the other starts.
     Returns False if a route does not end.
     """
     parent, offsets, lengths, root, _ = ways

@@ -2,7 +2,7 @@
 
 `grow_strides` is Dijkstra's algorithm (E. W. Dijkstra 1959) with a binary heap over the nodes of `stride_network`:
 what a link costs was found with the network and says only in which order nodes are taken and by which link each is
-reached. What cells cost is read from the map as it is now, step by step along that link.
+reached. The costs of cells are read from the current map, step by step along that link.
 
 Arrays, beside those of `layout`:
     stamp  uint8  (size,)  whether a cost has been recomputed: `now` if it has, less if not
@@ -53,12 +53,12 @@ Scratch = tuple[
     NDArray[np.int32],
     NDArray[np.uint32],
 ]
-"""Of a heap: keys, items, places; of each node: the lowest key so far, -inf once it is settled or where it takes no
-part; its link, and from which node that leads; a trail."""
+"""Arrays of a heap: keys, items, places; of each node: the lowest key up to now, -inf once it is settled or where
+it takes no part; its link, and the node from which that leads; a trail."""
 
 
 def make_scratch(nodes: int, cells: int) -> Scratch:
-    """For so many nodes and padded cells."""
+    """Makes the scratch for these numbers of nodes and padded cells."""
     return (
         np.empty(nodes, np.float32),
         np.empty(nodes, np.int64),
@@ -72,7 +72,7 @@ def make_scratch(nodes: int, cells: int) -> Scratch:
 
 @helper
 def _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail):
-    """As `tighten`, for one padded cell. Returns cells visited."""
+    """Like `tighten`, for one padded cell. Returns cells visited."""
     many = 0
     while stamp[v] < now and parent[v] != NONE:
         trail[many] = v
@@ -92,8 +92,8 @@ def _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trai
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u1[::1], i8, i8[::1], u4[::1])", CLIMBS)
 def tighten(grid, climbs, labels, stamp, now, cells, trail):
-    """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
-    (int64, padded) and of all on their ways to the root.
+    """Lowers costs, which are upper bounds, to those driven along the parents, less the tree's offset: of `cells`
+    (int64, padded) and of all on their paths to the root.
 
     They stay at least what the parent offers. Cells whose stamp is `now` are taken to be right, and those that
     become so are stamped. Returns cells visited. Raises ValueError where one is no padded cell.
@@ -122,8 +122,8 @@ def grow_strides(grid, climbs, labels, network, stamps, box, reach, scratch):
             that, and so on; none for more than the second
 
     Along each link a cell is tightened, then offered what the one before it offers. Only what gets cheaper is
-    rewritten, with its parent, so that costs stay upper bounds and grow strictly along every way. Where a step has
-    become impossible the cells beyond keep their own ways, and it goes on from there. Returns cells visited.
+    rewritten, with its parent, so that costs stay upper bounds and grow strictly along every way. If a step has
+    become impossible the cells beyond keep their own paths, and it goes on from there. Returns cells visited.
     """
     cost, _, root = labels
     centre, _, first, other, price, _, _, _ = network

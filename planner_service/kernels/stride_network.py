@@ -26,12 +26,14 @@ from planner_service.kernels.queue_heap import heap_lower, heap_pop
 OPEN = np.int32(-2)
 """`node` of a cell that belongs to one which has no number yet."""
 _OFF_CENTRE = np.float32(1.0)
-"""For the choice of a centre: how much dearer a cell at a block's border counts than its middle, as a share."""
+"""For the choice of a centre: share by which a cell at a block's border counts as more expensive than its
+middle."""
 
 
 @helper
 def _leads(cell_cost, offsets, corners, u, k):
-    """Whether a step may be taken from a passable cell: not into a lethal one, nor past one, unless it may."""
+    """Returns True if a step may be taken from a passable cell: not into a lethal one, nor past one, unless
+    allowed."""
     if not cell_cost[u + offsets[k]] < INF:
         return False
     if not k & 1 or corners:

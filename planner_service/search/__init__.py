@@ -1,6 +1,6 @@
-"""Where a target may be that nobody sees, and who looks where.
+"""Belief about an unseen target, and assignment of places to search.
 
-`target_search` begins and ends a search and says what is believed; `searcher` gives each vehicle a place, drawn by
-belief over cost; `belief` is a grid of probabilities that is moved by what the target may have done and cut by what
-vehicles have looked at; `search_routes` finds the ways from vehicles to their places.
+`target_search` begins and ends a search and publishes the belief; `searcher` gives each vehicle a place, drawn by
+belief over cost; `belief` is a grid of probabilities that is moved by the target's possible motion and cut by the
+views of vehicles; `search_routes` finds the paths from vehicles to their places.
 """

@@ -1,4 +1,4 @@
-"""Where a target may be that nobody has seen for a while. Pure.
+"""Belief about the position of a target that was not seen for a while. Pure.
 
 A grid of probabilities, moved by what the target may have done and cut by what vehicles have looked at, is the
 standard of the field (Bourgault, Furukawa, Durrant-Whyte 2003; Stone, *Theory of Optimal Search*). Here it is held
@@ -18,9 +18,9 @@ from shared_map.array_files import Bools, Floats
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 MOST_BLOCKS = 1 << 14
-"""Of a map with more of them blocks are wider: a step of a belief takes a millisecond for so many."""
+"""On a map with more blocks they are wider: a step of a belief takes a millisecond for this number."""
 _WHOLE = 1.4
-"""A block at most so many times as wide as the range of a sensor is seen whole from its middle, which is seen from
+"""A block at most this multiple as wide as the range of a sensor is seen whole from its middle, which is seen from
 every cell of it."""
 _MOST_SAMPLES = 16
 """A side. A range that is smaller than an eighth of a block sees too little of it to matter."""
@@ -89,15 +89,15 @@ class Blocks:
         return tuple(slice(at * side, (at + 1) * side) for at in block)  # type: ignore[return-value]
 
     def seen_whole(self, range_m: float) -> bool:
-        """Whether a sensor in the middle of a block sees all of it."""
+        """True if a sensor in the middle of a block sees all of it."""
         return self.side_cells == 1 or self.side_m <= _WHOLE * range_m
 
     def seen_from(self, east_m: float, south_m: float, range_m: float) -> tuple[slice, slice, Floats] | None:
         """Rows and columns of the blocks that a sensor sees, and which share of each, float32. None where it sees
         none, and from a place that is no number.
 
-        A block that is seen whole from its middle counts as seen if its middle is. Of a wider one what counts is
-        the share that is in range.
+        A block that is seen whole from its middle counts as seen if its middle is. For a wider one the share in
+        range counts.
         """
         rows, cols = self.shape
         at_row, at_col, reach = south_m / self.side_m, east_m / self.side_m, range_m / self.side_m
@@ -155,9 +155,9 @@ TURNS_PER_BLOCK = 0.067
 _MOST_MOVED = 0.8
 """Share of a block's mass that may leave it in one step: more of it would need blocks further on."""
 _GONE = 1e-9
-"""So little is left of all mass: then it was nowhere where it was believed to be."""
+"""Remaining mass at which the target was nowhere in the believed area."""
 _MOST_STEPS = 256
-"""Of one update, some 0.3 s: after a long silence the belief is spread so widely that larger steps change
+"""Limit of one update, some 0.3 s: after a long silence the belief is spread so widely that larger steps change
 little."""
 
 
@@ -209,7 +209,7 @@ class Belief:
 
     @property
     def step_s(self) -> float:
-        """How long a step of `predict` may be, so that it is one."""
+        """Returns the longest step of `predict` that is a single one."""
         return self._most_s
 
     @property
@@ -247,7 +247,7 @@ class Belief:
             driven[heading, max(row, 0) : rows + min(row, 0), max(col, 0) : cols + min(col, 0)] += moved[
                 max(-row, 0) : rows + min(-row, 0), max(-col, 0) : cols + min(-col, 0)
             ]
-        # What cannot go on turns, and so does a share of all.
+        # Blocked mass turns, and so does a share of all.
         turning = np.float32(min(seconds * self._turns_per_s, 1.0))
         stuck += turning * driven.sum(axis=0)
         driven *= np.float32(1.0) - turning
@@ -279,8 +279,8 @@ class Belief:
             self._renew(looked)
 
     def _renew(self, looked: Bools) -> None:
-        """Nothing is known but how far it may have come: anywhere there, except where somebody looks now. If there
-        is no such place what was known was wrong, and it may be anywhere."""
+        """Resets the belief to uniform over all blocks that the target may have reached, except those in view now.
+        If there is no such block the last sighting was wrong, and it may be anywhere."""
         for where in (self.reachable & ~looked, self.blocks.open & ~looked, self.blocks.open):
             weights = np.where(where, self.blocks.share, np.float32(0.0))
             total = float(weights.sum(dtype=np.float64))

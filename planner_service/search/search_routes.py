@@ -19,7 +19,8 @@ from swarm.grid import GridSpec, walk
 from swarm.wire.route_columns import SEARCHING, RouteBatch
 
 _MOST_CELLS = 1 << 21
-"""Of a map over which arrivals are found exactly, in some tenths of a second, once each time a target is lost."""
+"""Largest map over which arrivals are found exactly, in some tenths of a second, once each time a target is
+lost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,14 +44,14 @@ class Ways:
         self._parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._root = -1
         self._back_climbs: Climbs | None = None
-        """Of the way back. None before they are asked for."""
+        """Climbs of the way back. None before they are asked for."""
 
     @property
     def grid(self) -> GridSpec:
         return self._costs.grid
 
     def passable(self, cell: int) -> bool:
-        """Whether a vehicle can stand on a cell of the grid."""
+        """Returns True if a vehicle can be on a cell of the grid."""
         return self._costs.passable(cell)
 
     def grow(self, cell: int) -> None:
@@ -64,8 +65,8 @@ class Ways:
 
     @property
     def _back(self) -> CostGrid:
-        """The cell costs as they are now for whoever drives ways backwards: trees lead to their root, and vehicles
-        away from it."""
+        """Returns the current cell costs for reversed driving: trees lead to their root, and vehicles away from
+        it."""
         climbs = self._costs.climbs
         if climbs is None:
             return self._costs
@@ -84,10 +85,11 @@ class Ways:
         return steps_s
 
     def arrivals_s(self, cell: int) -> Floats:
-        """float32 (rows, cols), s: nobody who begins on a passable cell can be on another one sooner.
+        """float32 (rows, cols), s: earliest arrival on a cell from any passable cell.
 
-        Over large maps, and where uphill is not downhill, a lower bound from the ways back: each of their cells is
-        priced by another step, at most a diagonal one for a straight one, and the cell where one begins is entered.
+        Over large maps, and with direction-dependent costs, it is a lower bound from the ways back: each of their
+        cells is priced by another step, at most a diagonal one for a straight one, and the cell of the start is
+        entered.
         """
         costs, grid = self._costs, self.grid
         if costs.climbs is None and costs.size <= _MOST_CELLS:

@@ -1,4 +1,4 @@
-"""The search for one target that nobody sees: what is believed, and which vehicle is to look where. Pure.
+"""The search for one unseen target: the belief, and the place of each vehicle. Pure.
 
 Places are drawn in proportion to belief / (cost + `OFFSET_S`): taking the best of all dithers around the vehicle
 and sends all to the same place, drawing spreads them without negotiation. Times are seconds on the terrain.
@@ -30,11 +30,11 @@ IDLE_S = 300.0
 """A place at which nothing is believed is given only to a vehicle that can reach no other. It is given up after so
 long: by then there may be one (decision 66)."""
 STEP_S = 30.0
-"""Of the belief, at most; less where blocks are small."""
+"""Longest step of the belief; shorter if blocks are small."""
 MOST_GOALS = 4096
 """Vehicles with a place at once; of more, those that were given one first lose it."""
 _GROWN_CELLS = 1 << 20
-"""Cells that may be grown between two ticks: so many decisions are taken, the rest wait."""
+"""Cells that may be searched between two ticks: this bounds the decisions taken, the rest wait."""
 _MOST_DECISIONS = 8
 _STANDS = 1e30
 """Slowness of a target that stands still, as a finite number."""
@@ -42,7 +42,7 @@ _STANDS = 1e30
 
 @dataclass(slots=True, eq=False)
 class _Goal:
-    """Where one vehicle is to look.
+    """Place that one vehicle searches.
 
     ways         of the vehicle's class
     mass         belief of the block and those around it when it was given
@@ -58,7 +58,7 @@ class _Goal:
     age_s: float = 0.0
 
     def is_worth(self, belief: Belief) -> bool:
-        """Whether the place is still worth the way."""
+        """True if the place is still worth its cost."""
         if self.mass > 0.0:
             return belief.near(self.block) >= KEPT_SHARE * self.mass
         return self.age_s < IDLE_S
@@ -148,7 +148,8 @@ class Searcher:
         self._goals.clear()
 
     def tick(self, elapsed_s: float, places_m: Sequence[tuple[float, float]]) -> None:
-        """So many seconds have passed, and vehicles look from these places, (east, south) in m from the corner."""
+        """Advances by a time (s), with vehicles that look from these positions, (east, south) in m from the
+        corner."""
         self._left = self._most
         belief = self.belief
         if belief is None:
@@ -164,12 +165,12 @@ class Searcher:
         self._goals = {id: goal for id, goal in self._goals.items() if goal.is_worth(belief)}
 
     def wants_place(self, vehicle: str) -> bool:
-        """Whether a vehicle has no place to look at."""
+        """Returns True if a vehicle has no place to search."""
         return vehicle not in self._goals
 
     @property
     def may_decide(self) -> bool:
-        """Whether another place may be given before the next tick."""
+        """Returns True if another place may be given before the next tick."""
         return self._left > 0
 
     def forget_all_but(self, ways: Ways, vehicles: Iterable[str]) -> None:
@@ -182,7 +183,7 @@ class Searcher:
         steps where it has to ask again.
 
         ways         of the vehicle's class
-        vehicle      None for somebody who only asks, and keeps no place
+        vehicle      None for an asker that keeps no place
         map_version  of these ways
         """
         asked = np.array([cell], np.int64)

@@ -22,8 +22,8 @@ from swarm.wire.messages.planning import MOST_BELIEVED, Believed, Sighted, Targe
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
-"""A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it
-was, is not there (decision 66)."""
+"""A target in sight is published twice a second: one that is not published for this time, though a vehicle is at
+its position, is not there (decision 66)."""
 LOST_NS = 30 * NS_PER_S
 """A target whose tracker is lost is searched for after so long: most trackers are back by then
 (decision 66)."""
@@ -31,12 +31,12 @@ LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for so long before it takes its target for never seen (decision 66)."""
 _TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
-"""Some four months, so that the age of what was never seen is a number."""
+"""Some four months, so that the age of a target that was never seen is a number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """What a planner has to know of a target to search for it.
+    """Search settings of one target.
 
     tracked          whether it has a tracker: then it is searched for only while that is lost
 
@@ -56,8 +56,8 @@ class Hidden:
 
 
 class TargetSearch:
-    """Begins the search when nobody sees the target, and ends it with a sighting. One for all vehicles that chase
-    the target, whatever their class.
+    """Begins the search for an unseen target, and ends it with a sighting. One for all vehicles that chase the
+    target, whatever their class.
 
     costs       cell costs of the class "ground", by which the target moves, kept up to date by their owner
     time_scale  seconds on the terrain per second
@@ -67,7 +67,7 @@ class TargetSearch:
         self.searcher = Searcher(Ways(costs), hidden.sense_range_m, hidden.slowness, hidden.seed)
         self.time_scale = time_scale
         self.searches = 0
-        """How often it has begun to."""
+        """Number of searches begun."""
         self._hidden = hidden
         self._places_m: list[tuple[float, float]] = []
         self._first_ns: int | None = None
@@ -78,13 +78,13 @@ class TargetSearch:
         """By which of these the search began."""
         self._tell_ns = 0
         self._has_told = False
-        """Whether a search under way was told of last."""
+        """True if the last message was about a search under way."""
         self._searched: TargetPose | None = None
-        """What was the newest pose when the search began."""
+        """The newest pose when the search began."""
 
     @property
     def tracked(self) -> bool:
-        """Whether the target has a tracker, if none that lives."""
+        """True if the target has a tracker, living or not."""
         return self._hidden.tracked
 
     @property
@@ -92,12 +92,12 @@ class TargetSearch:
         return self.searcher.active
 
     def hear_vehicles(self, east_m: Floats, south_m: Floats) -> None:
-        """Where all vehicles are that count, m from the grid's corner."""
+        """Positions of all vehicles that count, m from the grid's corner."""
         self._places_m = list(zip(east_m.tolist(), south_m.tolist(), strict=True))
 
     def remember(self, sighted: Sighted, now_ns: int) -> None:
-        """An earlier sighting is told again, as to a planner that begins anew. Stamps ahead of the clock count as
-        now."""
+        """Takes an earlier sighting that is repeated, for a planner that has restarted. Stamps ahead of the clock
+        count as now."""
         known = self._remembered
         if known is None or (min(sighted.stamp_ns, now_ns), sighted.author) > (known.stamp_ns, known.author):
             self._remembered = msgspec.structs.replace(sighted, stamp_ns=min(sighted.stamp_ns, now_ns))
@@ -148,7 +148,7 @@ class TargetSearch:
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
 
     def belief_message(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
-        """What is believed, for people to look at; None if it is not time to tell it."""
+        """Returns the belief, for people; None if it is not due."""
         if now_ns < self._tell_ns or not (self.active or self._has_told):
             return None
         self._tell_ns = now_ns + _TELL_NS
@@ -189,12 +189,12 @@ class TargetSearch:
 
 
 def is_place(route: Route) -> bool:
-    """Whether a route leads to a place to look at, which is known."""
+    """Returns True if a route leads to a known place to search."""
     return route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
 
 
 def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
-    """What a scenario says of a target, for one life of its planner."""
+    """Search settings of one target, read once when its planner starts."""
     config = next((each for each in scenario.targets if target in ids_of(each)), None)
     # A target never outruns a vehicle; one that was added while the swarm ran is taken to be as quick.
     speed_m_per_s = math.inf if config is None else config.speed_m_per_s

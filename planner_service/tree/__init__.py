@@ -1,6 +1,6 @@
 """The tree of one target over one map: costs and parents that lead every cell to it.
 
-`cost_grid` is the map as kernels want it, `cost_changes` what has changed in it. A tree has a cost in every cell
+`cost_grid` is the map in the layout of kernels, `cost_changes` its changes. A tree has a cost in every cell
 (`cost_to_go`) or is cut into pieces (`partitioned_tree`). `growth` grows it, or a window of it, by the queue that
 suits the costs; `strides` thins it out far from its root; `certificates` reads routes off it with their bounds.
 """

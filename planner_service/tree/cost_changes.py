@@ -1,4 +1,4 @@
-"""What changed in the cell costs of a map, and what is known of all of them: their range, the rounding of sums."""
+"""Changes of the cell costs of a map, and facts about all of them: their range, the rounding of sums."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class CostRange:
 
     @property
     def highest(self) -> float:
-        """Of the finite ones; 0 if there is none."""
+        """Highest finite cost; 0 if there is none."""
         return float(self._ranges[1].view(np.float32).max())
 
     @property
@@ -81,9 +81,9 @@ _LETHAL = 0x7F8
 
 
 class Rounding:
-    """How far float32 may have put the labels of trees off, on a map whose cell costs are as they are now.
+    """Bound on the error of float32 in the labels of trees, on a map with the current cell costs.
 
-    docs/certificates.md says why that is enough. Nobody changes one, so that snapshots share it.
+    docs/certificates.md says why that is enough. It is immutable, so that snapshots share it.
 
     classes  how many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide
     """
@@ -93,19 +93,19 @@ class Rounding:
 
     @classmethod
     def of(cls, cell_cost: Floats) -> Self:
-        """That of a map; of no cells, before there is one."""
+        """Returns the rounding of a map; of no cells, before there is one."""
         classes = np.zeros(_MANY, np.int64)
         count_classes(cell_cost.view(np.int32), classes)
         return cls(classes)
 
     def after(self, changes: Changes) -> Self:
-        """That of the map with these changes."""
+        """Returns the rounding of the map with these changes."""
         kinds = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
         more, fewer = (np.bincount(part, minlength=_MANY) for part in kinds)
         return type(self)(self.classes + more - fewer)
 
     def at(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
-        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
+        """Returns the largest relative error of float32 in an exact label of a cell with a path of this cost, s.
 
         One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
         than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
@@ -115,10 +115,10 @@ class Rounding:
 
     @cached_property
     def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the cheapest cells cost together at least, s, and how many they are; both begin with 0."""
+        """Lower bounds on the sum of the n cheapest cells, s, and their numbers; both begin with 0."""
         classes = np.flatnonzero(self.classes[:_LETHAL])
         counts = self.classes[classes]
         least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
-        # Of the first class zero; a way that costs nothing has no steps.
+        # The first class is zero; a path that costs nothing has no steps.
         costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
         return np.append(0.0, costs), np.append(0.0, np.cumsum(counts))

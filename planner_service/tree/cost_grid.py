@@ -43,7 +43,7 @@ def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
 
 
 def said_of_bad(pace: Floats, window: Window) -> str:
-    """Of the first cell of a window whose pace is none."""
+    """Returns the sentence about the first cell of a window with an invalid pace."""
     part = pace[window.row0 : window.row1, window.col0 : window.col1]
     bad = np.argwhere(~(part > 0))
     row, col = (bad[0] + (window.row0, window.col0)).tolist()
@@ -86,7 +86,7 @@ class Walks(NamedTuple):
 
 
 class CostGrid:
-    """What entering each cell of a map costs, padded with a lethal border."""
+    """Cost of entering each cell of a map, padded with a lethal border."""
 
     def __init__(self, grid: GridSpec, config: PlannerConfig, climb: Climb | None = None) -> None:
         self.grid = grid
@@ -94,7 +94,7 @@ class CostGrid:
         self.rule = rule_of(config)
         """Which steps there are: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
         self.corners = config.corner_cutting
-        """Whether a diagonal step may pass a lethal cell."""
+        """True if a diagonal step may pass a lethal cell."""
         self.stride = grid.cols + 2
         """Cells of a padded row."""
         self.size = (grid.rows + 2) * self.stride
@@ -102,10 +102,10 @@ class CostGrid:
         self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
         """Length of a diagonal step in straight ones."""
         self.climbs: Climbs | None = None
-        """What a step's rise does to its cost, for kernels; None where entering a cell costs the same from
-        everywhere. If not, a cell's cost is that of the cheapest straight step into it."""
+        """Effect of a step's rise on its cost, for kernels; None if entering a cell costs the same from every side.
+        If not, a cell's cost is that of the cheapest straight step into it."""
         self.dearest_step = self.diagonal
-        """What a step costs at most, in cell costs."""
+        """Highest cost of a step, in cell costs."""
         self._metres = grid.resolution_m
         if climb is not None:
             self.climbs, self.dearest_step = padded_climbs(climb, self.rule)
@@ -125,24 +125,24 @@ class CostGrid:
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
         self.rounding = Rounding.of(_NONE)
-        """Of labels of trees on this map. `load`, `share` and `apply` put another in its place."""
+        """Rounding of labels of trees on this map. `load`, `share` and `apply` put another in its place."""
         self._time_cost: Floats | None = None
-        """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
+        """Same as `time_cost`, if that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
         """s; the lowest of `time_cost`."""
         self._range = self._time_range = CostRange(_NONE)
-        """Of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes them:
-        those of a snapshot are not its own."""
+        """Range of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes
+        them: those of a snapshot are not its own."""
         self._offsets = step_offsets(self.stride)
         self._shared: Floats | None = None
-        """What `cell_cost` began as, where that is mapped: `share` sets it, `load` resets it."""
+        """The original `cell_cost`, if that is mapped: `share` sets it, `load` resets it."""
         self._written: Bools = np.zeros(self.size // _BLOCK + 1, np.bool_)
         """Blocks of `_BLOCK` cells in which a cell cost has changed since `share`. `apply` sets it."""
         self._moves = route_walk.moves_of(self.stride, self.rule)
         self._make_scratch()
 
     def _make_scratch(self) -> None:
-        """What kernels write to: one thread's."""
+        """Makes scratch arrays for kernels: one thread's."""
         self._directions: NDArray[np.uint8] = np.empty(1 << 12, np.uint8)
         """Scratch of `walk`, which makes it longer where routes are."""
         self._trail: tuple[NDArray[np.uint32], NDArray[np.float64]] | None = None
@@ -159,7 +159,7 @@ class CostGrid:
 
     @property
     def buckets(self) -> Buckets:
-        """Of a repair: as wide as the lowest cell cost, and enough to hold all that costs at most a step more."""
+        """Buckets of a repair: as wide as the lowest cell cost, and enough for costs at most a step higher."""
         longest = self.highest_cell_cost * self.dearest_step
         count = math.ceil(longest / self.lowest_cell_cost) + 2
         return self.lowest_cell_cost, min(max(count, _FEWEST), _MOST)
@@ -224,22 +224,22 @@ class CostGrid:
     @property
     def time_cost(self) -> Floats:
         """float32 (size,), s: what a straight step into each cell takes; `cell_cost` itself where length costs
-        nothing. Where it does, a route's time cannot be had from `cell_cost`: the price of its length may have
-        rounded it away."""
+        nothing. With such a price, a route's time cannot be derived from `cell_cost`: the price of its length may
+        have rounded it away."""
         return self.cell_cost if self._time_cost is None else self._time_cost
 
     @property
     def time_share(self) -> float:
-        """What part of any route's cost is time at least: that of the lowest cell, less the rounding of float32 in
-        both of its costs."""
+        """Least share of time in any route's cost: that of the lowest cell, less the rounding of float32 in both of
+        its costs."""
         if not self.length_weight_s:
             return 1.0
         return self._lowest_time / (self._lowest_time + self.length_weight_s) * (1.0 - 2.0**-22)
 
     def share(self, time_cost: Floats) -> None:
         """Take the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
-        What `apply` changes is this grid's own. Raises ValueError unless they are of this grid, and such as `load`
-        makes."""
+        Cells changed by `apply` are this grid's own. Raises ValueError unless they are of this grid, and such as
+        `load` makes."""
         if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
             raise ValueError(f"cell costs of this map are float32, {self.size} cells")
         own = private_copy(time_cost)  # kernels know arrays that may be written only
@@ -261,7 +261,7 @@ class CostGrid:
         self.rounding = Rounding.of(self.cell_cost)
 
     def snapshot(self) -> Self:
-        """The same costs, which nobody changes any more. Of shared ones only what has changed is copied."""
+        """Returns the same costs, which do not change any more. Of shared ones only changed cells are copied."""
         frozen = copy.copy(self)
         frozen._make_scratch()
         if self._shared is None:
@@ -287,7 +287,7 @@ class CostGrid:
         return first
 
     def changes_since(self, older: Floats) -> Changes:
-        """What has changed since the cell costs of an earlier snapshot of this grid."""
+        """Returns the changes since an earlier snapshot of this grid."""
         if self._shared is None:
             cells = np.flatnonzero(self.cell_cost != older)
         else:
@@ -365,7 +365,7 @@ class CostGrid:
                 yield row0, col0, row1, col1
 
     def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        """The exact tree of a padded root. Arrays are written whole; no cost exceeds what is returned, s.
+        """The exact tree of a padded root. Arrays are written whole; no cost exceeds the returned one, s.
 
         Raises OutsideGridError unless the root is a padded cell, ValueError where it is lethal or an array has
         another size than the map.
@@ -391,8 +391,8 @@ class CostGrid:
         """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
 
         most      steps of a route; 0 for all of it
-        statuses  (n,), written: then `starts` are any numbers of cells of the grid, which become padded ones. Those
-                  without a route become the root, and what is driven from there is inf
+        statuses  (n,), written: then `starts` are any numbers of cells of the grid, which become padded ones.
+                  Starts without a route become the root, and the cost driven from there is inf
         Raises ValueError where a start or the root is no padded cell.
         """
         count = starts.size
@@ -411,8 +411,8 @@ class CostGrid:
         return Walks(self._directions[:steps].copy(), ends, driven, length, last)
 
     def rests(self, parent: NDArray[np.uint8], root: int, starts: Cells, cell_cost: Floats) -> NDArray[np.float64]:
-        """float64, s: what is driven from padded cells along the parents to a padded root; inf where there is no
-        way. Raises ValueError where a start or the root is no padded cell."""
+        """Returns float64, s: the cost driven from padded cells along the parents to a padded root; inf without a
+        path. Raises ValueError where a start or the root is no padded cell."""
         rests = np.empty(starts.size)
         many = min(1 << 16, 64 << starts.size.bit_length())
         known = np.zeros(many, np.uint32), np.empty(many)
@@ -429,6 +429,7 @@ class CostGrid:
         return parent, *self._moves, root, self.stride
 
     def passable(self, cell: int) -> bool:
-        """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""
+        """Returns True if a cell of the grid can be entered. Raises OutsideGridError where it is none of the
+        grid."""
         self.grid.row_col(cell)
         return bool(self.cell_cost[self.pad(cell)] < np.inf)

@@ -4,8 +4,8 @@
 float32 labels: a full growth over a route of n steps is within n * 2**-24 of the exact cost, relatively.
 
 The one invariant that everything rests on: a cell's stored cost is at least what its parent offers. Costs then grow
-strictly along every way to the root, so no tree, however it was composed, has a cycle; and every cost plus the
-tree's offset is an upper bound of what is driven along the parents.
+strictly along every path to the root, so no tree, however it was composed, has a cycle; and every cost plus the
+tree's offset is an upper bound of the cost driven along the parents.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from swarm.grid import Window
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 MOST_SPREAD_SHARE = 48
-"""While a tree is mended, what costs fall to spreads over one cell in so many at once, ten times as dear as
+"""While a tree is repaired, a fall in cost spreads over one cell in this number at most, ten times as expensive as
 evaluating it: beyond, whole branches have moved, and their trees are evaluated first (decision 60)."""
 
 
@@ -41,7 +41,7 @@ class CostToGoTree:
 
     def __init__(self, cost_grid: CostGrid) -> None:
         self.cost_grid = cost_grid
-        """The map that the tree lies on. Whoever changes it calls `repair`, or grows the tree anew."""
+        """The map that the tree lies on. A caller that changes it calls `repair`, or rebuilds the tree."""
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
         before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten`, `relabel` and
@@ -54,13 +54,13 @@ class CostToGoTree:
         """s; how much the stored costs lack at most. `move` adds the cost from the old root to the new one; `grow`,
         `take`, `mend` and `relabel` reset it."""
         self.exact = False
-        """Whether cost-to-go is exact on the map as it is now (then the offset is 0). `grow`, `take` and `mend` set
-        it, `move` to another root and `grow_strides` reset it, `repair` keeps it."""
+        """True if cost-to-go is exact on the current map (then the offset is 0). `grow`, `take` and `mend` set it,
+        `move` to another root and `grow_strides` reset it, `repair` keeps it."""
         self.reach = 0.0
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
         self.window_bound: WindowBound | None = None
-        """What the last window proves, as long as its root is the tree's. `move` sets it, a growth resets it, and
-        so does the owner (to None) when a cell gets cheaper: it bounds from below."""
+        """Bound proven by the last window, as long as its root is the tree's. `move` sets it, a growth resets it,
+        and so does the owner (to None) when a cell gets cheaper: it bounds from below."""
         self._kept: KeptScratch = {}
         """Scratch of the last small window."""
         self._walk: Walk | None = None
@@ -69,7 +69,7 @@ class CostToGoTree:
         """uint8, padded: `_now` where a cost was recomputed since ways changed last. None until
         needed."""
         self._now = 1
-        """Raised whenever ways change, so that all stamps are old; begins anew with new stamps at 255."""
+        """Raised whenever paths change, so that all stamps are old; starts again with new stamps at 255."""
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -82,9 +82,9 @@ class CostToGoTree:
         self._become_exact(root)
 
     def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
-        """Become a tree that somebody else grew, exactly, on the map as it was or is now. Raises as `grow`, except
-        that the root may have become lethal since, and ValueError unless the arrays are as `cost` and `parent`
-        here."""
+        """Becomes a tree that was searched elsewhere, exactly, on the map as it was or is now. Raises as `grow`,
+        except that the root may have become lethal since, and ValueError unless the arrays are as `cost` and
+        `parent` here."""
         self.cost_grid.grid.row_col(root)
         size = self.cost_grid.size
         if cost.shape != (size,) or parent.shape != (size,) or cost.dtype != np.float32 or parent.dtype != np.uint8:
@@ -95,8 +95,8 @@ class CostToGoTree:
         self._become_exact(root)
 
     def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
-        """Become a tree that somebody else made on the map as it is now; costs are what is driven along it. Raises
-        as `take`."""
+        """Becomes a tree that was made elsewhere on the current map; costs are those driven along it. Raises as
+        `take`."""
         self.take(root, np.empty(self.cost_grid.size, np.float32), parent, 0.0)
         self.relabel()
         self.reach = float(self.cost[np.isfinite(self.cost)].max())
@@ -150,8 +150,8 @@ class CostToGoTree:
             raise ValueError("the tree has no root: grow it first")
         grid.check_root(root)
         if not self.cost[grid.pad(root)] < math.inf:
-            # A step that is too steep may be one way only: whoever has a way to the new root may have none to the
-            # old one, and be left without.
+            # A step that is too steep may be one-way: a cell with a path to the new root may have none to the old
+            # one, and be left without.
             return 0
         box, cost, _, way = grow_window(grid, root, self.root, window, self._kept, False)
         if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
@@ -175,7 +175,7 @@ class CostToGoTree:
 
     def repair(self, changes: Changes) -> int:
         """Bring the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned
-        that a growth costs less: then it must be grown before anything else."""
+        that a full search costs less: then it must be searched before any other use."""
         if changes.cells.size == 0:
             return 0
         grid = self.cost_grid
@@ -230,16 +230,15 @@ class CostToGoTree:
 
     @property
     def slack(self) -> tuple[float, float, float]:
-        """By how much what is driven in an exact tree may exceed the optimum, and never by more than all of it: a
-        share of it, a share for each unit of the cost grid's rounding of it, and s for each of its steps."""
+        """Returns the largest excess of a cost driven in an exact tree over the optimum, and never more than all of
+        it: a share of it, a share for each unit of the cost grid's rounding of it, and s for each of its steps."""
         return 0.0, 2.0, 0.0
 
     def tighten(self, cells: Cells) -> None:
-        """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
+        """Lowers the costs of padded cells, and of all on their paths, to those driven along the parents.
 
-        A window raises the costs beyond it by the most that may be, move after move, until a growth comes by or
-        this is asked: later windows then leave alone what is good already. Raises ValueError where one is no padded
-        cell.
+        A window raises the costs beyond it by the largest possible amount, move after move, until a full search or
+        this call: later windows then leave good cells alone. Raises ValueError where one is no padded cell.
         """
         if not self.exact:
             grid = self.cost_grid
@@ -258,34 +257,35 @@ class CostToGoTree:
         return self._stamps
 
     def _ways_changed(self) -> None:
-        """What was tightened before need not be right any more."""
+        """Tightened costs may be wrong from now on."""
         self._now += 2
         if self._now > 254:
             self._now = 1
             self._stamps = None
 
     def relabel(self) -> None:
-        """Make every cost what is really driven along the parents, and the offset 0."""
+        """Sets every cost to the one driven along the parents, and the offset to 0."""
         route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
         self.reach += self.offset
         self.offset = 0.0
 
     @property
     def fine(self) -> bool:
-        """Whether float32 tells every cost from its parent's. If not, only whole growths keep the tree right."""
+        """True if float32 distinguishes every cost from its parent's. If not, only whole growths keep the tree
+        right."""
         return self.reach <= FINE * self.cost_grid.lowest_cell_cost
 
     @property
     def precise(self) -> bool:
-        """Whether one more window can be merged without losing a cell's cost in the rounding of the offset."""
+        """True if one more window can be merged without losing a cell's cost in the rounding of the offset."""
         return self.fine and self.offset <= FINE / 8 * self.cost_grid.lowest_cell_cost
 
 
 def _most_repaired(cells: int) -> tuple[int, int, int]:
-    """How much a repair may do before it gives way to a growth.
+    """Returns the largest extent of a repair before it gives way to a full search.
 
-    That a cell has lost its way is found in a tenth of the time that mending it takes, which is six times that of
-    growing it. So up to an eighth of the map may; and as nobody knows beforehand how far cheaper ways spread, a
-    repair that gives up has then cost a fifth of a growth at most.
+    Detecting that a cell has lost its path takes a tenth of the time of repairing it, which is six times that of
+    searching it. Up to an eighth of the map may therefore be repaired; the spread of lower-cost paths is unknown
+    beforehand, so a repair that gives up has then cost a fifth of a full search at most.
     """
     return cells // 8 + 64, cells // 24 + 64, cells // 20 + 64

@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     from planner_service.tree.cost_grid import CostGrid
 
 MOST_BUCKETS = 1 << 8
-"""As narrow as the cheapest step: where the dearest takes more of them, their width follows the map."""
+"""As narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
 _NARROW = 0.98
 """Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 FINE = float(1 << 20)
-"""While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
+"""While no cost exceeds this number of lowest cell costs, float32 distinguishes any cell's cost from its
+parent's."""
 
 Bounds = tuple[float, float, float]
-"""Lowest and highest finite cell cost, s, and what the dearest step that is not forbidden costs, in cell costs."""
+"""Lowest and highest finite cell cost, s, and the highest cost of an allowed step, in cell costs."""
 
 KeptScratch = dict[tuple[int, int], Any]
 """Scratch by padded cells and buckets: one at most, of one thread, one rule and one kind of step."""
@@ -98,9 +99,9 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
 
 
 _SAMPLE = 1 << 10
-"""Cells by which the usual cell cost is told."""
+"""Number of cells in the sample for the usual cell cost."""
 _RARE = 1 / 16
-"""Of them, so many may cost less than the usual."""
+"""Number of them that may cost less than the usual."""
 _FEW, _NEAR = 16.0, 4.0
 """Buckets are as narrow as the lowest cell cost asks for where none is more than `_FEW` times as much, or the usual
 one no more than `_NEAR` times."""
@@ -127,8 +128,8 @@ def grow_directed_costs(
 def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:
     """s, of the finest buckets; whether some steps may cost less than that.
 
-    So narrow that one level of buckets is as wide as the usual cell cost asks for, and the finest no wider than the
-    lowest does.
+    Returns a width at which one level of buckets is as wide as the usual cell cost asks for, and the finest no
+    wider than the lowest does.
     """
     if highest > _FEW * lowest:
         sample = cell_cost[:: max(cell_cost.size // _SAMPLE, 1)]
@@ -200,7 +201,7 @@ def _in_window(grid: CostGrid, cell: int, window: Window) -> int:
 
 
 def padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
-    """(climbs, what the dearest step that is not forbidden costs, in cell costs)."""
+    """Returns (climbs, the highest cost of an allowed step, in cell costs)."""
     grid = climb.grid
     height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
     height[1:-1, 1:-1] = climb.elevation_m
@@ -224,15 +225,14 @@ def _rows(stride: int) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
 
 
 def climbs_in(climbs: Climbs, stride: int, box: tuple[int, int, int, int]) -> Climbs:
-    """Of a window, as a padded grid of its own."""
+    """Returns the climbs of a window, as a padded grid of its own."""
     row0, col0, row1, col1 = box
     part = climbs[0].reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
     return np.ascontiguousarray(part).reshape(-1), *climbs[1:]
 
 
 def turned_round(climbs: Climbs) -> Climbs:
-    """Of whoever drives every way backwards: what was uphill is downhill, and the wind comes from ahead that came
-    from behind."""
+    """Reverses grades and wind, for searches that start at the vehicle."""
     height, prices, scale, begins, keys, best, codes, entries = climbs
     tables = np.roll(prices.reshape(-1, int(begins[1])), 4, axis=0)
     return -height, tables.reshape(-1), scale, begins, keys, best, codes, entries

@@ -34,24 +34,24 @@ from planner_service.tree.growth import KeptScratch, grow_window
 from swarm.grid import Window
 
 MOST_LOOKS = 3.0
-"""A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
-mend one counts double (decision 61)."""
+"""A move or a repair gives way to a full search once it has checked this multiple of the map's tiles; repairing one
+counts double (decision 61)."""
 
 MOST_KEPT = 1 << 9
-"""Of so many tiles is kept what cells cost inside: 17 MB. Of 4096 x 4096 cells, a repair looks at 200 tiles in the
-mean, and a move at 170 to 260 (decision 94)."""
+"""Number of tiles for which the costs of their cells inside are kept: 17 MB. On 4096 x 4096 cells, a repair checks
+200 tiles in the mean, and a move 170 to 260 (decision 94)."""
 
 
 class PieceTree:
     """The exact tree of one root on a `CostGrid` without climbs.
 
-    cost_grid  the map that the tree lies on. Whoever changes it calls `repair`, or `take`
+    cost_grid  the map that the tree lies on. A caller that changes it calls `repair`, or `take`
     parent     uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way. Empty
                before the first `take`
     root       the target's cell, of the grid; -1 before the first `take`
     exact      whether all costs are the least there are. `grow`, `take` and `mend` set it, `move` to another root
-               resets it, and so do `mend` and `repair` where they give way: the tree then still leads to its root,
-               and states what is driven
+               resets it, and so do `mend` and `repair` when they give way: the tree then still leads to its root,
+               and states the cost driven
     window_bound  None: an exact tree bounds itself
     fine, precise  as of a `CostToGoTree`: true
     """
@@ -90,7 +90,7 @@ class PieceTree:
         self._most = MOST_LOOKS * count + 64
         self._kept: KeptScratch = {}
         self.work = (0, 0, 0)
-        """Tiles looked at, tiles mended and rounds of the last `mend`."""
+        """Tiles checked, tiles repaired and rounds of the last `mend`."""
         self._moved = False
         """The root has moved since totals were added up."""
 
@@ -109,8 +109,8 @@ class PieceTree:
         self.take(root, parent)
 
     def take(self, root: int, parent: NDArray[np.uint8]) -> None:
-        """Become a tree that somebody else made, on the map as it is now, and make it exact. The array is taken
-        over. Raises as `grow`, and ValueError unless the array is as `parent` here."""
+        """Becomes a tree that was made elsewhere, on the current map, and makes it exact. The array is taken over.
+        Raises as `grow`, and ValueError unless the array is as `parent` here."""
         self.cost_grid.check_root(root)
         if parent.shape != (self.cost_grid.size,) or parent.dtype != np.uint8:
             raise ValueError(f"parents of this map are uint8, {self.cost_grid.size} cells")
@@ -191,19 +191,20 @@ class PieceTree:
 
     @property
     def slack(self) -> tuple[float, float, float]:
-        """As of a `CostToGoTree`. Cell costs are float32, a few roundings; the rest is left over step by step."""
+        """Same as in `CostToGoTree`. Cell costs are float32, a few roundings; the rest is left over step by
+        step."""
         farthest = self._ends[1].max() + self._tiles.span.max()
         return 2.0**-21, 0.0, float(MOST_SLACK * farthest)
 
     def tighten(self, cells: Cells) -> None:
-        """Costs are what is driven at all times."""
+        """Costs are those driven at all times."""
 
     def _relabel(self, changed: NDArray[np.uint8]) -> None:
-        """Label tiles anew in which something has changed: uint8 (n,), `partition.DEARER` or more."""
+        """Labels again the changed tiles: uint8 (n,), `partition.DEARER` or more."""
         partition.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
 
     def _schedule(self, turn: NDArray[np.float64]) -> Schedule:
-        """As `improve_tiles` takes it; totals are up to date after what it is handed to."""
+        """Returns the schedule for `improve_tiles`; totals are up to date after that call."""
         self._now += self._moved
         now = self._now if self._moved else 0
         self._moved = False

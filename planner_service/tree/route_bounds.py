@@ -16,12 +16,12 @@ from shared_map.array_files import Floats
 from swarm.wire.route_columns import RouteBatch
 
 LOWER_SHARE = 16
-"""A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth
+"""A heuristic is lowered by visiting at most one cell in this number; beyond, the bound waits for a full search
 (decision 64)."""
 
 
 class LowerBounds:
-    """What is known of the optimum while the tree itself is not exact."""
+    """Lower bounds on the optimum while the tree itself is not exact."""
 
     def __init__(self, cost_grid: CostGrid) -> None:
         self._grid = cost_grid
@@ -31,7 +31,7 @@ class LowerBounds:
         that would visit too many cells."""
 
     def take(self, exact_cost: Floats) -> None:
-        """Go by this exact padded cost from now on; nobody may write to it any more."""
+        """Uses this exact padded cost from now on, which must not be written to any more."""
         self._heuristic = exact_cost
 
     def forget(self) -> None:
@@ -39,7 +39,7 @@ class LowerBounds:
         self._heuristic = None
 
     def learn(self, changes: Changes) -> None:
-        """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
+        """The map changed: lower the heuristic where ways became cheaper. Costlier cells leave it consistent."""
         if self._heuristic is None or not changes.any_lower:
             return
         grid = self._grid

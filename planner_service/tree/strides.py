@@ -1,4 +1,4 @@
-"""The networks of strides on which far cells are planned (section 3.3.3): found, shared, and found anew."""
+"""Networks of strides on which far cells are planned (section 3.3.3): found, shared, and rebuilt."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ LEAST = 4
 """Doublings of the least stride that has a network: 16 cells. Shorter strides are single steps, near the target: a
 network as dense as they would need holds about as many cells as there are."""
 FINE = 8
-"""Strides below the least one are for so many times the narrowest window: there all cells are grown."""
+"""Strides below the least one serve this multiple of the narrowest window: there all cells are searched."""
 MOST_SHARE = 8
 """The largest stride is at most such a share of the map's side (decision 62)."""
 STALE_SHARE = 16
-"""Networks are found anew when cells have changed in one block of the least stride in so many (decision 62)."""
+"""Networks are rebuilt when cells have changed in one block of the least stride in this number (decision 62)."""
 
 _HEADER = 32
 """Bytes: four numbers of eight."""
@@ -33,8 +33,8 @@ _DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.ui
 class StrideNetwork:
     """Nodes, links and their ways, of every stride: what a coarse growth goes along.
 
-    Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. So marks
-    never make it wrong, only less good.
+    Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. Marks
+    therefore never make it wrong, only less good.
 
     arrays  for kernels
     size    padded cells of the map that it is of
@@ -47,7 +47,7 @@ class StrideNetwork:
         """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
 
     def learn(self, cost_grid: CostGrid, changes: Changes) -> bool:
-        """Cells have changed. False once the networks should be found anew."""
+        """Cells have changed. False once the networks should be rebuilt."""
         across = (cost_grid.stride >> LEAST) + 1
         if not self._changed.size:
             self._changed = np.zeros(((cost_grid.size // cost_grid.stride >> LEAST) + 1) * across, np.bool_)
@@ -64,7 +64,7 @@ class StrideNetwork:
 
     @classmethod
     def unpacked(cls, packed: Bytes) -> StrideNetwork:
-        """From what `packed` has made, whose memory it shares."""
+        """Reads the output of `packed`, whose memory it shares."""
         nodes, links, steps, size = packed[:_HEADER].view(np.int64).tolist()
         sizes = (nodes, nodes + 1, links, links, links, links, nodes, steps)
         lengths = [many * np.dtype(dtype).itemsize for many, dtype in zip(sizes, _DTYPES, strict=True)]
@@ -76,19 +76,20 @@ class StrideNetwork:
 
 
 class StrideShelf(Protocol):
-    """Where the planners of a machine leave the networks of the map as it is before any mark, so that one of them
-    finds these for all."""
+    """Shared store of the networks of the map before any mark, so that one planner of a machine finds them for
+    all."""
 
     def load(self) -> Bytes | None:
-        """What one of them has left, as `StrideNetwork.packed`; the caller may write to it."""
+        """Returns the stored network, as `StrideNetwork.packed`; the caller may write to it."""
         ...
 
     def claim(self) -> bool:
-        """Whether the caller is the one to find them: true again at its next call, until `leave` or its end."""
+        """Returns True if the caller is the one to find them: true again at its next call, until `leave` or its
+        end."""
         ...
 
     def leave(self, packed: Bytes) -> None:
-        """Leave what was found to all."""
+        """Stores the found network for all."""
         ...
 
 
@@ -142,7 +143,7 @@ class StrideUpkeep:
 
     @property
     def wanted(self) -> bool:
-        """Whether to begin a search."""
+        """Returns True if a search should begin."""
         return self.network is None and not self._searching
 
     def search(self, cost_grid: CostGrid, shelf: StrideShelf | None) -> StrideSearch:
@@ -154,7 +155,7 @@ class StrideUpkeep:
         return StrideSearch(cost_grid.snapshot()) if shared is None else StrideSearch(shared, shelf)
 
     def take(self, cost_grid: CostGrid, search: StrideSearch) -> None:
-        """Go by what was found; what has changed since counts as learnt."""
+        """Uses the found network; later changes count as learnt."""
         assert search.network is not None
         self._searching = False
         self.network = search.network
@@ -192,7 +193,7 @@ def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
 
 
 def _find(grid: CostGrid) -> Iterator[StrideNetwork | None]:
-    """Find one stride at a time; the last of what is yielded is the network."""
+    """Finds one stride at a time; the last item is the network."""
     node = _all_cells(grid)
     centres: list[NDArray[np.uint32]] = []
     links: list[Links] = []

@@ -6,18 +6,18 @@ granted, in the time of a tick; `dynamics` says how fast.
 
 A vehicle is in one of eight states, which each report tells (`VehicleState`):
 
-- IDLE: it has no target. So it begins, and so it is after `release`.
+- IDLE: it has no target. Initial state, and the state after `release`.
 - WAITING: it has a target and no route to it, and asks for one.
 - FOLLOWING: it has a route to a target whose tracker lives.
 - ARRIVED: its target is within capture range and has a tracker that lives.
 - STRANDED: no planner knows a way from here. It asks again every few seconds.
-- LOST: its target's planner is gone. It drives on along the route that it has.
+- LOST: its target's planner has ended. It drives on along the route that it has.
 - OUTDATED: as FOLLOWING or ARRIVED, by the last pose of a target whose tracker is lost.
-- SEARCHING: it has a route to a place where its target may be, which nobody sees.
+- SEARCHING: it has a route to a cell where its unseen target may be.
 
-The state follows from what is known: within capture range comes before a planner that is gone, that before a
-search, that before a route (`Vehicle._settle`). Only IDLE and STRANDED are kept. These are all transitions: the
-method of `Vehicle` that is called, the states before it, and the state after it. Any other call changes no state.
+The state follows from known facts: capture range takes precedence over an ended planner, that over a search, that
+over a route (`Vehicle._settle`). Only IDLE and STRANDED are kept. These are all transitions: the method of
+`Vehicle` that is called, the states before it, and the state after it. Any other call changes no state.
 
     assign          ARRIVED, LOST, SEARCHING -> FOLLOWING
     assign          LOST, SEARCHING -> OUTDATED

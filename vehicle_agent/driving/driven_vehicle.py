@@ -49,7 +49,7 @@ class GivenRoute(msgspec.Struct, frozen=True):
     cost_s         its cost, in seconds
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
-    searching      whether it leads to a place where the target may be, which nobody sees
+    searching      whether it leads to a cell where the unseen target may be
     turns          of a pulled route the indices of the cells in which it turns, its first and last included
     """
 
@@ -89,7 +89,7 @@ class Vehicle:
     tracked       whether that target has a tracker that lives; else it was in reach, and may be anywhere
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
     asked         the target of the open route request, None if there is none
-    searching     whether its last route led to a place where its target may be, which nobody sees
+    searching     whether its last route led to a cell where its unseen target may be
     """
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
@@ -155,7 +155,7 @@ class Vehicle:
         self._need_route(Reason.PLANNER_BACK, now_ns)
 
     def set_in_reach(self, in_reach: bool) -> None:
-        """Whether the target is within capture range."""
+        """Sets whether the target is within capture range."""
         self.in_reach = in_reach
         if in_reach:
             self._need = None
@@ -163,7 +163,7 @@ class Vehicle:
         self._settle()
 
     def set_tracked(self, tracked: bool) -> None:
-        """Whether its target has a tracker that lives: without one it goes on, by an old pose."""
+        """Sets whether its target has a living tracker: without one it goes on, by an old pose."""
         self.tracked = tracked
         self._settle()
 
@@ -269,7 +269,7 @@ class Vehicle:
             self._retry_ns = min(2 * self._retry_ns, _LONGEST_RETRY_NS)
 
     def _settle(self) -> None:
-        """Derive the state from what is known."""
+        """Derives the state from known facts."""
         if self.target is None:
             return
         if self.in_reach:

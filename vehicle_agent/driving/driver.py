@@ -116,12 +116,12 @@ class Driver:
         return 0.0
 
     def _passes(self, vehicle: Vehicle, cell: int) -> Point | None:
-        """Where a vehicle passes one of its next cells; None is the middle."""
+        """Returns the point where a vehicle passes one of its next cells; None is the middle."""
         return vehicle.route.point(cell, self._cols) if self._pulled else None
 
     def _measure(self, vehicle: Vehicle, head: int, seconds: float, length_m: float) -> None:
-        """Part of what is measured of the step to `head` was driven, or its end; all of that is as long as
-        `length_m` on level ground."""
+        """Measures a part of the step to `head` that was driven, or its end; all of that is as long as `length_m`
+        on flat ground."""
         if vehicle.motion.at_rest:
             self._rolling.add(vehicle.id)
         step = self._steps.get(vehicle.id)
@@ -151,7 +151,7 @@ class Driver:
 
 
 def climbing_of(motion: Motion, climb: Climb, pulled: bool) -> float:
-    """What a metre of the stretch on which a vehicle is takes, over one on the level and in still air.
+    """Returns the time of a metre of the vehicle's current stretch, relative to a level one in still air.
 
     pulled  whether it leads along a segment, in any direction
     """

@@ -1,6 +1,6 @@
-"""How fast a vehicle drives on the way that it was granted. The ground says how fast it may; a plug-in may slow it.
+"""Speed of a vehicle on its granted path. The ground says how fast it may; a plug-in may slow it.
 
-Which cells a vehicle enters, and when it must stop, is `Motion`'s and right of way's, whatever is said here.
+The cells that a vehicle enters, and its stops, belong to `Motion` and right of way, whatever this returns.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STRAIGHT_RAD = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class DynamicsWorld:
-    """What dynamics are made with.
+    """Arguments with which dynamics are made.
 
     agent  id of the agent whose vehicles they drive
     seed   of the run
@@ -38,7 +38,7 @@ class DynamicsWorld:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """What a vehicle drives next: to the border or the middle of a cell, at most.
+    """The next piece of driving: to the border or the middle of a cell, at most.
 
     vehicle        its id
     speed_m_per_s  how fast it was at the end of the last tick; 0 if it stood
@@ -46,7 +46,7 @@ class Stretch:
     turn_rad       by how much it has turned since the last stretch, -pi to pi, clockwise
     ahead_m        metres to the end of the cells that it was granted, where it stops unless more are granted
     tick_s         seconds on the terrain from one tick to the next
-    left_s         what is left of the tick
+    left_s         remaining time of the tick
     turns          (metres from here, radians) of each turn on the cells that it was granted
     """
 
@@ -63,8 +63,8 @@ class Stretch:
 class Inertia:
     """The built-in dynamics of a class with limits of its own, in m/s2 and degrees/s; None is no limit.
 
-    What it says can be driven from tick to tick: at the end of each it can still brake for all that is ahead. A
-    turn is driven on the half of a cell behind it.
+    Its distances are feasible from tick to tick: at the end of each it can still brake for everything ahead. A turn
+    is driven on the half of a cell behind it.
     """
 
     def __init__(self, grid: GridSpec, accel: float | None, turn_rate_deg_per_s: float | None) -> None:
@@ -87,8 +87,9 @@ class Inertia:
         return self._turn_rate * self._half_m / abs(turn_rad)
 
     def _down_to(self, then: float, ahead_m: float, seconds: float) -> float:
-        """The speed from which it can brake to another within so many metres, after some seconds at this speed: the
-        v of v seconds + (v^2 - then^2) / 2 accel = ahead. What it loses within that time it may drive at once."""
+        """Returns the speed from which it can brake to another within a distance (m), after some seconds at this
+        speed: the v of v seconds + (v^2 - then^2) / 2 accel = ahead. A speed that it loses within that time may be
+        driven immediately."""
         if math.isinf(then):
             return math.inf
         room = 2 * self._accel * ahead_m + then * then
@@ -142,7 +143,7 @@ class PluginDynamics:
         """The same of this tick."""
 
     def begin(self, tick_s: float) -> None:
-        """A tick begins, of so many seconds on the terrain."""
+        """Begins a tick of this time (s) on the terrain."""
         self._tick_s = tick_s
         self._were, self._are = self._are, {}
 
@@ -155,7 +156,7 @@ class PluginDynamics:
         pace_s_per_m: float,
         passes: Callable[[int], Point | None] = lambda cell: None,
     ) -> float:
-        """As `Motion.advance`, no faster than `pace_s_per_m`.
+        """Like `Motion.advance`, no faster than `pace_s_per_m`.
 
         path    the cells that the vehicle was granted, from its own on
         passes  where it passes one of these; None is the middle
@@ -182,7 +183,7 @@ class PluginDynamics:
     def _ahead(
         self, motion: Motion, path: Sequence[int], passes: Callable[[int], Point | None]
     ) -> tuple[float, tuple[tuple[float, float], ...]]:
-        """Metres to the end of what was granted, and the turns until there."""
+        """Returns the distance (m) to the end of the grant, and the turns until there."""
         cells = path[path.index(motion.head) + 1 :] if motion.head in path else ()
         stops = [motion.goal, *((cell, passes(cell) or middle_of(self._grid, cell)) for cell in cells)]
         ahead_m, heading_rad = motion.left_m, motion.heading_rad

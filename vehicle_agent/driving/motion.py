@@ -10,7 +10,7 @@ from swarm.grid import GridSpec
 Point = tuple[float, float]
 """Row and col, whole numbers in the middles of cells."""
 Stop = tuple[int, Point]
-"""Where a step begins or ends: a cell, and a point in it."""
+"""Beginning or end of a step: a cell, and a point in it."""
 
 
 class Motion:
@@ -32,7 +32,7 @@ class Motion:
         self._grid = grid
         self.heading_rad = 0.0
         self._via: Point | None = None
-        """Where it passes the border, if the step is not from middle to middle."""
+        """Point where it passes the border, if the step is not from middle to middle."""
         self.put(cell)
 
     def put(self, cell: int) -> None:
@@ -43,12 +43,12 @@ class Motion:
         self.at_rest = True
 
     def _settle(self) -> None:
-        """Find the cell anew. As whether it rests, it is asked for far more often than it changes."""
+        """Updates the cell. Like the state of rest, it is read far more often than it changes."""
         self.cell = self.tail if self.done_m < self.border_m else self.head
 
     @property
     def goal(self) -> Stop:
-        """Where the step ends."""
+        """End of the step."""
         return self.head, self._to
 
     @property
@@ -110,7 +110,7 @@ class Motion:
         return seconds - needed_s
 
     def stretch(self) -> tuple[Point, Point, float]:
-        """Where the straight stretch on which it is begins and ends, and how much of it is driven, 0 to 1."""
+        """Beginning and end of the current straight stretch, and the share of it that is driven, 0 to 1."""
         if self._via is None or not self.length_m:
             return self._at, self._to, self.done_m / self.length_m if self.length_m else 0.0
         if self.done_m < self.border_m:
@@ -158,8 +158,8 @@ def middle_of(grid: GridSpec, cell: int) -> Point:
 
 
 def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point:
-    """Where a step passes from its cell into the next: on the edge that they share, of which `shared` is the
-    middle, or at their corner, which it is then."""
+    """Returns the point where a step passes from its cell into the next: on the edge that they share, of which
+    `shared` is the middle, or at their corner, which it is then."""
     if rows and cols:
         return shared
     if rows:

@@ -13,7 +13,7 @@ _NOWHERE = (9, 9, 0, 0)
 _SKIPPED_CELLS = 24
 """A vehicle that others push may come back to its route so far on."""
 _LEAST_PART = 1e-9
-"""Of a segment: it only touches a cell of which it crosses no more."""
+"""Share of a segment below which it only touches a cell."""
 
 
 class Follower:
@@ -28,12 +28,13 @@ class Follower:
         self._cells: list[int] = []
         self._at = 0
         self._turns: Sequence[int] = ()
-        """Of a pulled route the indices of the cells in which it turns, its first and last included; and those."""
+        """For an any-angle route the indices of the cells in which it turns, its first and last included; and
+        those."""
         self._turn_cells: Sequence[int] = ()
         self._bounds: tuple[int, int, int, int] | None = None
         self.left = self.changes = self.version = 0
         self.partial = False
-        """Whether the route ends before its target, because the planner gave a part of it."""
+        """True if the route ends before its target, because the planner gave a part of it."""
 
     def begin(
         self, cells: Sequence[int], path: Sequence[int], partial: bool = False, turns: Sequence[int] = ()
@@ -63,8 +64,8 @@ class Follower:
         self.version += 1
 
     def bounds(self, cols: int) -> tuple[int, int, int, int]:
-        """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
-        rectangle that holds nothing. Kept, as a route changes seldom and the map all the time."""
+        """Returns the smallest (row, col) and the greatest of all its cells in a grid with `columns` columns;
+        without cells an empty rectangle. Kept, as a route changes seldom and the map all the time."""
         if self._bounds is None:
             self._bounds = bounds_of(self._cells, cols) if self._cells else _NOWHERE
         return self._bounds
@@ -83,15 +84,16 @@ class Follower:
         return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
 
     def _find(self, cell: int) -> int | None:
-        """Where on the route a cell is to which the vehicle may come next; None if it is not one of those."""
+        """Returns the index on the route of a cell that the vehicle may enter next; None if it is not one of
+        those."""
         try:
             return self._cells.index(cell, self._at, self._at + _SKIPPED_CELLS)
         except ValueError:
             return None
 
     def point(self, cell: int, cols: int) -> tuple[float, float] | None:
-        """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's
-        part in it. None where it is the middle of the cell.
+        """Returns the point where an any-angle route passes one of its next cells, as row and col: the middle of
+        its segment's part in it. None where it is the middle of the cell.
 
         A cell that the segment does not cross, whatever a planner says, is driven through its middle.
         """
@@ -118,7 +120,8 @@ class Follower:
         return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
 
     def legs_ahead(self) -> list[int]:
-        """Of a pulled route over how many steps each of its segments goes, from the cell passed last on."""
+        """Returns for an any-angle route the number of steps of each of its segments, from the cell passed last
+        on."""
         last = len(self._cells) - 1
         ends = [turn for turn in self._turns if self._at < turn < last] + [last] * (last > self._at)
         return [end - begin for begin, end in pairwise((self._at, *ends))] if self._turns else []

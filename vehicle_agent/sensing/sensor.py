@@ -1,4 +1,4 @@
-"""What vehicles see of the terrain, and which marks follow from it."""
+"""Sensing of the terrain by vehicles, and the marks that follow."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """What to mark: cells, flat indices; a `MarkKind` each; and the pace seen in s/m."""
+    """Marks to publish: cells, flat indices; a `MarkKind` each; and the observed pace in s/m."""
 
     cells: NDArray[np.int64]
     kinds: NDArray[np.uint8]
@@ -38,13 +38,13 @@ class Findings:
         return len(self.cells)
 
     def where(self, chosen: NDArray[np.bool_]) -> Findings:
-        """Those that are chosen."""
+        """Returns the selected ones."""
         return Findings(self.cells[chosen], self.kinds[chosen], self.paces[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorWorld:
-    """What a sensor is made with.
+    """Arguments with which a sensor is made.
 
     truth_s_per_m  float32 (rows, cols), the true pace, inf if lethal, read-only; it may change during a run
     range_m        `vehicles.sense_range_m`
@@ -63,9 +63,9 @@ class Sensor(Protocol):
     """Sees the ground around vehicles. A plug-in is made as `Name(world: SensorWorld, options)`."""
 
     def look(self, cells: Sequence[int]) -> Sight:
-        """What is seen from these cells, the places of vehicles that have come there: cells on the grid with their
-        pace, `PACE_LEAST` to `PACE_MOST` s/m, or inf where lethal. A built-in sensor sees at least each cell itself
-        and its eight neighbours; to a plug-in's sight these are added."""
+        """Returns the view from these cells, the positions of vehicles that have come there: cells on the grid with
+        their pace, `PACE_LEAST` to `PACE_MOST` s/m, or inf where lethal. A built-in sensor sees at least each cell
+        itself and its eight neighbours; to a plug-in's sight these are added."""
         ...
 
 
@@ -106,7 +106,8 @@ def sensor_of(plugin: Plugin, world: SensorWorld, tell: Tell) -> Sensor:
 
 class PluginSensor:
     """A plug-in's sight, and of the cells next to a vehicle the truth: a bumper, which no plug-in takes away, and
-    whose word counts where they differ. So no vehicle stands for ever before what its sensor does not see."""
+    whose word counts where they differ. No vehicle therefore waits for ever before a cell that its sensor does not
+    see."""
 
     def __init__(self, sensor: Sensor, world: SensorWorld, guard: Guard) -> None:
         self._sensor = sensor
@@ -144,7 +145,7 @@ class PluginSensor:
 
 
 def compare(sight: Sight, ground: NDArray[np.float32], prior: NDArray[np.float32]) -> Findings:
-    """Where the map differs from what was seen.
+    """Compares an observation with the map.
 
     ground, prior  float32 (rows, cols), s/m, before inflation; ground is with marks, prior without
     """

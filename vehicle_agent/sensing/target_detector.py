@@ -29,8 +29,8 @@ _RETELL_NS = NS_PER_S
 class TargetDetector:
     """The simulated sensor for targets: knows where all are, and reports those within its range.
 
-    Of each target it remembers the last sighting of all, if it was its own, for a planner that begins anew and
-    heard none. A target that was captured in sight is somewhere else, and its sighting is forgotten.
+    For each target it remembers the last sighting of all, if it was its own, for a planner that restarts and
+    received none. A target that was captured in sight is somewhere else, and its sighting is forgotten.
 
     range_m  of the sensor
     lasts_s  a sighting expires after so long
@@ -51,10 +51,10 @@ class TargetDetector:
         self._last: dict[str, Sighted] = {}
         """Target -> its last sighting of all, if that is this author's."""
         self._retell_ns: dict[str, int] = {}
-        """Target -> when its last sighting is told again."""
+        """Target -> time of the next repetition of its last sighting."""
 
     def set_truth(self, pose: TargetPose, now_ns: int) -> None:
-        """Where a target truly is. Of each target the newest pose counts."""
+        """Sets the true position of a target. For each target the newest pose counts."""
         if self._newest.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             before = self._true.get(pose.target)
             self._true[pose.target] = pose
@@ -64,7 +64,7 @@ class TargetDetector:
                 del self._last[pose.target]
 
     def lose(self, targets: Iterable[str]) -> None:
-        """Nobody knows any more where these are."""
+        """Forgets the positions of these targets."""
         for target in targets:
             self._true.pop(target, None)
 
@@ -75,7 +75,7 @@ class TargetDetector:
             del self._last[sighted.target]
 
     def retell(self, target: str, now_ns: int) -> None:
-        """The planner of a target has begun anew."""
+        """Repeats the last sighting for a planner that has restarted."""
         self._retell_ns[target] = now_ns + _RETELL_NS
 
     def retold(self, now_ns: int) -> list[Sighted]:
@@ -141,17 +141,19 @@ class UntrackedTargets:
 
 # Places where a target was seen last and is not any more, as vehicles find that stand there. Pure.
 #
-# A target that only vehicles see is where the newest sighting says, for as long as the sighting lasts. Captured, it
-# is somewhere else at once, and its planner leads to the old place until it finds, from where vehicles are, that
-# nobody sees it there, and searches. That costs whoever stands there nothing: without this they would stay.
+# A target that only vehicles see is where the newest sighting says, for as long as the sighting lasts. A captured
+# target is elsewhere immediately. Its planner leads to the old place until it finds, from the positions of
+# vehicles, that it is not seen there, and searches. That costs vehicles there nothing: without this they would
+# stay.
 
 UNSEEN_NS = 2 * NS_PER_S
-"""A target in sight is told of twice a second: one that is not told of for so long while a vehicle stands where it
-was is not there."""
+"""A target in sight is published twice a second: one that is not published for this time while a vehicle is at its
+position is not there."""
 
 
 LEFT_NS = 5 * NS_PER_S
-"""For so long nobody goes for a target that was found gone: then its planner searches, and it is as good as any."""
+"""Time for which no vehicle chases a target that was found absent: then its planner searches, and it is as good as
+any."""
 
 
 class EmptyPlaces:
@@ -175,12 +177,12 @@ class EmptyPlaces:
     def unseen(self, lost: Set[str]) -> Set[str]:
         """The targets that were placed by a sighting and may be anywhere now.
 
-        lost  those of which nobody knows where they are
+        lost  targets whose position is unknown
         """
         return (lost | self._found_ns.keys()) & self._by_sight
 
     def placed(self, target: str, *, by_sight: bool) -> None:
-        """It is known anew where a target is: by a sighting, or by its tracker."""
+        """Notes a new position of a target: by a sighting, or by its tracker."""
         self._found_ns.pop(target, None)
         if by_sight:
             self._by_sight.add(target)
@@ -190,7 +192,7 @@ class EmptyPlaces:
     def find_gone(self, stood_at: Iterable[str], now_ns: int) -> bool:
         """Find which targets are gone; returns whether one is that was not before.
 
-        stood_at  targets that a vehicle has within reach, by what is known
+        stood_at  targets that a vehicle has within reach, by their known positions
         """
         if not self._by_sight:
             return False

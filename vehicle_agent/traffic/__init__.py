@@ -1,17 +1,18 @@
 """Right of way for those who decide it: the members and wardens of plots, and where vehicles would go next.
 
 The map is cut into plots (`swarm.right_of_way.lock_regions`). Each plot has three members, which are agents; one of
-them is its warden. What a host does is in `swarm.right_of_way`; decision 25 has the proof. Here:
+them is its warden. The host's part is in `swarm.right_of_way`; decision 25 has the proof. Here:
 
 1. A host tells the warden where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
-   around a vehicle by its route. `CellRequests` keeps what is asked until something that it was made of changes.
+   around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.
 2. The warden plans all vehicles at rest at once (`pibt`) and appends free cells to their grants (`Grants`). No cell
    is in two vehicles' grants, and a grant is never revoked: only its host's word frees a cell.
 3. The warden sends its table to the other members, under (epoch, number). A member puts it on file and says so
-   (`Stored`). With the warden's own file one is a majority: then hosts are told what the table grants them.
+   (`Stored`). With the warden's own file one is a majority: then hosts receive the grants of the table.
 4. A warden that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store
    no table of a lower one (Paxos). The new warden begins with the newest table that a majority knows.
-5. What is promised or stored is on file before anybody is told. No clock decides anything but when to claim.
+5. Promises and stored tables are on file before any message states them. No clock decides anything but when to
+   claim.
 
 `RightOfWay` is one agent's part: its seats as a member, and its vehicles as a host. `Detours` leads vehicles around
 bodies, which speak no right of way.

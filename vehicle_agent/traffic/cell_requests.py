@@ -1,8 +1,8 @@
-"""What an agent's vehicles ask of wardens, each kept until something that it was made of changes.
+"""Requests of an agent's vehicles to wardens, each kept until one of its inputs changes.
 
-`Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, bodies, and what others hold)
-and of nothing else, so a wish that is kept is the one that would be made anew. What it is made of is found out in
-one place, `CellRequests.make`: arguments are compared, and each kind of cell tells in which places it has changed.
+`Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, bodies, and cells held by
+others) and of nothing else, so a kept wish equals a new one. Its inputs are compared in one place,
+`CellRequests.make`: arguments are compared, and each kind of cell reports its changed cells.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Each vehicle's turns begin at another time, so that no tick has all wishes to ma
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
 _MS = NS_PER_S // 1000
-"""A unit: ages are told in milliseconds, clocks count nanoseconds."""
+"""Unit: ages are sent in milliseconds, clocks count nanoseconds."""
 _STAYS = Wish()
 
 
@@ -66,9 +66,9 @@ class CellRequests:
         """Vehicle -> what its wish was made of, but for the cells near it; and from when until when that is so as
         far as time has a part in it."""
         self._beside: dict[str, frozenset[int]] = {}
-        """Vehicle at rest -> the cells on which it matters whether somebody holds them."""
+        """Vehicle at rest -> the cells that matter if another vehicle holds them."""
         self._changed: list[Window] = []
-        """Where the ground has changed since wishes were made."""
+        """Cells whose ground has changed since wishes were made."""
         self._held: set[int] = set()
         """The cells that vehicles held when wishes were made."""
         self._since_ns: dict[str, int] = {}
@@ -93,8 +93,8 @@ class CellRequests:
         self._made_of.pop(vehicle, None)
 
     def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
-        """Make the wishes of these vehicles for which anything has changed. Called once in a tick, after all that
-        changes what is held."""
+        """Make the wishes of these vehicles for which anything has changed. Called once in a tick, after all
+        changes of held cells."""
         holdings, steering = self._holdings, self._steering
         held = holdings.occupied()
         changed = held ^ self._held

@@ -1,4 +1,4 @@
-"""What a warden has granted: by vehicle, by host and by cell, kept as it changes."""
+"""Grants of a warden: by vehicle, by host and by cell, updated incrementally."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ _MOST_BESIDE = 1 << 14
 
 @lru_cache(maxsize=_MOST_BESIDE)
 def cells_beside(cell: int, cols: int) -> frozenset[int]:
-    """The cells beside a cell in a grid of so many columns; at a border of the grid also some that are far away."""
+    """Returns the cells beside a cell in a grid with `columns` columns; at a border of the grid also some that are
+    far away."""
     north, south = cell - cols, cell + cols
     return frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))
 
@@ -35,7 +36,7 @@ class Grants:
         self.cells: dict[str, set[int]] = {}
         self.holders: dict[int, str] = {}
         self._doubled: set[int] = set()
-        """Cells that were granted twice, as no table says that nobody made up."""
+        """Cells granted twice, which occurs only in a forged table."""
         for vehicle, grant in grants.items():
             self._doubled.update(self.holders.keys() & grant.cells)
             self._add(vehicle, grant)

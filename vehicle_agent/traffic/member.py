@@ -1,7 +1,7 @@
 """A member of a plot: it promises, stores tables, and becomes the plot's warden when the last one is silent.
 
-The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. What is promised or
-stored must be on file before anybody is told. No clock decides anything but when a member tries to become warden.
+The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. Promises and tables must
+be on file before any message states them. No clock decides anything but when a member tries to become warden.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEASE_NS = 3 * BEAT_NS
 _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
-"""Where no host has spoken for so long, nobody needs a warden."""
+"""Time without a host's message after which no warden is needed."""
 _TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
 
@@ -90,7 +90,7 @@ class Member:
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
         self._told: list[Table] = []
-        """As warden: tables that have been told, the oldest first, from the newest one that is on file on."""
+        """As warden: published tables, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
         """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
@@ -101,7 +101,7 @@ class Member:
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
-            # Nobody can be in charge of a plot that is new; and whoever was until now, hosts hear no more.
+            # A new plot cannot have another warden; and hosts receive no more from the previous one.
             led = self.promised and now_ns >= self._led_until_ns + LEASE_NS
             wait_ns = _START_NS if led else 0
             self._due_ns = max(self._due_ns, now_ns + wait_ns + self._rank * _RANK_NS)
@@ -132,7 +132,7 @@ class Member:
             self.promised, self.stored = table.epoch, table
             actions.append(Save(self.promised, self.stored))
         if table.stamp == self.stored.stamp:
-            self._said = min(self._said, (table.epoch, table.seq - 1))  # a table told again is answered again
+            self._said = min(self._said, (table.epoch, table.seq - 1))  # a repeated table is acknowledged again
             if self._plots.warden(self.plot, table.epoch + 1) == self._me:
                 actions.append(self._say(now_ns))
         return actions
@@ -142,9 +142,9 @@ class Member:
         return self.on_file
 
     def _say_late(self, now_ns: int) -> list[MemberAction]:
-        """What the member that is second after the warden says of its file. With the warden the first one makes a
-        majority, so the second says only what the first does not, and, as others may not hear the first, speaks at
-        least once in a beat."""
+        """Returns the reply of the member that is second after the warden about its file. With the warden the first
+        one makes a majority, so the second says only what the first does not, and, as others may not hear the
+        first, speaks at least once in a beat."""
         stamp = self.stored.stamp
         if self.warden is not None or self._said >= stamp:
             return []
@@ -170,7 +170,7 @@ class Member:
             self._take_charge(now_ns)
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """As warden: what is granted by the tables that are on file now."""
+        """As warden: takes acknowledgements, and grants by the tables that are on file now."""
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq)
@@ -187,9 +187,9 @@ class Member:
         return []
 
     def _hear_same(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """A warden tells the table again that it has told before. Whoever has it answers as if it had come whole;
-        whoever has an older one says so, and is told the whole. That one is silent who has a newer one: two that
-        both answered would never end."""
+        """Handles a warden's repetition of a table by its number. A member that has it replies as if it had come
+        whole; one with an older table says so, and gets the whole. A member with a newer one is silent: two that
+        both reply would never end."""
         stamp = (stored.epoch, stored.seq)
         if stored.epoch < self.promised:
             return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
@@ -231,7 +231,7 @@ class Member:
 
     def _lead(self, warden: Warden, now_ns: int) -> list[MemberAction]:
         if self._others and now_ns - self._acked_ns > LEASE_NS:
-            self.warden = None  # nobody hears us, or we hear nobody: leave it to the others
+            self.warden = None  # no messages arrive in one direction: leave it to the others
             self._led(now_ns, self._me)
             return []
         actions: list[MemberAction] = [Refused(text) for text in warden.refused]
@@ -242,7 +242,8 @@ class Member:
                 self.stored = table
                 self._told = [*self._told[-_TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
-            # What both others have on file needs no more than its number: at rest tables were a fifth of all bytes.
+            # A table on file with both others needs no more than its number: at rest tables were a fifth of all
+            # bytes.
             answered = now_ns - self._acked_ns < 2 * BEAT_NS
             known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
             actions.append(self.on_file if known and answered else table)
@@ -256,7 +257,7 @@ class Member:
             self.warden = Warden(self._plots, self._me, self._claimed, newest, self._fleets)
             self._told = []
             self._acked_ns = now_ns
-            # Once in an epoch: a promise that comes again after the warden has resigned must not begin it anew.
+            # Once in an epoch: a promise that is repeated after the warden has resigned must not restart it.
             self._claimed, self._promises = 0, {}
 
     def _promise(self, epoch: int) -> None:

@@ -1,10 +1,10 @@
-"""Who moves where: priority inheritance with backtracking (Okumura et al., 2019 and 2022), for vehicles that need
+"""Order of moves: priority inheritance with backtracking (Okumura et al., 2019 and 2022), for vehicles that need
 different times for their steps.
 
-The vehicle of the highest priority takes the best cell that it can get. Where another stands there, that one is
-planned next, with the priority that it inherits, and must go anywhere else; if it cannot, the first takes its
-second best. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places
-and none go around in a ring.
+The vehicle of the highest priority takes the best cell that it can get. If another vehicle is there, that one is
+planned next, with the inherited priority, and must go anywhere else; if it cannot, the first takes its second
+choice. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places and
+none go around in a ring.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Round:
     """One round of planning in one plot.
 
     movers  all that are at rest
-    closed  whether a cell stays occupied, whatever is planned
+    closed  whether a cell stays occupied under any plan
     inside  whether a cell belongs to the plot
 
     to      vehicle -> the cell that it is to go to; its own if it stays
@@ -60,7 +60,7 @@ class Round:
             self._plan(mover, mover.age, pushed=False)
 
     def _plan(self, mover: Mover, age: int, pushed: bool) -> bool:
-        """Whether the mover leaves its cell, or may stay."""
+        """Returns True if the mover leaves its cell, or may stay."""
         self._chain.add(mover.cell)
         found = self._take_one(mover, age, pushed)
         self._chain.discard(mover.cell)

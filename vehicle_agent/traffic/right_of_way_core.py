@@ -1,7 +1,7 @@
 """One agent's part in right of way: its seats among the members of plots, and the cells that its own vehicles hold.
 
-Messages and time in, actions out. The shell performs actions in their order: what is saved must be on file before
-what follows is said.
+Messages and time in, actions out. The shell performs actions in their order: a saved file must be on disk before
+later messages are sent.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from vehicle_agent.traffic.member import Member, MemberAction, Refused
 
 
 class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What an agent keeps on file about itself and the others' files.
+    """An agent's record about itself and the others' files.
 
     disk      names this file: a number drawn when it was made
     lives     the agent's lives that have run on it, the last ones
-    noted     agent -> its file, the first that we were told of
+    noted     agent -> its file, the first that we received
     noted_by  the agents that have noted ours
     plot_cells  side of the plots of which this file holds promises, if it holds any
     """
@@ -52,8 +52,8 @@ class RightOfWay:
 
     host      our part as a host of vehicles
     holdings  which cells our vehicles hold: none before `begin`
-    silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
-              our vehicles hold and are granted does not depend on it
+    silent    whether our file cannot be written now: then we are no member of any plot, and note no other agent's
+              file. Our vehicles' held and granted cells do not depend on it
 
     Raises StoreError if the file holds promises of plots of another size: the same cells would be granted twice.
     """
@@ -70,7 +70,7 @@ class RightOfWay:
     ) -> None:
         self.agent = agent
         self.plots = plots
-        if not (saved or own.noted or own.noted_by):  # nobody builds on it: it takes any size
+        if not (saved or own.noted or own.noted_by):  # no vehicle depends on it: it takes any size
             own = replace(own, plot_cells=plots.side)
         elif own.plot_cells != plots.side:
             raise StoreError(
@@ -90,9 +90,9 @@ class RightOfWay:
 
     @property
     def settled(self) -> bool:
-        """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file (a
-        guest's nobody notes; it has to hear of its plots), and no later life leaves it to us to say, wherever cells
-        of ours are shut, that we have stopped."""
+        """True if no recovery query about us is pending: we live, all other agents have noted our file (a guest's
+        is not noted; it has to know its plots), and no later life leaves it to us to state, wherever cells of ours
+        are shut, that we have stopped."""
         noted = self.host.informed if self._is_guest else len(self.own.noted_by) >= len(self._spawns) - 1
         return self.holdings.life > 0 and noted and not self.holdings.replaced
 
@@ -100,7 +100,7 @@ class RightOfWay:
         """Another agent has begun a life. The last action is what to answer.
 
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
-        first. A guest never has a seat: of its file nothing is noted, and it is told who has one.
+        first. A guest never has a seat: its file is not noted, and it receives the list of seats.
         """
         if request.layer != self.plots.layer or request.agent in self.plots.others:
             return []
@@ -143,7 +143,7 @@ class RightOfWay:
 
     @property
     def _has_quorum(self) -> bool:
-        """Whether we know that this run has plots of our size."""
+        """Returns True once the run has confirmed this plot size."""
         return self.plots.has_quorum({self.agent, *self.own.noted_by})
 
     def _known_of(self, agent: str, disk: int) -> Known:
@@ -202,7 +202,7 @@ class RightOfWay:
     # --- time passes ----------------------------------------------------------------------------------------
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
-        """What our members and our vehicles have to say now."""
+        """Returns the messages of our members and our vehicles to send now."""
         actions: list[Action] = [Refused(text) for text in self.holdings.refused]
         self.holdings.refused.clear()
         for member in () if self.silent else self._members.values():
@@ -215,8 +215,8 @@ class RightOfWay:
         return actions
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
-        """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
-        not known to be the first, and what was promised in the first is not in it; or while agents of plots of
+        """Returns our seat in a plot. None if we have none, or the other members have not all noted our file: then
+        it is not known to be the first, and promises in the first are not in it; or while agents of plots of
         another size could have seats."""
         if self.silent:
             return None

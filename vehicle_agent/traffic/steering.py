@@ -1,4 +1,4 @@
-"""Where each vehicle would go next: what a host asks of wardens for it."""
+"""Next cells of each vehicle: a host's requests to wardens for it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
 _SHORTEST_CUT = 0.5
-"""Where steps cost by what they climb: by how much any cell but the route's next is better than to stay, in cells.
-Planners know better than hosts what steps cost, so it is less than for the next; but more than for the next with a
-vehicle on it."""
+"""With direction-dependent costs: advantage of any cell but the route's next over staying, in cells. Planners know
+better than hosts what steps cost, so it is less than for the next; but more than for the next with a vehicle on
+it."""
 _DIAGONAL = math.sqrt(2.0) - 1.0
 _OCCUPIED = 0.9
-"""What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
+"""Cost of pushing another vehicle, in cells: less than a step, so that a vehicle without another path pushes."""
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
@@ -41,11 +41,11 @@ class Steering:
 
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
-    bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
+    bodies       vehicles without right of way: their cells are passed like lethal ones, but by routes
     climb        says which steps are too steep; None if none is
 
-    waiting_ns   vehicle -> the cell on which it waits, and since when; whoever lets it go on deletes it
-    ways_out     cell that only an operator's zone closes -> steps from there out of it: who stands there leaves
+    waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on
+    ways_out     cell that only an operator's zone closes -> steps from there out of it: a vehicle there leaves
     """
 
     def __init__(
@@ -69,11 +69,12 @@ class Steering:
         self.waiting_ns: dict[str, tuple[int, int]] = {}
 
     def closed(self, cell: int) -> bool:
-        """Whether a cell is lethal, or a body closes it."""
+        """Returns True if a cell is lethal, or a body closes it."""
         return cell in self._shut or not math.isfinite(self._pace.item(cell))
 
     def passable(self, tail: int, head: int) -> bool:
-        """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
+        """Returns True if the map allows the step between two neighbours; a diagonal also needs the cells beside
+        it."""
         if tail in self.ways_out:
             return head in self._out_of(tail)
         if self.closed(head) or not (self._climb is None or self._climb.allows(tail, head)):
@@ -85,8 +86,8 @@ class Steering:
         return not (self.closed(tail + col) or self.closed(tail + rows * cols))
 
     def passable_steps(self, cells: Sequence[int]) -> int:
-        """How many steps along some cells, each next to the one before, the map allows. Bodies count for none: they
-        may be gone before the vehicle is there."""
+        """Returns the number of leading steps of `cells` that the map allows. Bodies count for none: they may be
+        gone before the vehicle is there."""
         if len(cells) < 2:
             return 0
         at = np.array(cells, np.int64)
@@ -95,8 +96,8 @@ class Steering:
         if not self._corner_cutting:
             cols = at % self._grid.cols
             east = cols[1:] - cols[:-1]
-            # Beside a straight step are its own two cells. That it leaves a lethal one matters to diagonals only;
-            # of all steps but the first it is the head of one before, which ends the route there anyway.
+            # Beside a straight step are its own two cells. Leaving a lethal cell matters to diagonals only; for all
+            # steps but the first it is the head of the previous one, which ends the route there anyway.
             beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[heads - east])
             beside[0] &= cols[0] != cols[1] and cells[0] // self._grid.cols != cells[1] // self._grid.cols
             lethal |= beside
@@ -115,8 +116,8 @@ class Steering:
         in_reach: Callable[[str | None, int], bool],
         lot: int,
     ) -> Wish:
-        """What to ask for a vehicle that holds these cells. Depends on nothing but its arguments, on ground and
-        bodies near the vehicle, and on `ways_out`.
+        """Returns the request for a vehicle that holds these cells. Depends on nothing but its arguments, on ground
+        and bodies near the vehicle, and on `ways_out`.
 
         pushed_ms  the age with which it is to make way into another plot; 0 if it is not
         age_ms     for how long it has been on its way
@@ -163,12 +164,12 @@ class Steering:
         return Wish(ahead, wants, len(wants) if pushed_ms else better, age_ms)
 
     def threatened(self, cell: int) -> bool:
-        """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
+        """Returns True if a body is on a cell or approaches it: a vehicle there makes way before all others."""
         return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
 
     def blocked(self, vehicle: Vehicle, now_ns: int) -> bool:
-        """Whether one that holds no cell but its own stands though its route goes on. Asks for another route after
-        a while."""
+        """Returns True if a vehicle that holds no cell but its own is at rest though its route goes on. Asks for
+        another route after a while."""
         if vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
             self.waiting_ns.pop(vehicle.id, None)
             return False
@@ -203,8 +204,8 @@ class Steering:
         return [each for each in around if self.passable(cell, each)]
 
     def _is_one_way(self, tail: int, head: int) -> bool:
-        """Whether a step between neighbours could not be taken back, as it is too steep the other way: it may lead
-        where no way leads out."""
+        """Returns True if a step between neighbours could not be reversed, as it is too steep the other way: it may
+        lead into a dead end."""
         return self._climb is not None and not self._climb.allows(head, tail)
 
     def _costs(
@@ -212,8 +213,8 @@ class Steering:
     ) -> tuple[dict[int, float], Container[int]]:
         """(cost-to-go of each cell to which one may drive, those that are the last resort).
 
-        Where steps cost by what they climb nothing is better than the next cell of the route, unless somebody is
-        there, and steps beside it that could not be taken back are for those who must make way only.
+        With direction-dependent costs the next cell of the route is best, unless it is occupied, and steps beside
+        it that could not be reversed are for vehicles that must make way only.
         """
         cost = {cell: self._cost(cell, route) for cell in self.steps(here)}
         if self._climb is None:
@@ -232,8 +233,8 @@ class Steering:
     def _cost(self, cell: int, route: Sequence[tuple[int, int, int, float]]) -> float:
         """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it.
 
-        Where steps cost by what they climb a route winds, beside cells of its own to which a step is too steep or
-        too dear. Then a cell of it costs what is left of it, so that the next one is always better than to stay.
+        With direction-dependent costs a route winds, beside cells of its own to which a step is too steep or too
+        expensive. Then a cell of it costs its remainder, so that the next one is always better than to stay.
         """
         row, col = divmod(cell, self._grid.cols)
         best = math.inf

@@ -1,7 +1,7 @@
 """The warden of a plot: it grants cells to vehicles, and frees them only by their host's own word.
 
-No cell is in two vehicles' grants; a grant is never revoked. So whoever obeys a table that a majority has stored is
-alone on its cells (see decision 25 for the proof).
+No cell is in two vehicles' grants; a grant is never revoked. The vehicle with a table that a majority has stored is
+therefore alone on its cells (see decision 25 for the proof).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from vehicle_agent.traffic.grants import Grants, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
-"""Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
+"""Vehicles of a host that is silent for this time are obstacles: no vehicle waits for them or pushes them."""
 _AGE_BITS = 12
 """Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
 the older most of the time, or each lets its own wait for the other (decision 25)."""
 _TOLD_AGAIN_NS = 3 * BEAT_NS // 4
-"""A host is told the same again after so long: somewhat less than a beat, so that a beat tells it."""
+"""Interval at which an unchanged grant is repeated: somewhat less than a beat, so that a beat carries it."""
 MOST_GUESTS = 256
 """Guests that one plot has ever known: their lives stay in its table, as those of all hosts (decision 40)."""
 MOST_CELLS_OF_GUEST = 1024
@@ -37,18 +37,18 @@ MOST_CELLS_OF_GUESTS = 1 << 14
 _NO_CELLS: Sequence[int] = []
 _NO_GRANTS: Mapping[str, list[int]] = {}
 _MOST_CELLS = 64
-"""Of one vehicle: what a `Grant` has room for."""
+"""Limit for one vehicle: the largest `Grant`."""
 
 
 def _turn(stand: Stand) -> tuple[int, int, str]:
-    """Who goes first: the older; of one age, another one in each step of it. By name, those of the last agent would
-    always give way where many are of one age, as all are who began the run together."""
+    """Returns the priority: the older first; of one age, another one in each step of it. By name, those of the last
+    agent would always give way where many are of one age, as all are who began the run together."""
     step = stand.age_ms >> _AGE_BITS
     return -step, _lot(stand.vehicle, step), stand.vehicle
 
 
 def _is_entering(stand: Stand) -> bool:
-    """Whether it stands nowhere yet, as far as right of way knows, and asks for its first cell."""
+    """Returns True if the vehicle holds no cell and requests its first."""
     return not stand.holds and stand.ahead[:1] == [stand.cell]
 
 
@@ -58,20 +58,20 @@ def _lot(vehicle: str, step: int) -> int:
 
 
 def _rests(stand: Stand, cells: Sequence[int]) -> bool:
-    """Whether a vehicle stands, with nothing granted to it but where it does."""
+    """Returns True if a vehicle is at rest, with nothing granted to it but its cell."""
     return stand.cell == stand.end and (not cells or cells == [stand.cell])
 
 
 @dataclass(slots=True)
 class _Host:
-    """What was heard of a host.
+    """Known state of a host.
 
     standing  the newest of its newest life, and when it came; None if none counts
-    stands    of that, vehicle -> what is said of it, of the vehicles that the host may speak for
-    asking    those of them that stand, or would go further than they are granted; whoever else is under way wants
-              nothing now
-    spoke_ns  when anything came, of any of its lives: one that is replaced is told so
-    told      what was granted to it last, and when
+    stands    of that, vehicle -> its stand, for vehicles that the host may speak for
+    asking    those of them that are at rest, or request more than they are granted; other vehicles under way
+              request nothing now
+    spoke_ns  time of the last message, of any of its lives: a replaced one is informed
+    told      the last grant to it, and its time
     """
 
     spoke_ns: int
@@ -152,10 +152,10 @@ class Warden:
         # Only now: a life that is itself replaced and has not stopped must not open what a vehicle may stand on.
         self._enter_again(standing, self._open(standing))
         if standing.life in standing.dead:
-            self._shut[host, standing.life] = []  # nobody drives by it: its successor need not wait
+            self._shut[host, standing.life] = []  # no host has acted on it: no need to wait
 
     def _open(self, standing: Standing) -> set[int]:
-        """Open what is shut for lives that are proved to have ended. Returns the cells."""
+        """Opens cells that are shut for lives that are proved to have ended. Returns the cells."""
         opened: set[int] = set()
         for dead in standing.dead:
             cells = self._shut.pop((standing.agent, dead), None)
@@ -180,18 +180,18 @@ class Warden:
                 self._granted = True
 
     def _is_welcome(self, host: str) -> bool:
-        """Whether there is room for this host: for each of the scenario, and for so many guests."""
+        """Returns True if there is room for this host: for each of the scenario, and for a number of guests."""
         if host in self._fleets or host in self._lives or host in self._hosts:
             return True
         known = self._lives.keys() | self._hosts.keys()
         return len(known - self._fleets.keys()) < MOST_GUESTS
 
     def _is_of(self, vehicle: str, host: str) -> bool:
-        """Whether a vehicle is one that the host may speak for."""
+        """Returns True if the host may speak for a vehicle."""
         return vehicle in self._fleets[host] if host in self._fleets else agent_of(vehicle) == host
 
     def _stands_of(self, standing: Standing) -> dict[str, Stand]:
-        """Vehicle -> what is said of it, of those that the host may speak for."""
+        """Returns vehicle -> its stand, for vehicles that the host may speak for."""
         fleet = self._fleets.get(standing.agent)
         if fleet is None:
             return {each.vehicle: each for each in standing.vehicles if agent_of(each.vehicle) == standing.agent}
@@ -214,8 +214,8 @@ class Warden:
             self._granted = True
 
     def _succeed(self, host: str, before: int) -> None:
-        """A new life of a host speaks. What the one before it was granted stays shut until that is known to have
-        ended; the new one is granted the same cells, and has to see that before it can give any back."""
+        """A new life of a host speaks. Cells granted to the life before it stay shut until that is known to have
+        ended; the new one is granted the same cells, and has to see that before it can release any."""
         mine = self._granted_to(host)
         if (host, before) in self._shut:
             del self._shut[host, before]
@@ -242,8 +242,8 @@ class Warden:
     # --- what is granted ------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> Table | None:
-        """Grant what can be granted. Returns the table if somebody waits for what is new in it, or once in a beat:
-        the same as before if nothing has changed."""
+        """Grants all possible requests. Returns the table if a host waits for a change in it, or once in a beat:
+        the same as before if it is unchanged."""
         self._plan(now_ns)
         if not self._granted and now_ns - self._told_ns < BEAT_NS:
             return None
@@ -267,7 +267,8 @@ class Warden:
         )
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
-        """What a table says to each host that has spoken lately, where it is new or the last word is a beat old."""
+        """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
+        beat old."""
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
@@ -280,7 +281,7 @@ class Warden:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
             grants = dict(grants_of.by_host.get(name, _NO_GRANTS))
-            # Also around those under way: what they want once they come to rest depends on who is there.
+            # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
             others = held.difference(grants_of.cells.get(name, ())) | shut
             near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
@@ -309,7 +310,7 @@ class Warden:
             for host in self._hosts.values()
             if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
         ]
-        # Whoever has been on its way for longest first.
+        # The vehicle that has been on its way for longest goes first.
         asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
         shut = {cell for cells in self._shut.values() for cell in cells}
         held = ChainMap(self._grants.holders, dict.fromkeys(shut, ""))
@@ -318,7 +319,7 @@ class Warden:
         for stand in asking:
             cells = self._grants.cells_of(stand.vehicle)
             if not cells and _is_entering(stand):
-                continue  # nobody makes way for it
+                continue  # no vehicle makes way for it
             if _rests(stand, cells):
                 movers[stand.vehicle] = Mover(
                     stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
@@ -345,10 +346,10 @@ class Warden:
             self._granted = True
 
     def _stays(self, cell: int, stands: Mapping[str, Stand]) -> bool:
-        """Whether a cell stays occupied, whatever is planned. Whoever wants one that a vehicle under way will leave
-        may wait for it; one that stands can be pushed.
+        """Returns True if a cell stays occupied under any plan. A vehicle may wait for a cell that another under
+        way will leave; one at rest can be pushed.
 
-        stands  vehicle -> what is said of it, by the hosts that have spoken lately
+        stands  vehicle -> its stand, by the hosts that have spoken lately
         """
         vehicle = self._grants.holders.get(cell)
         if vehicle is None:
@@ -381,7 +382,8 @@ class Warden:
             self._granted = True
 
     def _guest_may_hold_more(self, vehicle: str) -> bool:
-        """Whether neither this guest nor all together hold their share; true of vehicles of the scenario."""
+        """Returns True if neither this guest nor all together hold their share; true of vehicles of the
+        scenario."""
         host = agent_of(vehicle)
         if host in self._fleets:
             return True
