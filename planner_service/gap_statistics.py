@@ -1,4 +1,4 @@
-"""How far from optimal routes are: statistics of one planner. Pure.
+"""Statistics of one planner about the gap of its routes to the optimum. Pure.
 
 certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
 gap_excess            measured at full growths: driven cost over optimum of what the tree offered each follower
@@ -33,7 +33,7 @@ Gaps = NDArray[np.float64]
 
 
 class GapStatistics:
-    """What was measured of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
+    """Measured gaps of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
 
     def __init__(
         self, grid: GridSpec, config: PlannerConfig, counters: Counters, climb: Climb | None = None

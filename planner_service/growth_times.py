@@ -1,4 +1,5 @@
-"""What growing a tree takes, and what follows: the row in force, and what may be grown between answers."""
+"""Times of full searches, and their consequences: the strategy row in force, and the size of searches between
+answers."""
 
 from __future__ import annotations
 
@@ -20,33 +21,33 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
 MODEL_NS_PER_CELL = 15
-"""What a full growth costs per cell, for choices that must come out alike on every machine."""
+"""Model cost of a full search per cell, for choices that must be the same on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
 MODEL_PIECES_NS_PER_ROW = 5_000
 """The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096. It counts
 until a move has been measured."""
 PIECES_CELLS = 1 << 18
-"""Maps of so many cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as by the
-parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
+"""Maps of this number of cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as
+by the parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
 INLINE_NS = 100_000_000
-"""What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
-takes less, and where there is a worker, so is any other."""
+"""Longer work does not belong on the thread that answers: a forced range is searched immediately if a full search
+takes less, and with a worker, so is any other."""
 FINE_SHARE = 16
-"""How far the fine windows of multi-resolution reach, as a share of the map's side."""
+"""Reach of the fine windows of multi-resolution, as a share of the map's side."""
 
 _TICKS = 32
-"""Over so many is averaged how often the target moves, and the row is chosen anew where that has changed by: """
+"""Number of ticks for the average rate of target moves, and the change of it at which the row is chosen again: """
 _NOTICED = 0.05
 """Moves per tick, far below what makes another row the better one."""
 
 _MEDIAN_OF = 5
-"""Of the last so many times the median counts: single ones take longer, as after a change of processors, or to cut
-a tree into pieces."""
+"""Number of recent times whose median counts: single ones take longer, as after a change of processors, or to cut a
+tree into pieces."""
 
 
 def is_slow_to_grow(grid: GridSpec) -> bool:
-    """Whether a whole tree of this grid is nothing to be grown between two answers."""
+    """Returns True if a whole tree of this grid takes too long to be searched between two answers."""
     return grid.cells * MODEL_NS_PER_CELL > INLINE_NS
 
 
@@ -70,10 +71,10 @@ class GrowthTimes:
             self.exact_ns = math.isqrt(grid.cells) * MODEL_PIECES_NS_PER_ROW
         self.row = StrategyRow(OnMove.WHOLE_TREE)
         self.narrowest = 4 << config.k_min
-        """How far the narrowest scheduled window reaches, in cells."""
+        """Half width of the narrowest scheduled window, in cells."""
         self.fine = max(FINE << config.k_min, 1 << LEAST)
-        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
-        where that is half of it there are no others."""
+        """Distance up to which strides are so short that all cells are searched, in cells: no less than the least
+        block. On a map where that is half of it there are no others."""
         self.budget_ns = config.cpu_budget * 1e9 / config.tick_hz
         """CPU time that a tick may take. Written by `set_budget`."""
         self._tick_hz = config.tick_hz
@@ -82,7 +83,7 @@ class GrowthTimes:
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
-        """Of the last `_TICKS` ticks or so; what it was when the row was chosen."""
+        """Of the last `_TICKS` ticks or so; its value when the row was chosen."""
         self._ticks = 0
         self._choose()
 
@@ -92,18 +93,18 @@ class GrowthTimes:
         self._choose()
 
     def rest_ns(self, took_ns: int) -> int:
-        """How long after such work none like it may begin, so that it takes no more than the budget."""
+        """Returns the pause after such work before the next, so that it takes no more than the budget."""
         return int(took_ns * 1e9 / (self.budget_ns * self._tick_hz))
 
     def note_tick(self, moved: bool) -> None:
-        """Whether the target has moved since the last tick: one that stands may have a dearer tree."""
+        """Notes whether the target has moved since the last tick: one at rest may have a more expensive tree."""
         self._ticks = min(self._ticks + 1, _TICKS)
         self._moves_per_tick += (moved - self._moves_per_tick) / self._ticks
         if abs(self._moves_per_tick - self._chosen_at) > _NOTICED:
             self._choose()
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took; not one that found networks too. A simulation does not call it."""
+        """Notes the time of a full search; not of one that found networks too. A simulation does not call it."""
         median_ns = _median_with(self._full_took_ns, took_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
@@ -114,7 +115,7 @@ class GrowthTimes:
         self._choose()
 
     def observe_exact_ns(self, took_ns: int) -> None:
-        """What an exact move really took, without the repair before it."""
+        """CPU time (ns) of an exact update, without the preceding repair."""
         if self.in_pieces and not self._exact_took_ns:
             # One slow move, such as the first after a growth, gives up no tree: another one takes a second.
             self._exact_took_ns.extend([int(self.exact_ns)] * 2)
@@ -131,7 +132,7 @@ class GrowthTimes:
         self.row = self._chosen_by.row(times)
 
     def widest(self, rule: WidestWindow) -> int:
-        """How far the widest window reaches that is grown without a worker, in cells."""
+        """Half width of the widest window that is searched without a worker, in cells."""
         if rule is WidestWindow.SHARE_OF_MAP:
             side = max(self._grid.rows, self._grid.cols)
             return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
@@ -140,22 +141,23 @@ class GrowthTimes:
         return math.isqrt(int(share * self._grid.cells)) // 2
 
     def is_quick(self, cells: int) -> bool:
-        """Whether so many cells may be grown on the thread that answers."""
+        """Returns True if this number of cells may be searched on the thread that answers."""
         return not self._has_worker or cells * self.full_ns <= INLINE_NS * self._grid.cells
 
     @staticmethod
     def is_short(took_ns: float) -> bool:
-        """Whether work of so long holds up no answer for long."""
+        """Returns True if work of this length holds up no answer for long."""
         return took_ns <= INLINE_NS
 
     @property
     def model_ns(self) -> int:
-        """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
+        """Returns the model time of one full search in a simulation: a constant per cell, the same on every
+        machine."""
         return self._grid.cells * MODEL_NS_PER_CELL
 
     @property
     def mends_quickly(self) -> bool:
-        """Whether the whole tree may be made exact on the thread that answers."""
+        """Returns True if the whole tree may be made exact on the thread that answers."""
         return not self._has_worker or self.is_short(self.exact_ns)
 
 
@@ -168,9 +170,9 @@ def _median_with(took_ns: deque[int], newest_ns: int) -> int:
 class WindowSchedule:
     """Windows of doubling width, each of which is due once the target has come a share of that width.
 
-    Routes are as old as the widest window that they begin in. What the target has moved since matters in proportion
-    to how far away it is: a window that reaches `AHEAD` times as far keeps that small at every distance, and costs
-    64 cells of growth per cell of its width and move.
+    Routes are as old as the widest window that they begin in. Moves of the target since a cell's search matter in
+    proportion to its distance. A window that reaches `AHEAD` times as far keeps that small at every distance, and
+    costs 64 cells of search per cell of its width and move.
 
     half  of the narrowest window, cells to every side; one that narrow is grown with every move
     """
@@ -178,12 +180,12 @@ class WindowSchedule:
     def __init__(self, grid: GridSpec, half: int) -> None:
         self._grid = grid
         self._half = half
-        # Where the target stood when the whole tree was last grown, and when each width was: narrowest first.
+        # Cell of the target at the last full search, and at the last window of each width: narrowest first.
         self._whole = 0
         self._centres = [0] * max((max(grid.rows, grid.cols) // half).bit_length(), 1)
 
     def half(self, cell: int, widest: int) -> int:
-        """How far the window around a target that came to `cell` should reach, at most `widest` unless the
+        """Returns the half width of the window around a target that came to `cell`, at most `widest` unless the
         narrowest is wider. No window is ever narrower than the way since one so wide, so that windows overlap."""
         found = self._half
         for doublings, centre in enumerate(self._centres):
@@ -195,12 +197,12 @@ class WindowSchedule:
         return found
 
     def beyond(self, cell: int, widest: int) -> bool:
-        """Whether what lies beyond a window of `widest` cells is due to be renewed: when a window twice as wide
-        would be."""
+        """Returns True if cells beyond a window of `widest` cells are due: when a window twice as wide would be."""
         return AHEAD * self._grid.distance_cells(self._whole, cell) >= 2 * widest
 
     def note_grown(self, cell: int, half: int) -> None:
-        """A window of `half` cells to every side of `cell` was grown: all widths up to it begin anew."""
+        """Notes that a window of `half` cells to every side of `cell` was searched: all widths up to it start
+        again."""
         if half >= max(self._grid.rows, self._grid.cols):
             self._whole = cell
         for doublings in range(len(self._centres)):
@@ -209,34 +211,34 @@ class WindowSchedule:
 
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
-    """How far, in cells, the window of variable range reaches to every side (section 3.3.2).
+    """Returns the half width, in cells, of the window of variable range (section 3.3.2).
 
-    With the largest k >= k_min of which the target crossed the border of a block of 2**k cells the window is
+    With the largest k >= k_min for which the target crossed the border of a block of 2**k cells the window is
     2**(k+2) + 1 cells wide, without any 2**(k_min+1) + 1 as in figure 3: 9 cells with k_min = 2. The printed rule
     asks that row and column cross at once, which a move along an axis never does; here either is enough. At least
     twice as far as the move was long, so that the window holds both cells and some room around them.
     """
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)
-    # Of numbers that differ, the highest bit in which they do is the largest block whose border was crossed.
+    # Of numbers that differ, their highest differing bit is the largest block whose border was crossed.
     k = ((row ^ old_row) | (col ^ old_col)).bit_length() - 1
     half = 2 << k if k >= k_min else 1 << k_min
     return max(half, 2 * grid.distance_cells(old, new))
 
 
 def exact_half(grid: GridSpec, old: int, new: int) -> int:
-    """How far, in cells, the window of an exact move reaches to every side.
+    """Returns the half width, in cells, of the window of an exact move.
 
-    Near the root the ways of whole trunks change, which a window finds at the cost of a growth, a cell of it; what
-    it does not find costs several times as much a cell, but nobody's exactness. Measured on four elevation models
-    and made-up terrain of 512 to 2048 cells a side.
+    Near the root the paths of whole trunks change, which a window finds at the cost of a search per cell; changes
+    beyond it cost several times as much a cell, without harm to exactness. Measured on four elevation models and
+    made-up terrain of 512 to 2048 cells a side.
     """
     side = min(grid.rows, grid.cols)
     return max(16, min(side // 12, 64), 2 * grid.distance_cells(old, new))
 
 
 class WindowLimit:
-    """How far a tree is grown when its target moves, and when all of it is due, by what was grown before.
+    """Extent of the search when the target moves, and the time of a full search, from earlier times.
 
     moves  of the target since the whole tree was last exact. The owner counts them
     """
@@ -260,8 +262,8 @@ class WindowLimit:
         self._schedule.note_grown(cell, half)
 
     def after_move(self, row: StrategyRow, old: int, new: int, has_network: bool) -> tuple[int, int]:
-        """How far to every side of the target all cells are grown now, and how far strides are: no further where
-        both are the same."""
+        """Returns the half width in which all cells are searched now, and that of strides: no further if both are
+        the same."""
         fine = self._times.fine
         has_strides = row.thins_far_cells and has_network and 4 * fine <= self._side
         least = 2 * self._grid.distance_cells(old, new)
@@ -275,6 +277,6 @@ class WindowLimit:
         return half, half
 
     def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
-        """Whether the whole tree is due to become exact, which takes so long."""
+        """Returns True if the whole tree is due to become exact, which takes this time."""
         within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
         return row.full_growth is FullGrowth.WITHIN_BUDGET and within_budget

@@ -46,7 +46,7 @@ from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes
 
 Kernel = Any
-"""What `kernels.compile.kernel` makes; numba has no types."""
+"""Result of `kernels.compile.kernel`; numba has no types."""
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
@@ -61,8 +61,8 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     cell_costs.block_ranges,
     cell_costs.count_classes,
 )
-"""Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
-takes longest comes first, so that builders end together."""
+"""Kernels for full searches, for updates to the map by full searches, and for certified routes. The slowest to
+compile comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
     costs_from_parents.mend,
@@ -98,7 +98,7 @@ _BUILDERS = "builders.lock"
 
 @dataclass(frozen=True, slots=True)
 class NeededKernels:
-    """What planners call, none of them twice. Whoever compiles for them and they themselves go by the same.
+    """Kernels that planners call, none of them twice. Builders and planners use the same list.
 
     first    until the first route of the class "ground" is served
     classes  beside these, until the first route of any other class is
@@ -115,7 +115,8 @@ class NeededKernels:
 
 
 def needed_kernels(scenario: Scenario) -> NeededKernels:
-    """What the planners of a scenario call. Its ground may be of one kind, and a class that flies of the other."""
+    """Returns the kernels that the planners of a scenario call. Its ground may be of one kind, and a class that
+    flies of the other."""
     ground = scenario.cost.directional
     aloft = bool(aloft_classes(scenario))
     pulled = scenario.planner.routes == "pulled"
@@ -126,7 +127,7 @@ def needed_kernels(scenario: Scenario) -> NeededKernels:
 
 
 def all_kernels() -> list[Kernel]:
-    """Those of planners on any map, each once: what is asked for more often comes first."""
+    """Returns the kernels of planners on any map, each once: those needed more often come first."""
     return [*chain(*_once(*(_of_kind(part, kind) for part in (FIRST, LATER, [PULL]) for kind in (False, True))))]
 
 
@@ -154,17 +155,17 @@ def name_of(kernel: Kernel) -> str:
 
 
 def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
-    """Those that this process cannot call yet without compiling."""
+    """Returns the kernels that this process cannot call yet without compiling."""
     return [kernel for kernel in kernels if not load(kernel, compiling=False)]
 
 
 def can_build() -> bool:
-    """Whether what a builder compiles can be found by others."""
+    """Returns True if the output of a builder can be found by others."""
     return cache_folder() is not None
 
 
 def load_what_is_there() -> None:
-    """Make ready what is on disk; or all, compiled here, where nothing can be kept."""
+    """Loads the kernels on disk; or compiles all here, if none can be kept."""
     if can_build():
         missing(all_kernels())
     else:
@@ -196,7 +197,8 @@ def build(kernels: Iterable[Kernel], tell: Callable[[Kernel], None] = lambda _: 
 
 @contextlib.contextmanager
 def _locked(path: Path, how: int, remove: bool = True) -> Iterator[bool]:
-    """Whether the lock was got. A file that is removed leaves two processes with a lock each, at worst."""
+    """Returns True if the lock was acquired. A file that is removed leaves two processes with a lock each, at
+    worst."""
     with path.open("wb") as file:
         try:
             fcntl.flock(file, how)
@@ -209,7 +211,7 @@ def _locked(path: Path, how: int, remove: bool = True) -> Iterator[bool]:
 
 
 def is_building() -> bool:
-    """Whether a builder is at work."""
+    """Returns True if a builder is at work."""
     folder = cache_folder()
     assert folder is not None
     with _locked(folder / _BUILDERS, fcntl.LOCK_EX | fcntl.LOCK_NB, remove=False) as alone:
@@ -231,17 +233,17 @@ class KernelLoader:
         self._missing = list(self._kernels)
         self._asked_s = -math.inf
         self.builders: list[subprocess.Popen[bytes]] = []
-        """Those that were started because nobody was compiling."""
+        """Builders that were started because no process was compiling."""
         self._thread = threading.Thread(target=self._load_rest, name="load-kernels", daemon=True)
 
     @property
     def complete(self) -> bool:
-        """Whether all may be called. Once true, it stays so."""
+        """True if all may be called. Once true, it stays so."""
         return not self._missing
 
     @property
     def classes_complete(self) -> bool:
-        """Whether whole trees of all classes may be grown, beside those of "ground". Once true, it stays so."""
+        """True if whole trees of all classes may be searched, beside those of "ground". Once true, it stays so."""
         if self._classes and self._missing:
             gone = {name_of(kernel) for kernel in self._missing}
             self._classes = [kernel for kernel in self._classes if name_of(kernel) in gone]
@@ -249,7 +251,7 @@ class KernelLoader:
         return True
 
     def load_first(self, tell: Callable[[str], None] = lambda _: None) -> None:
-        """Wait until a first route can be planned; what comes after it is loaded as it is there. `tell` is handed a
+        """Waits until a first route can be planned; later kernels are loaded as they appear. `tell` is handed a
         sentence now and then."""
         if not can_build():
             for kernel in self._kernels:
@@ -278,7 +280,7 @@ class KernelLoader:
             self._missing = missing(self._missing)
 
     def _have_built(self) -> None:
-        """See to it that somebody compiles what is missing."""
+        """Ensures that a process compiles the missing kernels."""
         now_s = time.monotonic()
         if now_s - self._asked_s > 20.0 and not is_building():
             self._asked_s = now_s

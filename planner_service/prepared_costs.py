@@ -1,4 +1,4 @@
-"""What the planners of one map on one machine have in common, in files of the run's folder.
+"""Shared data of the planners of one map on one machine, in files of the run's folder.
 
 One computes it, all map it. A file's name is the digest of all that it follows from, so that it cannot be another
 map's.
@@ -34,11 +34,11 @@ PREPARED_COSTS = ExternalCalls(
     calls={"load": np.ndarray | None, "claim": bool, "leave": None},
     fixed=("cell_cost",),
 )
-"""What a planner uses of them."""
+"""Calls of it that a planner uses."""
 
 
 _DIGEST_BYTES = 16
-"""As in names of kept terrains: no two arrays of one machine have the same by chance."""
+"""As in names of cached terrains: no two arrays of one machine have the same by chance."""
 Kept = Callable[[], str | None]
 
 
@@ -125,8 +125,8 @@ def _digest_of(packed: Bytes) -> Bytes:
 
 
 def _read(path: Path, dtype: type[np.generic], size: int | None) -> NDArray[Any] | None:
-    """None where the file is not there; a damaged one is as none, and is said. Of no given size: one that ends with
-    its digest, as kernels check no index that they read from it."""
+    """None where the file is not there; a damaged one is as none, and is said. The size is not given: the file ends
+    with its digest, as kernels check no index that they read from it."""
     try:
         found = open_array(path)
         if found.shape != (size or found.size,) or found.dtype != dtype:

@@ -1,7 +1,7 @@
 """The strategies by which a tree follows its target: one table, a row per strategy, in the terms of the paper.
 
-A row says what is grown when the target moves, how wide, when the whole tree is due, and whether far cells are
-thinned out. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
+A row gives the search after a move of the target, its width, the condition of a full search, and the thinning of
+far cells. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
 here, and its name in `swarm.config.setting_types.Strategy`, or a plug-in. Sections are those of Wan et al.
 """
 
@@ -19,11 +19,11 @@ from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
 
 AHEAD = 16
-"""A window reaches so many times as far as the target has come since one so wide was grown last."""
+"""A window reaches this multiple of the target's distance since the last one as wide."""
 
 
 class OnMove(Enum):
-    """What is grown when the target moves."""
+    """Search after a move of the target."""
 
     WHOLE_TREE = "whole tree"
     """Brute force, section 3.3.1: the exact tree, with every move."""
@@ -34,7 +34,7 @@ class OnMove(Enum):
     """Variable range, section 3.3.2: a window around the target, as wide as the largest block of 2**k cells whose
     border the target crossed."""
     SCHEDULED_WINDOW = "scheduled window"
-    """Ours: windows of doubling width, each grown anew once the target has come a 16th of its reach."""
+    """Ours: windows of doubling width, each searched again once the target has moved by a 16th of its reach."""
 
 
 class FullGrowth(Enum):
@@ -47,7 +47,7 @@ class FullGrowth(Enum):
 
 
 class WidestWindow(Enum):
-    """How wide a scheduled window gets before something else takes its place."""
+    """Largest width of a scheduled window before other work takes its place."""
 
     WHILE_CHEAPER = "while cheaper than a full growth"
     SHARE_OF_MAP = "a 16th of the map's side"
@@ -72,7 +72,7 @@ class StrategyRow:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the tree is exact after every move."""
+        """True if the tree is exact after every move."""
         return self.on_move in (OnMove.WHOLE_TREE, OnMove.EXACT_MOVE)
 
     def row(self, growths: Growths) -> StrategyRow:
@@ -82,7 +82,7 @@ class StrategyRow:
 
 @dataclass(frozen=True, slots=True)
 class Growths:
-    """What a strategy chooses by.
+    """Inputs of a strategy's choice.
 
     full_ns       CPU time that a full growth takes: a model's figure until one has been measured
     budget_ns     CPU time that a tick may take, by `planner.cpu_budget`
@@ -111,7 +111,7 @@ class Strategy(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StrategyWorld:
-    """What a strategy is made with.
+    """Arguments with which a strategy is made.
 
     target  id of the planner's target
     config  the planner's settings

@@ -1,8 +1,8 @@
-"""How the tree of one target follows it: what is grown when the target moves or the map changes.
+"""Update of one target's tree: the search after a move of the target or a change of the map.
 
-The strategy's row (`strategy.STRATEGIES`) says what is done, this module how. `TargetTree` has no thread, no clock
-and no bus: `full_job` returns the long work as a closure for a worker, `adopt` takes its result. Whatever happened,
-the tree that `routes` reads has no cycle and crosses no lethal cell.
+The strategy's row (`strategy.STRATEGIES`) selects the work, this module performs it. `TargetTree` has no thread, no
+clock and no bus: `full_job` returns the long work as a closure for a worker, `adopt` takes its result. In every
+state, the tree that `routes` reads has no cycle and crosses no lethal cell.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Kind = Literal["none", "full", "exact", "window", "repair", "coarse", "forced"]
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What one call changed.
+    """Changes by one call.
 
-    kind        the dearest thing that was done: nothing, the whole tree grown, the tree made exact by its parents,
-                a window, a repair after map changes, a window and strides beyond it, a window that was forced
+    kind        the most expensive work: none, full search, tree made exact by its parents, window, repair after map
+                changes, window and strides beyond it, forced window
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
     wants_full  please run `full_job` on a worker, and `adopt` what it returns
@@ -64,7 +64,7 @@ class Update:
 
 
 class State(Enum):
-    """Where a tree stands. Whether its target stands on a cell that can be led to is `TargetTree.ready`.
+    """State of a tree. `TargetTree.ready` states whether its target is on a cell that can be reached.
 
     =========  ===========================================  ====================================================
     state      what it means                                what ends it
@@ -85,7 +85,7 @@ class State(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """How a tree follows its target, decided before anything is done.
+    """Planned update of a tree, decided before any work.
 
     how   nothing; the whole tree, here or on the worker; an exact move; a window, and strides beyond it
     half  how far the window reaches to every side of the target, cells; 0 if it has not moved
@@ -107,10 +107,10 @@ class TargetTree:
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     chosen_by    the strategy; the built-in one that `config` names if not given
-    stopwatch    CPU time of this thread, ns, by which repairs are told from what follows them; none in a simulation
-    times        what growths take, to be told; by these the strategy chooses
-    last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
-                 last `adopt`; empty before
+    stopwatch    CPU time of this thread, ns, which separates repairs from later work; none in a simulation
+    times        times of searches, by which the strategy chooses
+    last_gaps    float64, driven cost over optimum of the offer to each followed vehicle, measured by the last
+                 `adopt`; empty before
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class TargetTree:
         self._all_kernels = all_kernels
         self._has_worker = has_worker
         self._stopwatch = stopwatch
-        # The cell costs of the map as it was last told, and whether it was told at all.
+        # The last known cell costs of the map, and whether there are any.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
         self._tree: AnyTree = CostToGoTree(self._costs)
@@ -149,12 +149,12 @@ class TargetTree:
 
     @property
     def ready(self) -> bool:
-        """Whether routes can be given; if not, every route's status is NO_TARGET."""
+        """True if routes can be given; if not, every route's status is NO_TARGET."""
         return self.target_cell is not None
 
     @property
     def cost_grid(self) -> CostGrid:
-        """The cell costs of the map as it was last told; its owner is this tree."""
+        """The last known cell costs of the map; its owner is this tree."""
         return self._costs
 
     @property
@@ -164,8 +164,8 @@ class TargetTree:
         return row if self._all_kernels() else whole_trees_only(row)
 
     def share(self, cell_cost: Floats) -> None:
-        """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is
-        told all changes since. Before the first `update`."""
+        """Begins with the cell costs of the map before any mark, which other processes share; `update` receives all
+        changes since. Before the first `update`."""
         self._costs.share(cell_cost)
         self._loaded = True
 
@@ -186,7 +186,7 @@ class TargetTree:
         return self._follow(target_cell, changes) if self._set_target(target_cell, changes) else Update("none")
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
-        """A full growth for a worker, on the map as it was told last: see `growth_job`."""
+        """Returns a full search for a worker, on the last known map: see `growth_job`."""
         leads_there = self.ready and self._state is not State.STALE and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
@@ -246,8 +246,8 @@ class TargetTree:
     def force(self, cells: Any) -> Update:
         """Force the range to cover these cells (section 3.3.2): what they get afterwards is the best there is.
 
-        Where growing the whole tree would hold up answers for long, a worker is asked to, and they get it when that
-        is adopted; until then, the best inside a window that holds them and the target, where that is quick enough.
+        If a full search would hold up answers for long, a worker does it, and they get their routes when that tree
+        is adopted; until then, the best inside a window that holds them and the target, if that is quick enough.
         """
         target = self.target_cell
         if not self.ready or target is None:
@@ -310,7 +310,8 @@ class TargetTree:
             self._bounds.forget()
 
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
-        """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
+        """Returns True if the target is on a cell to which a tree can lead. If not, the tree is stale as soon as
+        the map changes."""
         self.target_cell = target_cell if can_be_root(self._costs, target_cell) else None
         if not self.ready and (changes is None or changes.cells.size):
             self._state = State.STALE
@@ -333,7 +334,7 @@ class TargetTree:
         return done if repaired.kind == "none" else done.after(repaired)
 
     def _decide(self, target_cell: int) -> Decision:
-        """How to lead to the target's cell from the tree that there is."""
+        """Decides how to reach the target's cell from the current tree."""
         tree, row = self._tree, self.strategy
         moved = target_cell != tree.root
         if not moved and (tree.exact or not row.is_exact):
@@ -351,7 +352,7 @@ class TargetTree:
         return Decision("window", *self._windows.after_move(row, tree.root, target_cell, self._network is not None))
 
     def _perform(self, decision: Decision, target_cell: int) -> Update:
-        """Do what was decided; where it does not lead to the target, grow the whole tree."""
+        """Performs a decision; if it does not lead to the target, it searches the whole tree."""
         if decision.how == "exact" and self._in_pieces:
             self._tree = in_pieces(self._tree)
         elif decision.how == "window":
@@ -377,7 +378,7 @@ class TargetTree:
 
     @property
     def _is_quick(self) -> bool:
-        """Whether a whole tree may be grown here."""
+        """Returns True if a whole tree may be searched here."""
         return self.times.is_quick(self._grid.cells)
 
     @property
@@ -417,7 +418,7 @@ class TargetTree:
 
     @property
     def _in_pieces(self) -> bool:
-        """Whether the row in force wants the tree in pieces."""
+        """Returns True if the row in force wants the tree in pieces."""
         return self.times.in_pieces and self.strategy.on_move is OnMove.EXACT_MOVE
 
     def _bounds_are_old(self) -> None:
@@ -444,7 +445,7 @@ class TargetTree:
 
     @property
     def _can_mend(self) -> bool:
-        """Whether the tree can be made exact here and now, by the parents that it has."""
+        """Returns True if the tree can be made exact here and now, by its parents."""
         return self.times.mends_quickly and self._all_kernels() and self._tree.fine
 
     def _mend(self) -> Update:
@@ -460,7 +461,7 @@ class TargetTree:
         return Update("exact", self._grid.window, cells)
 
     def _renew(self, done: Update) -> Update:
-        """The whole tree is due, after what was `done`."""
+        """Handles a due full search, after the work in `done`."""
         if not self._can_mend or self._state is State.BEHIND:
             return Update(done.kind, done.window, done.cells, wants_full=True)
         mended = self._mend()
@@ -483,7 +484,7 @@ class TargetTree:
         return None, cells
 
     def _is_full_due(self, done: Update) -> bool:
-        """Whether the whole tree is due after what was done, unless a growth is under way."""
+        """Returns True if a full search is due after this work, unless one is under way."""
         if done.kind in ("full", "exact") or done.wants_full or self._job_out:
             return False
         costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns

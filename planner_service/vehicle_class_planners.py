@@ -1,4 +1,4 @@
-"""The planners of one target for the classes of vehicles: one tree each, kept as long as somebody of it asks."""
+"""Planners of one target for the classes of vehicles: one tree each, kept as long as it has queries."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND
 
 UNUSED_NS = 60 * NS_PER_S
-"""A tree that nobody has asked for so long is dropped."""
+"""A tree without a query for this time is dropped."""
 _BEGINS_NS = NS_PER_S
 """A query waits so long at most for the first tree of its class."""
 
@@ -61,7 +61,7 @@ class ClassPlanners:
         return self._begun_ns.get(name, 0)
 
     def used(self, name: str, now_ns: int) -> Planner:
-        """The planner of a known class that somebody needs; made if it is not there."""
+        """Returns the planner of a known class that is needed; made if it is missing."""
         planner = self._by_class.get(name)
         if planner is None:
             planner = self._by_class[name] = self._make(name, now_ns)
@@ -70,13 +70,13 @@ class ClassPlanners:
         return planner
 
     def must_wait(self, name: str, now_ns: int) -> bool:
-        """Whether a query had better wait: there is nothing to answer from yet, and soon there will be."""
+        """Returns True if a query should wait: there is no tree to answer from yet, but soon."""
         planner = self._by_class[name]
         is_new = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
         return planner.must_wait or (is_new and planner.begins)
 
     def drop_unused(self, now_ns: int) -> None:
-        """Forget what nobody has asked for a minute."""
+        """Drops trees that had no query for 60 s."""
         for name, used_ns in list(self._used_ns.items()):
             if name != GROUND and now_ns - used_ns >= UNUSED_NS:
                 del self._by_class[name], self._used_ns[name], self._begun_ns[name]

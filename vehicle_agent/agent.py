@@ -64,7 +64,7 @@ class Agent:
     bodies     what they must not drive into, though it speaks no right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
-    group      what the other agents of the group told of their costs, if the assigner asks for it
+    group      costs published by the other agents of the group, if the assigner asks for them
 
     stopped     whether an operator wants a vehicle to stand
     assignment  asks for costs, and gives vehicles their targets
@@ -117,13 +117,13 @@ class Agent:
         self._trackings = Trackings(local_map.grid)
         self._empty = EmptyPlaces(self._trackings)
         self._unseen: set[str] = set()
-        """Targets which nobody sees: their planners say where to look."""
+        """Unseen targets: their planners name places to search."""
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         assigner, stagger = assigner or Spread(), chance.random()
         self.assignment = Assignment(self.vehicles, self.targets, assigner, config.reassign_s, stagger, group)
         self._unassigned = False
-        """Whether vehicles have been placed that nobody has asked a target for yet."""
+        """True if vehicles have been placed that have no assignment yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
         self._sight_cells = max(sense_cells, config.reserve_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
@@ -134,7 +134,8 @@ class Agent:
     # --- what operators order ---------------------------------------------------------------------------------
 
     def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
-        """The targets that the vehicles may go for from now on. Those that go for another get one of these."""
+        """The targets that the vehicles may go for from now on. Vehicles that change their target get one of
+        these."""
         if list(targets) == self.targets:
             return
         self.targets = list(targets)
@@ -161,8 +162,8 @@ class Agent:
             self._unassigned = True
 
     def is_open(self, cell: int) -> bool:
-        """Whether a vehicle may enter the map on a cell: it is not lethal, and no body closes it, as far as all
-        bodies are known."""
+        """Returns True if a vehicle may enter the map on a cell: it is not lethal, and no body closes it, as far as
+        all bodies are known."""
         return not (self.bodies.is_deaf or self._steering.closed(cell))
 
     def remove(self, vehicles: Sequence[str]) -> None:
@@ -195,7 +196,7 @@ class Agent:
 
     @property
     def wishes(self) -> Mapping[str, Wish]:
-        """What to ask of wardens for each vehicle, as of the last `decide`."""
+        """Requests to wardens for each vehicle, as of the last `decide`."""
         return self._wishes.of
 
     @property
@@ -239,7 +240,7 @@ class Agent:
         """End routes before cells that are lethal now, and paths also before corners that are.
 
         changed  the windows with all cells that have changed
-        look     another agent changed the map: compare what is in sight with it again
+        look     another agent changed the map: compare the view with it again
         """
         self._wishes.ground_changed(changed)
         if not changed or not self.vehicles:
@@ -262,8 +263,8 @@ class Agent:
                 self._driver.entered[vehicle.cell] = None
 
     def bodies_moved(self) -> None:
-        """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: what was
-        granted since the last time may lie on closed cells, too."""
+        """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: cells granted
+        since the last time may be closed, too."""
         if self.bodies.any:
             for vehicle in self.vehicles.values():
                 self._driver.end_path(vehicle)
@@ -296,7 +297,7 @@ class Agent:
                 self._driver.stop_soon(vehicle)
             path = paths[vehicle.id]
             if len(path) > 1 and vehicle.motion.at_rest:
-                # What was granted late may be closed by now, and would be held for good.
+                # Late grants may be closed by now, and would be held for ever.
                 self._driver.end_path(vehicle)
                 path = paths[vehicle.id]
             reason = vehicle.route_request(now_ns)
@@ -352,7 +353,7 @@ class Agent:
     # --- what is heard --------------------------------------------------------------------------------------
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
-        """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
+        """Takes a tracker's pose of a target; returns it, with its cell, if it counts."""
         counts = self._trackings.counted(pose, now_ns)
         if counts is not None:
             self._empty.placed(pose.target, by_sight=False)
@@ -360,11 +361,12 @@ class Agent:
         return counts
 
     def lost(self, now_ns: int) -> set[str]:
-        """The targets of which nobody knows any more where they are."""
+        """Targets whose position is unknown."""
         return self._trackings.lost(now_ns)
 
     def see_target(self, pose: TargetPose, now_ns: int) -> None:
-        """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
+        """Position of a target without a tracker, by the best sighting of it. A pose outside the grid is
+        ignored."""
         if 0 <= pose.cell < self._map.grid.cells:
             if pose != self._poses.get(pose.target):
                 self._empty.placed(pose.target, by_sight=True)

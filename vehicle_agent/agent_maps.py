@@ -1,7 +1,7 @@
 """The maps of an agent, what its vehicles learn of the ground, and the zones of operators in them.
 
-What a vehicle finds is marked as for the class "ground", which any class can read; a vehicle drives by the map of
-its own class. What is found in a zone is no news, and a vehicle that stands in one drives out.
+Vehicles publish marks for the class "ground", which any class can read; a vehicle drives by the map of its own
+class. Hazards found in a zone are no news, and a vehicle in one drives out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class LocalMap:
     """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
 
     pace       cost of a cell to its vehicles' class, with marks and inflation
-    ground     what the map says of cells to the class "ground", before inflation: what is found is compared with it
+    ground     the map's cells for the class "ground", before inflation, with which findings are compared
     prior      as ground, without marks
     physics    the pace at which vehicles really drive
     climb      factor of a step's cost by its slope; None if steps cost the same both ways
@@ -80,15 +80,15 @@ _OWN = "own"
 
 
 class AgentMaps:
-    """What a vehicle finds it tells as for "ground", which any class can read; it drives by its own class's map.
-    For vehicles of "ground" both are one.
+    """Vehicles publish marks for "ground", which any class can read; each drives by its own class's map. For
+    vehicles of "ground" both are one.
 
     common, own   the ground for "ground", and for the vehicles' class
     class_number  of that class, 0 of "ground"
 
     common    the cost map of "ground"
     own       that of the vehicles' class
-    sink      takes in marks, and what is learned, for both
+    sink      applies marks, and measurements, for both
     local     what vehicles drive by
     learning  what they learn of kinds of ground; None if nothing is to be learned
     """
@@ -134,7 +134,7 @@ class AgentMaps:
 
 
 _EVERY_NS = 5 * NS_PER_S
-"""What is learned is told so often: kinds of ground do not change while a vehicle looks."""
+"""Interval of measurements: terrain classes do not change while a vehicle looks."""
 
 
 class Learning:
@@ -150,7 +150,7 @@ class Learning:
         self._due_ns = 0
 
     def tick(self, driven: Iterable[tuple[int, float]], now_ns: int) -> Mapping[int, Measurement]:
-        """What to tell now, of all that was measured so far; nothing if nothing is new, or it is too early.
+        """Returns the measurements to publish now; empty if there are none, or it is too early.
 
         driven  (cell, s/m) of each step since the last call
         """
@@ -164,7 +164,7 @@ class Learning:
 
 
 _AGAIN_NS = NS_PER_S
-"""Ways out are looked for again so often while somebody needs one: what is around the zone changes, too."""
+"""Interval of searches for a way out while a vehicle needs one: the surroundings of the zone change, too."""
 
 
 class ZonesAround:
@@ -179,7 +179,7 @@ class ZonesAround:
         self._maps = maps
         self._cost_map = maps.own
         self._version = 0
-        """Of the zones that `_cells` and `_tiles` are those of."""
+        """Version of the zones in `_cells` and `_tiles`."""
         self._cells: NDArray[np.int64] = np.empty(0, np.int64)
         """Cells of zones for all vehicles, sorted."""
         self._tiles: list[int] = []
@@ -204,8 +204,8 @@ class ZonesAround:
             self.ways_out = self._find_ways_out(shut)
 
     def free(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which cells are in no zone for all vehicles. In one an operator's word stands, whatever a vehicle sees
-        there; in a zone for one class the others go by what is found."""
+        """Which cells are in no zone for all vehicles. In one an operator's mark holds, against any view of a
+        vehicle; in a zone for one class the others go by findings."""
         return ~np.isin(cells, self._cells)
 
     def _find_zones(self) -> None:
@@ -228,7 +228,7 @@ class ZonesAround:
 
     def _find_ways_out(self, shut: Collection[int]) -> dict[int, int]:
         """Breadth first from the open cells around zones, along straight steps over cells that only zones close.
-        What is shut leads out too, as a vehicle may stand there, but nothing leads over it."""
+        Shut cells lead out too, as a vehicle may be there, but no path leads over them."""
         grid, pace, closed = self._replica.grid, self._cost_map.pace_s_per_m.reshape(-1), self._closed_by_zones()
         beside = {
             cell: [each for direction, each in grid.neighbours(cell) if direction % 2 == 0] for cell in closed
@@ -278,7 +278,7 @@ class ZonesAround:
         return found
 
     def _said_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
-        """What is said of a tile beside its zones, and the cells in it of each zone."""
+        """Returns the marks of a tile beside its zones, and the cells in it of each zone."""
         sets, now_ns = self._replica.held.of_tile(tile), self._replica.now_ns
         zones = [standing(each, now_ns).cells for each in sets if is_zone(each.author)]
         return winners([each for each in sets if not is_zone(each.author)], now_ns), zones

@@ -44,7 +44,7 @@ _LEAD_CELLS = 24
 
 
 class AgentParts:
-    """What an agent process consists of; each part is made once, of what `setup` says of the agent that it names.
+    """Parts of an agent process; each part is made once, from `setup`'s settings for the agent that it names.
 
     truth  float32 (rows, cols), s/m, the pace at which vehicles of "ground" really drive
     warn   as of `RightOfWaySync`
@@ -55,7 +55,7 @@ class AgentParts:
     untracked  the targets of which only vehicles tell
     costs      what the group's agents tell each other; None if the assigner does not ask for it
     spawning   lets the vehicles of an added agent enter; None for an agent of the scenario
-    faults     what plug-ins did wrong and nobody has been told yet
+    faults     faults of plug-ins that are not reported yet
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
     """
@@ -124,7 +124,7 @@ class AgentParts:
             cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
             self.spawning = Spawning(plan.vehicle_ids, cells, core.holdings, self.agent.is_open)
 
-        # The targets, and what is told of the vehicles.
+        # The targets, and messages to vehicles.
         self.detector = TargetDetector(grid, self.author, group, range_m)
         self.untracked = UntrackedTargets(scenario.untracked, reads)
         self.target_bodies = TargetBodies(scenario, grid)

@@ -29,7 +29,7 @@ _LONGEST_S = 1e7
 
 @dataclass(frozen=True, slots=True)
 class AssignmentWorld:
-    """What an assigner is made with.
+    """Arguments with which an assigner is made.
 
     agent    id of the agent whose vehicles it assigns
     group    their group
@@ -47,13 +47,13 @@ class AssignmentWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostTable:
-    """What each vehicle would need to each target.
+    """Costs from each vehicle to each target.
 
-    targets   those whose planners have answered; where costs are shared, ascending, those that others told of too
+    targets   whose planners have replied; with shared costs, ascending, also those from others
     vehicles  those that have a choice
     costs_s   (targets, vehicles) float64, inf where there is no route
     current   (vehicles,) index of the target of each now, -1 for none
-    others    where costs are shared: the same, of the vehicles of the group's other agents, as they told it last
+    others    with shared costs: the same, for the vehicles of the group's other agents, as last received
     """
 
     targets: tuple[str, ...]
@@ -67,8 +67,8 @@ class Assigner(Protocol):
     """Says which vehicle of an agent goes for which target. A plug-in is made as
     `Name(world: AssignmentWorld, options)`.
 
-    One that has an attribute `shares_costs`, and it is true, is told the costs of the whole group: its agents tell
-    each other theirs, once a period.
+    An assigner with a true attribute `shares_costs` receives the costs of the whole group: its agents publish
+    theirs to each other, once a period.
     """
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
@@ -95,7 +95,7 @@ class Balanced:
     """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
 
     All agents solve one problem, which does not depend on who solves it or in which order words came, and each
-    takes what it says of its own vehicles. Where they hold different words, a target may have more pursuers for a
+    takes what it says of its own vehicles. If they hold different messages, a target may have more pursuers for a
     period.
     """
 
@@ -128,7 +128,7 @@ ASSIGNERS: Mapping[str, Callable[[AssignmentWorld], Assigner]] = {
 
 
 def shares_costs(assigner: Assigner) -> bool:
-    """Whether the agents of a group tell each other their costs for it."""
+    """Returns True if the agents of a group publish their costs for it."""
     return getattr(assigner, "shares_costs", False) is True
 
 
@@ -140,7 +140,7 @@ def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
 
 
 class PluginAssigner:
-    """What a plug-in assigns; even shares once it has failed."""
+    """Assignment by a plug-in; even shares once it has failed."""
 
     def __init__(self, assigner: Assigner, guard: Guard) -> None:
         self._assigner = assigner
@@ -211,8 +211,8 @@ def need_first(costs_s: Costs, current: Sequence[int], pursuers: int) -> NDArray
     """Which vehicles the targets need as pursuers.
 
     Each target gets `pursuers` of them, or as many as there are for each where vehicles are fewer, one at least;
-    the sum of their costs is the least. Where not all that are needed have a way, as many targets as can be get
-    their first pursuer, then as many their second. Ties go by index: whoever sorts alike finds the same.
+    the sum of their costs is the least. If not all needed vehicles have a path, as many targets as possible get
+    their first pursuer, then as many their second. Ties go by index, so that equal orders give equal results.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ class _Matching:
         self.filled = np.zeros(targets, np.int64)
         self._costs = costs
         self._free = costs.copy()
-        """As `_costs`, inf for vehicles that have an owner: they have one for good, if not the same."""
+        """As `_costs`, inf for vehicles that have an owner: they keep one, if not the same."""
         self._swap = np.where(np.eye(targets, dtype=bool), 0.0, np.inf)
         """[a, b]: what it costs more to have the vehicle `_swapped` chase a instead of its owner b, and one more,
         so that of equal paths that of fewest exchanges is the shortest; 0 where a is b."""
@@ -293,7 +293,7 @@ class _Matching:
             self._compare(target)
 
     def _lengths(self, start: int) -> Costs:
-        """What the cheapest exchanges cost from a target to every other, by ever longer paths."""
+        """Computes the costs of the cheapest exchanges from a target to every other, by ever longer paths."""
         dist = np.full(len(self.filled), np.inf)
         dist[start] = 0.0
         while True:
@@ -303,7 +303,7 @@ class _Matching:
             dist = low
 
     def _compare(self, target: int) -> None:
-        """What others would pay for a vehicle of this target."""
+        """Computes the bids of others for a vehicle of this target."""
         self._swap[:, target] = np.inf
         own = np.flatnonzero(self.owner == target)
         if own.size:

@@ -1,12 +1,12 @@
 """Which cells are closed by bodies: whatever reports where it is, with a lease, and speaks no right of way. Pure.
 
 A report closes the cells that its disc touches, and those that it touches within `REACTION_S` if it keeps its
-speed and heading. Until the next report it may have gone on as it said, so what is closed grows with its age. A
+speed and heading. Until the next report it may have continued as stated, so the closed area grows with its age. A
 cell is open again only if a newer report of the same body leaves it, or its lease ends. Leases count by the
 receiver's clock, from when a report was heard; nothing depends on what the sender's clock says.
 
-Where reports contradict each other, everything that either says is closed: two senders under one id are two bodies,
-and a body that leaps keeps its old place closed until that report's lease ends.
+If reports contradict each other, all cells of both are closed: two senders under one id are two bodies, and a body
+that leaps keeps its old position closed until that report's lease ends.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ STANDS_NS = NS_PER_S
 """A body that has kept its place for so long is driven around, not waited for."""
 MOST_BODIES = 256
 MOST_CELLS = 100_000
-"""That all bodies together may close: bounds time and memory, and what liars can do."""
+"""Limit for all bodies together: bounds time and memory, and the effect of false reports."""
 _FURTHEST_CELLS = 64
-"""Cells ahead of a body that are closed, at most: whoever is quicker must look out."""
+"""Largest number of cells ahead of a body that are closed: a faster body must look out itself."""
 _LONGEST_PAUSE_NS = NS_PER_S // 4
 """Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
 _DEAF_NS = NS_PER_S // 2
 LISTEN_NS = NS_PER_S
-"""Each body says where it is at least so often, so that whoever has just begun to listen knows it."""
+"""Each body is published at least this often, so that a new subscriber knows it."""
 _GHOSTS = 3
 """Places that a body has leapt from and that are still closed, at most."""
 _MOST_TOLD = 1000
 _LEAP_M = 5.0
-"""Beyond what its speed explains: how far a place that satellites told may be wrong."""
+"""Distance beyond the one its speed explains: the error of satellite positions."""
 
 
 _NOTHING = Window(0, 0, 0, 0)
 
 
 def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0.0) -> Capsule:
-    """What a body touches while it goes so far: by its heading, or any way if it tells none."""
+    """Returns the area that a body touches on a distance: by its heading, or in any direction without one."""
     ahead_m = min(ahead_m, _FURTHEST_CELLS * grid.resolution_m)
     radius_m = report.radius_m + margin_m
     if report.heading_rad is None:
@@ -64,7 +64,7 @@ def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0
 
 @dataclass(slots=True, eq=False)
 class _Known:
-    """What one report says.
+    """State of one report.
 
     heard_ns  when it was heard; later where the process has not listened meanwhile, `came_ns` never
     cells     closed now; `ahead_m` is the length of the way to which they belong
@@ -95,7 +95,7 @@ class Bodies:
     then.
 
     margin_m    added to each body's radius: the radius of a vehicle
-    complaints  a sentence for each id and kind of report that was not taken as it is; who tells them clears them
+    complaints  a sentence for each id and kind of report that was changed or refused; the reader clears them
     refused     how many such reports there were
     """
 
@@ -135,8 +135,8 @@ class Bodies:
     # --- reports --------------------------------------------------------------------------------------------
 
     def take_report(self, report: Body, now_ns: int) -> None:
-        """Take in a report, after `tick` at the same time. One that is older than what is known of its sender
-        changes nothing."""
+        """Take in a report, after `tick` at the same time. A report older than the last one of its sender changes
+        nothing."""
         key = report.id, report.incarnation
         known = self._known.get(key)
         if known is not None and report.seq <= known.report.seq:
@@ -180,7 +180,8 @@ class Bodies:
             self._open(known)
 
     def _charge(self, report: Body) -> tuple[int, str | None]:
-        """How many cells it may close until its lease ends, at most, and why it cannot be taken in."""
+        """Returns the largest number of cells that it may close until its lease ends, and the reason if it is
+        refused."""
         if report.radius_m > MOST_RADIUS_M:
             return 0, f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
         if report.speed_m_per_s > MOST_M_PER_S:
@@ -257,12 +258,12 @@ class Bodies:
 
     @property
     def is_deaf(self) -> bool:
-        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much
-        time pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
+        """Returns True if there may be bodies without a received report: the process has just started, or its last
+        tick was so long ago that messages meanwhile may be unread. Nobody drives then."""
         return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
 
     def listen_anew(self, now_ns: int) -> None:
-        """Nothing was heard before now: for a second, in which every body says where it is, nobody drives."""
+        """Starts listening again: for a second, in which every body publishes its position, no vehicle drives."""
         self._listens_ns = now_ns + LISTEN_NS
 
     def _forget(self, key: tuple[str, int]) -> None:
@@ -315,8 +316,8 @@ class Bodies:
     # --- what is asked --------------------------------------------------------------------------------------
 
     def danger(self, cell: int) -> float:
-        """How directly bodies come to a cell within `MAKE_WAY_S`: 0 if none does, more the nearer their way passes
-        its middle."""
+        """Returns an urgency score for a cell. 0 if no body reaches it within `MAKE_WAY_S`; higher the closer a
+        body passes its centre."""
         worst = 0.0
         for known in self._known.values():
             if known.coming is not None:
@@ -374,7 +375,7 @@ class TargetBodies:
                 )
 
     def bodies_of(self, pose: TargetPose, now_ns: int) -> list[Body]:
-        """What a pose says about bodies: nothing of a target that is none."""
+        """Returns the bodies in a pose: none for a target without a body."""
         radius_m = self._radii_m.get(pose.target)
         if radius_m is None:
             return []

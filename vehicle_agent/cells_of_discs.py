@@ -19,7 +19,7 @@ _LEAST = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """All places within `radius_m` of a line from (x_m, y_m), so many metres to the east and to the north."""
+    """All points within `radius_m` of a line from (x_m, y_m), of this length to the east and to the north."""
 
     x_m: float
     y_m: float
@@ -48,7 +48,8 @@ class Capsule:
         return flat
 
     def depth(self, grid: GridSpec, cell: int) -> float:
-        """How deep the middle of a cell lies in it, widened by half a cell's diagonal: 0 outside, 1 on its line."""
+        """Returns the depth of a cell's middle in it, widened by half a cell's diagonal: 0 outside, 1 on its
+        line."""
         u0, v0, u1, v1, radius = self._in_cells(grid)
         row, col = divmod(cell, grid.cols)
         u, v = col + 0.5, row + 0.5

@@ -19,7 +19,7 @@ from vehicle_agent.service import AgentService
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Drive the vehicles of one agent until it is told to stop.
+    """Drives the vehicles of one agent until it is told to stop.
 
     stop_when  blocks until the process has to end; None to run until a signal comes
     """

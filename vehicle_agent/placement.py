@@ -1,4 +1,4 @@
-"""Where vehicles start: those of the scenario all at once, those of an added agent one by one.
+"""Start cells of vehicles: those of the scenario all together, those of an added agent one by one.
 
 Every process computes the same cells for the vehicles of the scenario, so that all differ. An added agent asks
 wardens for a first cell of each of its vehicles (decision 40).
@@ -66,8 +66,8 @@ def spawn_cells(
 
 
 def entry_cells(added: AddedAgent, grid: GridSpec, homes: NDArray[np.bool_], seed: int) -> list[int]:
-    """Where the vehicles of an added agent may enter, the best first: near the place named, else anywhere. Raises
-    ConfigError for a place outside the terrain.
+    """Returns cells where the vehicles of an added agent may enter, the best first: near the named location, else
+    anywhere. Raises ConfigError for a place outside the terrain.
 
     homes  bool (rows, cols), `homes_of` prior and truth
     """
@@ -163,14 +163,15 @@ class Spawning:
         self._waiting = [vehicle for vehicle in self._waiting if vehicle not in gone]
 
     def may_stand(self, vehicle: str, cell: int) -> bool:
-        """Whether a vehicle that has found its place may take it. One of an earlier life stands there already; one
-        that would enter has a body there that came while the cell was asked for, and goes elsewhere."""
+        """Returns True if a vehicle that has found its place may take it. One of an earlier life stands there
+        already; one that would enter has a body there that came while the cell was asked for, and goes
+        elsewhere."""
         asked_cell, _ = self._asked.get(vehicle, (None, 0))
         return cell != asked_cell or self._is_open(cell)
 
     @property
     def over(self) -> bool:
-        """Whether no vehicle of the agent is left or will come."""
+        """Returns True if no vehicle of the agent is left or will come."""
         return not self._waiting
 
     def tick(self, informed: bool, now_ns: int) -> None:
@@ -191,7 +192,7 @@ class Spawning:
                 self._ask(vehicle, now_ns)
 
     def _ask(self, vehicle: str, now_ns: int) -> None:
-        """For the next cell that is open. While none is, what was asked for is not taken once it is granted."""
+        """For the next cell that is open. Without one, a requested cell is not taken once it is granted."""
         for _ in range(len(self._cells)):
             cell = self._cells[0]
             self._cells.rotate(-1)

@@ -1,4 +1,4 @@
-"""What an agent has on file for right of way: its own lives, and what it has promised and stored as a member."""
+"""Files of an agent for right of way: its own lives, and its promises and tables as a member."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 _SIZE_BYTES = 1 << 18
-"""Of each of the two files, and at least four times what still counts in them."""
+"""Size of each of the two files, and at least four times that of their live records."""
 _HEAD_BYTES = 4
 """The length of a record, far more than a file holds."""
 
@@ -36,11 +36,11 @@ PROMISE_STORE = ExternalCalls(
     calls={"reserve": str | None, "save_own": None, "save": None},
     facts={"own": OwnRecord, "saved": dict[int, tuple[int, Table]], "ready": bool},
 )
-"""What an agent uses of its store."""
+"""Calls of its store that an agent uses."""
 
 
 class PromiseStore:
-    """What an agent keeps, here in memory only: it survives a simulated process, not this one.
+    """Records of an agent, here in memory only: they survive a simulated process, not this one.
 
     own    of the agent itself
     saved  plot -> (promised epoch, stored table)
@@ -67,8 +67,8 @@ class PromiseStore:
 
 
 class FilePromiseStore(PromiseStore):
-    """Appends to a file, and goes over to a spare one with what still counts when it is full. What was written
-    survives a kill -9 of the process, not a loss of power: nothing is synced.
+    """Appends to a file, and goes over to a spare one with what still counts when it is full. A written record
+    survives a kill -9 of the process, not a loss of power: there is no sync.
 
     Both files have their space beforehand, so that a disk which is full keeps no member from its promises for long,
     and a life that begins meanwhile from none. A record counts once its length stands before it, which is written
@@ -97,7 +97,7 @@ class FilePromiseStore(PromiseStore):
         self._file = self._spare = -1
         """Open files; -1 is none."""
         self._at = self._size = self._spare_size = 0
-        """Where the next record begins, and how long the two files are."""
+        """Position of the next record, and the length of the two files."""
         if path.exists():
             self._read()
         else:
@@ -121,7 +121,7 @@ class FilePromiseStore(PromiseStore):
             except OSError:
                 os.close(spare)
                 with contextlib.suppress(OSError):
-                    self._spare_path.unlink()  # half of it is of no use, and somebody else needs the space
+                    self._spare_path.unlink()  # A partial file is useless. Free its space.
                 raise
         except OSError as error:
             return f"cannot write {self._spare_path}: {error.strerror}"
@@ -166,7 +166,7 @@ class FilePromiseStore(PromiseStore):
         self._at, self._size = at, len(data)
 
     def _all(self) -> bytes:
-        """What still counts, as a file begins with it."""
+        """Returns the live records, encoded as the start of a new file."""
         records = [_Record(own=self.own)]
         records += [_Record(promised=promised, table=table) for promised, table in self.saved.values()]
         packed = map(self._encoder.encode, records)

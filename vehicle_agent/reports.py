@@ -18,26 +18,27 @@ from swarm.wire.messages.vehicles import NO_TARGET, Chasers, Fleet
 from vehicle_agent.driving.driven_vehicle import Places
 
 HEARTBEAT_NS = NS_PER_S
-"""A target whose chasers stand still is told of them so often: the planner's lease is five times as long."""
+"""Interval of messages about a target whose chasers are at rest: the planner's lease is five times as long."""
 
 
 class ChasersReport:
     """Makes the messages of one author.
 
-    A planner reads pushed routes from the cells that it was told, and a vehicle can take a route that begins
-    anywhere on its path. So each vehicle tells the end of its path, and tells it anew when its path no longer has
-    the cell: seldom for one that is slow on a map of large cells, and never for one that waits.
+    A planner reads pushed routes from the published cells, and a vehicle can take a route that begins anywhere on
+    its path. Each vehicle therefore publishes the end of its path, and again when its path no longer has the cell:
+    seldom for one that is slow on a map of large cells, and never for one that waits.
     """
 
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
         self._told: dict[str, tuple[dict[str, int], int]] = {}
-        """Target -> the cells of its chasers that its planner was told last, and when; of all that have chasers."""
+        """Target -> the cells of its chasers in its planner's last message, and the time; for all that have
+        chasers."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
-        """The messages that are due: of targets that a vehicle has taken or left, whose planner knows a cell that a
-        vehicle has left behind, or that were not told of for `HEARTBEAT_NS`.
+        """Returns due messages: about targets that a vehicle has taken or left, whose planner knows a cell that a
+        vehicle has left behind, or without a message for `HEARTBEAT_NS`.
 
         vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
         """
@@ -65,7 +66,7 @@ class ChasersReport:
 
 
 def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
-    """Whether what was told is still true: the same vehicles, and each may still reach its cell."""
+    """Returns True if the last message is still true: the same vehicles, and each may still reach its cell."""
     return told.keys() == paths.keys() and all(map(contains, map(paths.__getitem__, told), told.values()))
 
 

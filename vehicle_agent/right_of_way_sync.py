@@ -25,9 +25,9 @@ class OwnTime:
     """A clock that counts of the time between two ticks one period at most.
 
     A process that comes late to its ticks has not heard the others meanwhile, so it cannot say that they were
-    silent; and where one is late, for want of processors, the others are. By the time of the wall, on a machine on
-    which ticks come seconds apart, every lease had run out whenever somebody looked: wardens were replaced before
-    they could grant, for ever. On time it is the time of the wall. Nothing that is safe hangs on it.
+    silent; and where one is late, for want of processors, the others are. By wall time, on a machine on which ticks
+    come seconds apart, every lease had expired at each tick: wardens were replaced before they could grant, for
+    ever. On time it is the time of the wall. Nothing that is safe hangs on it.
 
     period_ns  of ticks
     """
@@ -56,16 +56,16 @@ _FIRST_ANSWERS_S = 0.3
 """A new life waits so long for the others' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
-"""Agents are asked anew what they know of us after a second, then after twice as long, at last so rarely."""
+"""Interval of recovery queries to agents: a second, then twice as long each time, up to this."""
 _PROMISE_TIMEOUT_S = 5.0
-"""A member that is late answers late, and its promise counts until we claim anew: by epoch, so it does no harm."""
+"""A late member replies late, and its promise counts until we claim again: by epoch, so it does no harm."""
 _MOST_REFUSALS_TOLD = 100
 """Liars may say as many different things as they like."""
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _WAITING_AGAIN_NS = 10 * NS_PER_S
-"""What lasts is said again so often: somebody who begins to watch shall learn of it, and the log stay readable."""
+"""Interval of repeated events: a late watcher receives them, and the log stays readable."""
 
 
 class RightOfWaySync:
@@ -93,12 +93,12 @@ class RightOfWaySync:
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
         self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
-        """What the core is told. When to ask, and when to tell people, goes by the time of the wall."""
+        """Time for the core. When to ask, and when to tell people, goes by the time of the wall."""
         self._asking = False
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._unasked = False
-        """Whether an agent has come up that we have not asked what it knows of us."""
+        """True if an agent has appeared that has not received our recovery query."""
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Plot without a warden -> when that is said again."""
@@ -213,7 +213,7 @@ class RightOfWaySync:
             self._answer(asked, self.core.hear_claim(plot, epoch, own_ns))
 
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
-        """Perform what has to be done first, and answer with the last."""
+        """Performs the actions that come first, and replies with the last."""
         for action in actions:
             match action:
                 case Table():

@@ -1,7 +1,7 @@
 """The shell of an agent: carries messages to its parts, and what they decide to the bus.
 
-What is acted on at ticks is collected by the bus (`Bus.collect`); all else comes as an event. Each kind of message
-has one handler, named after what it tells.
+Messages that are used at ticks are collected by the bus (`Bus.collect`); all others come as events. Each kind of
+message has one handler, named after what it tells.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class AgentService:
     def start(self, now_ns: int) -> None:
         bus, post, id = self._bus, self._post, self._setup.id
         bus.watch_alive(post, role="planner")
-        self._right_of_way.start(now_ns)  # whoever sees our token asks at once what we know
+        self._right_of_way.start(now_ns)  # peers send a query as soon as they see this token
         self._member.join()
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
@@ -222,12 +222,12 @@ class AgentService:
 
     def stop(self, now_ns: int) -> None:
         if self._parts.spawning is not None:
-            self._on_leave([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
+            self._on_leave([])  # an orderly end takes its vehicles away; a killed process leaves them
             self._right_of_way.tick(self.agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
 
     def _collected(self, topic: Topic, kind: type[M]) -> Iterator[M]:
-        """What the bus has kept on a topic since the last tick."""
+        """Returns the messages that the bus has kept on a topic since the last tick."""
         for heard in self._bus.collected(topic):
             assert isinstance(heard.message, kind)
             yield heard.message
@@ -235,7 +235,7 @@ class AgentService:
     # --- orders and places ----------------------------------------------------------------------------------
 
     def _obey(self, now_ns: int) -> None:
-        """Go by what is ordered."""
+        """Applies orders."""
         orders, agent = self._obedience, self.agent
         agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
         if self._obeyed_version != orders.book.version:
@@ -338,7 +338,7 @@ class AgentService:
     # --- driving and planners -------------------------------------------------------------------------------
 
     def _drive(self, now_ns: int) -> None:
-        """Drive cell by cell, and write what is found on each into the map before driving on."""
+        """Drives cell by cell, and writes findings on each into the map before driving on."""
         agent, learning = self.agent, self._maps.learning
         agent.begin_drive(now_ns)
         while (found := agent.drive()) is not None:

@@ -2,7 +2,7 @@
 
 Once a period (`vehicles.reassign_s`) an agent asks all planners for the costs of all its vehicles. When their
 answers have come, the assigner shares the targets out (`assignment`), and each vehicle takes its own if the change
-is worth it. Where the assigner asks for it, the agents of a group tell each other their costs (`GroupCosts`).
+is worth it. If the assigner asks for it, the agents of a group publish their costs to each other (`GroupCosts`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _JUMPS_APART_NS = NS_PER_S // 50
 """For each target: so long after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
-"""An agent of the group that has told no costs for so many periods is gone."""
+"""An agent of the group without costs for this number of periods has ended."""
 _MOST_AGENTS = 256
 """The agents of one group that are listened to: strangers may invent as many as they like."""
 
@@ -36,7 +36,7 @@ _MOST_AGENTS = 256
 class GroupCosts:
     """The newest words of the other agents of a group.
 
-    agent   id of this agent; what comes under it is not another's
+    agent   id of this agent; messages under it are not another's
     """
 
     def __init__(self, author: str, group: str, agent: str) -> None:
@@ -89,12 +89,12 @@ class GroupCosts:
 
     @property
     def targets(self) -> set[str]:
-        """Those that others have told of."""
+        """Targets in the costs of others."""
         return {target for message, _ in self._heard.values() for target in message.target_ids}
 
     def rows(self, targets: Sequence[str]) -> tuple[tuple[str, ...], NDArray[np.float64], tuple[int, ...]]:
-        """Ids of the others' vehicles, ascending; float64 (targets, vehicles) their costs in s, inf where nothing
-        was told; and the index of the target of each, -1 for none of these."""
+        """Returns ids of the others' vehicles, ascending; float64 (targets, vehicles) their costs in s, inf where
+        unknown; and the index of the target of each, -1 for none of these."""
         ids: list[str] = []
         parts: list[NDArray[np.float64]] = []
         chased: list[int] = []
@@ -167,7 +167,7 @@ class Assignment:
     assigner    which of them each goes for
     stagger     share of the period by which the first request is followed early, so that agents ask one after the
                 other
-    group       what the group's other agents told; None if the assigner does not ask for it
+    group       costs of the group's other agents; None if the assigner does not ask for them
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class Assignment:
         """Target -> the costs that its planner answered to the open request."""
 
     def set_period(self, reassign_s: float) -> None:
-        """How often vehicles ask from now on."""
+        """Sets the interval of the vehicles' queries."""
         self._reassign_ns = int(reassign_s * NS_PER_S)
 
     def due(self, now_ns: int) -> bool:
@@ -236,7 +236,7 @@ class Assignment:
         """All planners that will answer have: each vehicle takes its target. Returns what to tell the group.
 
         planners  target -> incarnation of its planner, of those which live
-        empty     targets that are not where their planners lead to: whoever has a way to another goes for that
+        empty     targets that are not at their planners' positions: a vehicle with a path to another goes for that
         standing  vehicles that an operator lets stand: no target's pursuers where costs are shared
         """
         asked = self._open
@@ -264,7 +264,7 @@ class Assignment:
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
         if self._group is None:
             return None
-        # What the others reckon with: the costs of those vehicles that may chase any target.
+        # Input of the others: the costs of vehicles that may chase any target.
         may = [n for n, id in enumerate(asked.vehicles) if id in self._vehicles and id not in standing]
         told_s = {
             target: column[may]
@@ -277,7 +277,7 @@ class Assignment:
     def _share_out(self, asked: AskCosts, empty: Collection[str], standing: Collection[str]) -> dict[str, str]:
         """The target of each vehicle that has a choice, so that not all go for the same."""
         targets = [target for target in self.targets if target in self._costs_s and target not in empty]
-        # A vehicle whose planner is silent keeps to it, or is told that nothing is known.
+        # A vehicle whose planner is silent keeps to it, or is informed that there is no data.
         held = {id: self._vehicles[id].target for id in asked.vehicles if id in self._vehicles}
         now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
