@@ -19,7 +19,7 @@ _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
 def end_with_parent(number: signal.Signals) -> None:
-    """Let the kernel send this signal to the present process when its parent ends. Does nothing but on Linux."""
+    """Makes the kernel send this signal to the present process when its parent ends. Does nothing but on Linux."""
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, int(number))
     parent = multiprocessing.parent_process()
@@ -28,7 +28,7 @@ def end_with_parent(number: signal.Signals) -> None:
 
 
 def main() -> None:
-    """Become the program that the arguments name, which ends when process PARENT_PID does."""
+    """Becomes the program that the arguments name, which ends when process PARENT_PID does."""
     parent, program = int(sys.argv[1]), sys.argv[2:]
     end_with_parent(signal.SIGKILL)
     if _LIBC is not None and os.getppid() != parent:  # it ended before it could be watched

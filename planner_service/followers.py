@@ -143,7 +143,7 @@ class Followers:
         self._lies(follower, self._bounds(route) if route.status is RouteStatus.OK else _NOWHERE_BOUNDS)
 
     def _lies(self, follower: Follower, bounds: tuple[int, int, int, int]) -> None:
-        """Note where another route of a follower lies."""
+        """Notes where another route of a follower lies."""
         follower.bounds, follower.walked = bounds, None
         if self._rows is not None:
             self._rows[1][follower.row] = bounds

@@ -48,7 +48,7 @@ class GapStatistics:
         self._due_ns = 0
 
     def certify(self, routes: RouteBatch) -> float:
-        """Note the proven gaps of served routes. Returns the widest, at least 1."""
+        """Notes the proven gaps of served routes. Returns the widest, at least 1."""
         gaps = routes.gaps
         # The histogram and `gaps` would take a route below its bound for one that is proven optimal.
         self._count_broken(int(np.count_nonzero(routes.lower_bound_s > routes.cost_s)))

@@ -173,8 +173,8 @@ def load_what_is_there() -> None:
 
 
 def load_all() -> None:
-    """Make all kernels for maps where uphill is as downhill ready in this process, compiled here where they are not
-    on disk."""
+    """Makes all kernels for maps where uphill is as downhill ready in this process, compiled here where they are
+    not on disk."""
     for kernel in _of_kind([*FIRST, *LATER], False):
         load(kernel)
 
@@ -269,7 +269,7 @@ class KernelLoader:
             self._thread.start()
 
     def wait(self) -> None:
-        """Wait until all may be called."""
+        """Waits until all may be called."""
         if self._missing:
             self._thread.join()
 

@@ -143,7 +143,7 @@ class Planner:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
-        """Take over, or leave it to another. A planner that takes over does not know which routes followers have:
+        """Takes over, or leave it to another. A planner that takes over does not know which routes followers have:
         it pushes one to each."""
         self.leads = self._watch.counts = leads
         if leads:
@@ -159,16 +159,16 @@ class Planner:
         return self._watch.lost(now_ns)
 
     def on_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
+        """Notes where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
         if pose.target == self.target:
             self._watch.watch_pose(pose, now_ns)
 
     def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
-        """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""
+        """Notes where the target is, by the best sighting of it: sightings are ordered before they come here."""
         self._watch.on_sighting(pose, now_ns)
 
     def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
-        """Note which vehicles of an agent chase this target, and from where."""
+        """Notes which vehicles of an agent chase this target, and from where."""
         if chasers.target == self.target:
             self.followers.on_chasers(chasers, now_ns)
 
@@ -178,7 +178,7 @@ class Planner:
         now_ns: int,
         send: Callable[[Answer], None] = lambda answer: None,
     ) -> Answer:
-        """Answer from the tree as it is. Never waits for a growth that is under way.
+        """Answers from the tree as it is. Never waits for a growth that is under way.
 
         send  called with what is returned as soon as that is known: who asked does not wait for what is counted
         """
@@ -192,7 +192,7 @@ class Planner:
         return answer
 
     def tick(self, now_ns: int) -> list[Action]:
-        """Bring the tree up to date, push newer routes, tell how we are doing."""
+        """Brings the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
         self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
@@ -211,7 +211,7 @@ class Planner:
         return actions
 
     def adopt(self, grown: GrownTree, took_ns: int, now_ns: int) -> list[Action]:
-        """Replace the tree by what the worker grew, and make up for what happened meanwhile."""
+        """Replaces the tree by what the worker grew, and applies later changes."""
         pose = self._watch.pose
         if self._growing_since_ns is None or pose is None:
             return []
@@ -238,7 +238,7 @@ class Planner:
         return [self._grow(now_ns)] if self._wants_full else []
 
     def adopt_strides(self, search: StrideSearch) -> None:
-        """Go by what the worker found."""
+        """Goes by what the worker found."""
         self.tree.take_strides(search)
 
     @property
@@ -259,7 +259,7 @@ class Planner:
     # --- the tree -----------------------------------------------------------------------------------------------
 
     def _keep_up(self, now_ns: int) -> list[Action]:
-        """Take in the newest pose and all map changes since the last time, if there are any."""
+        """Takes in the newest pose and all map changes since the last time, if there are any."""
         pose = self._watch.pose
         if pose is None:
             if self._under_way is not None and self.tree.map_version != self._cost_map.version:
@@ -296,7 +296,7 @@ class Planner:
             self.counters.counts["search_places"] = search.searcher.decisions
 
     def _learn_map(self, now_ns: int) -> None:
-        """Take in the map without a target to lead to."""
+        """Takes in the map without a target to lead to."""
         self.tree.update(self._cost_map.pace_s_per_m, -1, self._take_dirty(now_ns), self._cost_map.version)
 
     def _may_not_wait(self, now_ns: int) -> bool:
@@ -344,7 +344,7 @@ class Planner:
             self._unseen_mark_ns = None
 
     def _timed(self, update: Update, took_ns: int, now_ns: int) -> None:
-        """Note what work on this thread cost."""
+        """Notes what work on this thread cost."""
         if self._stopwatch is None:
             took_ns = update.cells * (MODEL_EXACT_NS_PER_CELL if update.kind == "exact" else MODEL_NS_PER_CELL)
         if update.repair_ns:
@@ -441,7 +441,8 @@ class Planner:
         return update.kind != "none"
 
     def _certify(self, routes: RouteBatch, now_ns: int) -> None:
-        """Note the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy does."""
+        """Notes the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy
+        does."""
         widest = self._gaps.certify(routes)
         loose = widest > MAX_GAP and self.tree.strategy.renews_loose_bounds
         if loose and now_ns >= self._full_due_ns:

@@ -298,7 +298,7 @@ class PlannerService:
         return self._planners.held(name) if tag == self._tag(work, name) else None
 
     def _take_fleet(self, now_ns: int) -> None:
-        """Take in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
+        """Takes in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
         if self._search.tracked:
             self._listen(self._planner.is_lost(now_ns))
         if not self._listens:
@@ -310,7 +310,7 @@ class PlannerService:
         self._search.hear_vehicles(*self._presence.columns())
 
     def _listen(self, listens: bool) -> None:
-        """Hear from vehicles where they are and what they see, or do not."""
+        """Receives from vehicles where they are and what they see, or do not."""
         if listens == self._listens:
             return
         self._listens = listens
@@ -322,7 +322,7 @@ class PlannerService:
             self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
-        """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long.
+        """Answers what was asked. Where there will be something to answer from soon, wait for that, but not long.
 
         What is asked for one class never waits for the tree of another.
         """
@@ -353,7 +353,7 @@ class PlannerService:
         asked.end()
 
     def _obey(self) -> None:
-        """Go by what is ordered."""
+        """Goes by what is ordered."""
         book, scenario = self._obedience.book, self._scenario
         if book.version == self._obeyed_version:
             return
@@ -368,7 +368,7 @@ class PlannerService:
             self._pace(planner)
 
     def _pace(self, planner: Planner) -> None:
-        """Set a planner's pace as it is ordered."""
+        """Sets a planner's pace as it is ordered."""
         book, scenario = self._obedience.book, self._scenario
         self._search.time_scale = book.setting("time_scale", scenario.time_scale)
         planner.set_pace(
@@ -393,7 +393,7 @@ class PlannerService:
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
-        """Serve the target, or leave that to another. A query which comes meanwhile is answered all the same."""
+        """Serves the target, or leave that to another. A query which comes meanwhile is answered all the same."""
         if leads == self._planner.leads:
             return
         for _, planner in self._planners:

@@ -202,7 +202,7 @@ class TargetTree:
         return self._strides.search(self._costs, shelf)
 
     def take_strides(self, search: StrideSearch) -> None:
-        """Go by the networks that were found."""
+        """Goes by the networks that were found."""
         self._strides.take(self._costs, search)
 
     def adopt(
@@ -214,7 +214,7 @@ class TargetTree:
         map_version: int,
         followed_cells: Any,
     ) -> Update:
-        """Replace the tree by a grown one and bring it up to date; measure `last_gaps` over `followed_cells`.
+        """Replaces the tree by a grown one and bring it up to date; measure `last_gaps` over `followed_cells`.
 
         dirty  covers every cell that changed since the snapshot of `grown` was taken
         """
@@ -291,7 +291,7 @@ class TargetTree:
     # --- how ----------------------------------------------------------------------------------------------------
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
-        """Take the map's changes. None the first time: everything is new."""
+        """Takes the map's changes. None the first time: everything is new."""
         if not self._loaded:
             self._costs.load(pace)
             self._loaded = True
@@ -318,7 +318,7 @@ class TargetTree:
         return self.ready
 
     def _follow(self, target_cell: int, changes: Changes | None) -> Update:
-        """Bring the tree up to date with the map, then with its target: decide, and do it."""
+        """Brings the tree up to date with the map, then with its target: decide, and do it."""
         if self._state is State.STALE:
             return self._grow_full(target_cell)
         self._windows.moves += target_cell != self._tree.root
@@ -396,15 +396,15 @@ class TargetTree:
         return tree
 
     def _grow_or_leave(self, target_cell: int) -> Update:
-        """Grow the whole tree here, or leave that to the worker and lead to the old root until it is adopted."""
+        """Grows the whole tree here, or leave that to the worker and lead to the old root until it is adopted."""
         if self._is_quick and self._state is not State.BEHIND:
             return self._grow_full(target_cell)
         self.target_cell, self._state = self._tree.root, State.BEHIND
         return Update("none", wants_full=not self._job_out)
 
     def _grow_full(self, target_cell: int) -> Update:
-        """Grow the whole tree: here or, where that would take too long, on the worker. The one that there is serves
-        no more."""
+        """Grows the whole tree: here or, where that would take too long, on the worker. The one that there is
+        serves no more."""
         if not self._is_quick:
             self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
@@ -426,7 +426,7 @@ class TargetTree:
         self._is_better_bound = True
 
     def _repair(self, changes: Changes | None) -> Update | None:
-        """Bring the tree up to date with the map; None if it must be grown instead."""
+        """Brings the tree up to date with the map; None if it must be grown instead."""
         if changes is None:
             return None
         if changes.cells.size == 0:
@@ -449,7 +449,7 @@ class TargetTree:
         return self.times.mends_quickly and self._all_kernels() and self._tree.fine
 
     def _mend(self) -> Update:
-        """Make the tree exact; where a growth costs less, grow it or ask a worker to."""
+        """Makes the tree exact; where a growth costs less, grow it or ask a worker to."""
         tree = self._tree
         cells = tree.mend()
         if not tree.exact:
@@ -468,7 +468,7 @@ class TargetTree:
         return Update(mended.kind, mended.window, done.cells + mended.cells, mended.wants_full)
 
     def _grow_window(self, target_cell: int, half: int) -> tuple[Window | None, int]:
-        """Lead to the target's new cell by a window that reaches so far to every side, or further where that does
+        """Leads to the target's new cell by a window that reaches so far to every side, or further where that does
         not connect it to the old one. Returns it, None where a growth of the whole tree costs less; and the cells
         grown."""
         cells = 0

@@ -45,7 +45,7 @@ def open_array(path: Path) -> NDArray[Any]:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array where `open_array` reads it, at once: other processes see all of it or nothing. Raises
+    """Writes an array where `open_array` reads it, at once: other processes see all of it or nothing. Raises
     OSError."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -67,8 +67,9 @@ def private_copy(array: NDArray[Any]) -> NDArray[Any]:
 
 @functools.cache
 def reuse_memory() -> None:
-    """Keep the memory of small freed arrays for the next ones. By default the allocator gives much of it back after
-    each band; fetching it again took a fifth of the time of classifying a photo. Large ones are given back."""
+    """Keeps the memory of small freed arrays for the next ones. By default the allocator gives much of it back
+    after each band; fetching it again took a fifth of the time of classifying a photo. Large ones are given
+    back."""
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc's
     if set_option is not None:
         set_option(_TRIM_THRESHOLD, 64 << 20)
@@ -76,7 +77,7 @@ def reuse_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Return to the system what the allocator keeps of freed arrays; it keeps much where threads made them."""
+    """Returns to the system what the allocator keeps of freed arrays; it keeps much where threads made them."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
     if trim is not None:
         trim(0)

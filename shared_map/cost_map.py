@@ -82,7 +82,7 @@ class CostMap:
         paces: NDArray[np.float32],
         class_number: int = 0,
     ) -> None:
-        """Make these the current statements about these cells; of a repeated cell the last counts. PACE sets the
+        """Makes these the current statements about these cells; of a repeated cell the last counts. PACE sets the
         pace, even where the prior is lethal; LETHAL makes the cell lethal; CLEAR restores the prior.
 
         cells  uint32 (n,)   flat indices in the grid; raises OutsideGridError if one is not in it
@@ -115,7 +115,7 @@ class CostMap:
             self._note_dirty(where)
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
-        """Make these the words of all authors about kinds of ground. Those which are none change nothing. A change
+        """Makes these the words of all authors about kinds of ground. Those which are none change nothing. A change
         of factors is one of the whole map. Lethal cells stay lethal, and marked cells as they are marked.
         Returns whether the factors changed."""
         if self.keys is None or self._stated is None:

@@ -49,7 +49,7 @@ class Sightings:
         self._newest: dict[tuple[str, str], _Seen] = {}
 
     def receive(self, sighted: Sighted, now_ns: int) -> bool:
-        """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
+        """Takes in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
 
         An author's sighting with a lower number is news after a silence, as `swarm.liveness.Newest` has it.
         """
@@ -68,7 +68,7 @@ class Sightings:
         return True
 
     def expire(self, now_ns: int) -> None:
-        """Forget expired sightings."""
+        """Forgets expired sightings."""
         self._newest = {key: each for key, each in self._newest.items() if each.until_ns > now_ns}
 
     def best(self, now_ns: int) -> Mapping[str, Sighted]:

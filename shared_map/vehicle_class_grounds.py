@@ -151,8 +151,8 @@ the terrain of the run."""
 
 
 def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: Floats) -> None:
-    """Leave the ground of every class that vehicles belong to in a run's folder, as `prepare` does for the terrain;
-    made-up ones are kept for later runs."""
+    """Leaves the ground of every class that vehicles belong to in a run's folder, as `prepare` does for the
+    terrain; made-up ones are kept for later runs."""
     for name in driven_classes(scenario):
         folder, key = _folder(run_dir, name), _prepared_key(scenario, name)
         if _load(folder, key, scenario, common, name) is not None:
@@ -166,7 +166,7 @@ def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: F
 
 
 def load_classes(setup: RoleSetup, common: Terrain) -> None:
-    """Lets `class_grounds` and `class_terrains` take prepared files in a run's folder, instead of making them."""
+    """Makes `class_grounds` and `class_terrains` take prepared files in a run's folder, instead of making them."""
     if setup.run_dir is not None:
         _open(setup.run_dir, setup.scenario, common)
 

@@ -39,7 +39,7 @@ class ManualClock:
         return self._now_ns
 
     def advance_to(self, now_ns: int) -> None:
-        """Set the time. Raises ValueError on a time before the present one."""
+        """Sets the time. Raises ValueError on a time before the present one."""
         if now_ns < self._now_ns:
             raise ValueError(f"time does not run backwards: {now_ns} < {self._now_ns}")
         self._now_ns = now_ns

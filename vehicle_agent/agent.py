@@ -207,7 +207,7 @@ class Agent:
     # --- driving --------------------------------------------------------------------------------------------
 
     def begin_drive(self, now_ns: int) -> None:
-        """Give every vehicle the time that has passed since it was last driven."""
+        """Gives every vehicle the time that has passed since it was last driven."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
         if self.bodies.is_deaf:
             elapsed_s = 0.0
@@ -215,7 +215,7 @@ class Agent:
         self._driver.begin(self.vehicles, min(elapsed_s, _LONGEST_STEP_S) * self._time_scale)
 
     def drive(self) -> Findings | None:
-        """Let vehicles drive until they come to another cell; returns what they find there, to be written into
+        """Makes vehicles drive until they come to another cell; returns what they find there, to be written into
         the map before they drive on. None when their time is over."""
         self._driver.drive(self.vehicles, self.stopped)
         if not self._driver.entered:
@@ -237,7 +237,7 @@ class Agent:
         return driven
 
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
-        """End routes before cells that are lethal now, and paths also before corners that are.
+        """Ends routes before cells that are lethal now, and paths also before corners that are.
 
         changed  the windows with all cells that have changed
         look     another agent changed the map: compare the view with it again
@@ -263,7 +263,7 @@ class Agent:
                 self._driver.entered[vehicle.cell] = None
 
     def bodies_moved(self) -> None:
-        """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: cells granted
+        """Makes vehicles stop before cells that bodies close, or turn back. Called before they drive: cells granted
         since the last time may be closed, too."""
         if self.bodies.any:
             for vehicle in self.vehicles.values():
@@ -272,7 +272,7 @@ class Agent:
     # --- deciding -------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int) -> list[AgentAction]:
-        """Say what each vehicle needs next; returns the requests to planners."""
+        """States what each vehicle needs next; returns the requests to planners."""
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[tuple[str, int, Reason]]] = {}
         self.blocked_ticks = 0

@@ -187,7 +187,7 @@ class ZonesAround:
         self._due_ns = 0
 
     def update(self, places: Collection[int], now_ns: int, shut: Collection[int] = ()) -> None:
-        """Take in what changed.
+        """Takes in what changed.
 
         places  the cells that our vehicles hold
         shut    cells over which no way out leads: bodies stand there, or vehicles have seen that they are lethal

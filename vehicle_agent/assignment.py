@@ -268,7 +268,7 @@ class _Matching:
         self._swapped = np.zeros((targets, targets), np.int64)
 
     def add(self, start: int, place: int) -> None:
-        """Fill this place of a target, its first being 0, if the one before is: by a free vehicle, if one can be
+        """Fills this place of a target, its first being 0, if the one before is: by a free vehicle, if one can be
         had. Else the target which has this place at the highest cost gives it up, or this one goes without."""
         if self.filled[start] < place:
             return

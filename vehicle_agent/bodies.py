@@ -135,7 +135,7 @@ class Bodies:
     # --- reports --------------------------------------------------------------------------------------------
 
     def take_report(self, report: Body, now_ns: int) -> None:
-        """Take in a report, after `tick` at the same time. A report older than the last one of its sender changes
+        """Takes in a report, after `tick` at the same time. A report older than the last one of its sender changes
         nothing."""
         key = report.id, report.incarnation
         known = self._known.get(key)
@@ -212,7 +212,7 @@ class Bodies:
         return math.hypot(report.x_m - before.x_m, report.y_m - before.y_m) > far_m
 
     def _meet_namesake(self, report: Body, known: _Known | None) -> None:
-        """Tell if two senders take turns under one id; one that was started again does not return."""
+        """Reports if two senders take turns under one id; one that was started again does not return."""
         senders = self._senders.setdefault(report.id, {})
         senders[report.incarnation] = None
         if known is None or len(senders) == 1:
@@ -236,7 +236,7 @@ class Bodies:
     # --- time passes ----------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """End leases, and let what moves go on."""
+        """Ends expired leases, and moves obstacles on."""
         passed_ns = 0 if self._ticked_ns is None else now_ns - self._ticked_ns
         if passed_ns > _DEAF_NS and self._known:
             self._listens_ns = max(self._listens_ns, now_ns + 1)  # this tick
@@ -281,7 +281,7 @@ class Bodies:
         self._close(known, frozenset(), _NOTHING)
 
     def _cover(self, known: _Known, now_ns: int) -> None:
-        """Close what the body can reach by now and within the reaction time."""
+        """Closes what the body can reach by now and within the reaction time."""
         report = known.report
         age_s = max(now_ns - known.heard_ns, 0) / NS_PER_S
         # In steps of half a cell, so that it is seldom computed; never less than said.

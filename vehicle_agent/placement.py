@@ -137,7 +137,7 @@ _ANOTHER_CELL_NS = NS_PER_S
 
 
 class Spawning:
-    """Lets the vehicles of an added agent enter.
+    """Makes the vehicles of an added agent enter.
 
     vehicles  all of the agent
     cells     where they may, the best first
@@ -175,7 +175,7 @@ class Spawning:
         return not self._waiting
 
     def tick(self, informed: bool, now_ns: int) -> None:
-        """Ask for cells. `informed`: whether those could answer who know what earlier lives held."""
+        """Asks for cells. `informed`: whether those could answer who know what earlier lives held."""
         holdings = self._holdings
         if not holdings.life or holdings.replaced:
             return

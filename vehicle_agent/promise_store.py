@@ -109,7 +109,7 @@ class FilePromiseStore(PromiseStore):
         return self._spare >= 0 or self._size - self._at >= self._size // 2
 
     def reserve(self) -> str | None:
-        """Make the spare file. Returns the reason if that fails, None if there is one."""
+        """Makes the spare file. Returns the reason if that fails, None if there is one."""
         if self._spare >= 0:
             return None
         size = max(_SIZE_BYTES, 4 * len(self._all()))
@@ -142,7 +142,7 @@ class FilePromiseStore(PromiseStore):
                 os.close(file)
 
     def _read(self) -> None:
-        """Take in the records of the file, and go on behind them."""
+        """Reads the records of the file, and goes on behind them."""
         data = read_bytes(self._path, FileKind.PROMISES)
         decoder = msgspec.msgpack.Decoder(_Record)
         at = 0
@@ -173,7 +173,7 @@ class FilePromiseStore(PromiseStore):
         return b"".join(len(each).to_bytes(_HEAD_BYTES, "little") + each for each in packed)
 
     def _switch(self) -> None:
-        """Go over to the spare file."""
+        """Goes over to the spare file."""
         why = self.reserve()
         content = self._all()
         try:

@@ -225,7 +225,7 @@ class RightOfWaySync:
                     self._perform([action])
 
     def _tell_members(self, topic: Topic, message: Table | Stored) -> None:
-        """Tell the other members of a plot, each by itself."""
+        """Reports the other members of a plot, each by itself."""
         for member in self.core.plots.members(message.plot):
             if member != self._id:
                 self._bus.publish(topic, message, plot=message.plot, member=member, agent=self._id)

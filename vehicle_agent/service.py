@@ -265,7 +265,7 @@ class AgentService:
             log.info("%d vehicles have their places", len(self.agent.vehicles))
 
     def _on_leave(self, asked: Sequence[str]) -> Removed:
-        """Let vehicles leave, all if none is named; of those that have left already say how far it is."""
+        """Makes vehicles leave, all if none is named; of those that have left already say how far it is."""
         ours = self.agent.plan.vehicle_ids
         left = [id for id in ours if id in asked or not asked]
         self.agent.remove([id for id in left if id not in self._removed])
@@ -376,7 +376,7 @@ class AgentService:
             self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
 
     def _perform(self, actions: list[AgentAction]) -> None:
-        """Ask planners what the core wants to know."""
+        """Asks planners what the core wants to know."""
         for action in actions:
             match action:
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):

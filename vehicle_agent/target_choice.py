@@ -84,7 +84,7 @@ class GroupCosts:
         self._heard[agent] = message, now_ns
 
     def expire(self, since_ns: int) -> None:
-        """Forget agents that were not heard since then: they are gone."""
+        """Forgets agents that were not heard since then: they are gone."""
         self._heard = {agent: heard for agent, heard in self._heard.items() if heard[1] >= since_ns}
 
     @property

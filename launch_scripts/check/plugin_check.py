@@ -58,7 +58,7 @@ def check_plugin(
     folder: str = ".",
     seeds: Iterable[int] = range(4),
 ) -> list[str]:
-    """Ask a plug-in as a run would, and say which promises of its kind it breaks.
+    """Asks a plug-in as a run would, and say which promises of its kind it breaks.
 
     Parameters
     ----------

@@ -161,7 +161,7 @@ def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:
 
 
 def check_places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | None = None) -> None:
-    """Raise ConfigError with the first of `places` that is a failure."""
+    """Raises ConfigError with the first of `places` that is a failure."""
     for finding in places(scenario, terrain, truth, homes):
         if finding.level == "failure":
             raise ConfigError(f"scenario {scenario.name}: {finding.sentence}")

@@ -103,7 +103,7 @@ def _fill_streams() -> None:
 
 
 def _leave_output() -> None:
-    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
+    """Sends what still waits to be printed nowhere: the interpreter would complain about it at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)

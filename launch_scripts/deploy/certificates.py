@@ -192,7 +192,7 @@ def _pem(what: str) -> Iterator[None]:
 
 
 def check_signed(ca: Path, certificate: Path, key: Path) -> None:
-    """Raise StoreError where three files in PEM do not go together: another authority's, another's key, or one of
+    """Raises StoreError where three files in PEM do not go together: another authority's, another's key, or one of
     the certificates not valid today."""
     with _pem(f"{ca}, {certificate} and {key} are not certificates and a key"):
         authority, own, secret = _certificate(ca), _certificate(certificate), _key(key)
@@ -207,7 +207,7 @@ def check_signed(ca: Path, certificate: Path, key: Path) -> None:
 
 
 def _check_today(certificate: x509.Certificate, path: Path, remedy: str) -> None:
-    """Raise StoreError where a certificate is not valid today."""
+    """Raises StoreError where a certificate is not valid today."""
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if not start <= _in_days(0) <= end:
         raise StoreError(f"{path} is good from {start:%Y-%m-%d} to {end:%Y-%m-%d}, not today; {remedy}")

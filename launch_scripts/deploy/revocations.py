@@ -46,7 +46,7 @@ def with_revocations(network: NetworkConfig) -> NetworkConfig:
 
 
 def revoke(folder: Path, names: list[str]) -> Path:
-    """Add names to a folder's file of revoked names, whole or not at all. Returns its path."""
+    """Adds names to a folder's file of revoked names, whole or not at all. Returns its path."""
     path = folder / FILE
     checked = [_checked(name, "a name to revoke") for name in names]
     every = dict.fromkeys((*revoked_in(folder), *checked))

@@ -233,7 +233,7 @@ class OutlivingOutput:
         return getattr(self._stream, name)
 
     def _survive(self, work: Callable[[], object]) -> None:
-        """Lets the descriptor lead nowhere, for all who write to it: what still waits in the stream is lost there,
+        """Makes the descriptor lead nowhere, for all who write to it: what still waits in the stream is lost there,
         and not an error again at each flush up to the interpreter's end."""
         try:
             work()
@@ -247,7 +247,7 @@ class OutlivingOutput:
 
 
 def make_output_outlive_readers() -> None:
-    """Let standard output and standard error of this process outlive their readers."""
+    """Makes standard output and standard error of this process outlive their readers."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is not None and not isinstance(stream, OutlivingOutput):

@@ -57,8 +57,8 @@ def fetch_if_missing(
     roles: Collection[str],
     progress: Progress = no_progress,
 ) -> bool:
-    """Fetch the terrain from a keeper if files of it are missing here, and save it prepared in the run's folder for
-    every process of this machine. True if the run's folder then holds a fetched terrain.
+    """Fetches the terrain from a keeper if files of it are missing here, and save it prepared in the run's folder
+    for every process of this machine. True if the run's folder then holds a fetched terrain.
 
     found  processes of runs in the namespace; the run's terrain is theirs
     roles  roles that this machine is about to start
@@ -93,7 +93,7 @@ def fetch_if_missing(
 
 @contextlib.contextmanager
 def _locked(run_dir: Path) -> Iterator[None]:
-    """Lets one process at a time fetch into a run's folder."""
+    """Makes one process at a time fetch into a run's folder."""
     try:
         lock = (run_dir / "terrain.lock").open("wb")
     except OSError as error:

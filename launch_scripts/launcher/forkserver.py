@@ -30,7 +30,7 @@ _BACKGROUND = 5
 
 
 def start_forkserver(loads: str | None) -> None:
-    """Let a forkserver load what roles share, beside this process. Does nothing where it runs already.
+    """Makes a forkserver load what roles share, beside this process. Does nothing where it runs already.
 
     loads  `ROLES_ONLY` or `ROLES_AND_KERNELS`; None: nothing
     """
@@ -105,7 +105,7 @@ class WarmUp:
         return f"compiling kernels, once: {self._all - len(self._left)} of {self._all}{first}"
 
     def close(self) -> None:
-        """End what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
+        """Ends what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
         with self._lock:
             self._closed = True
             for builder in self._builders:
@@ -173,8 +173,8 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
 
 
 def _say(tell: Connection, what: object) -> None:
-    """Tell the launcher. A launcher that has refused its scenario meanwhile has closed the pipe, and its user must
-    read no traceback of that."""
+    """Reports the launcher. A launcher that has refused its scenario meanwhile has closed the pipe, and its user
+    must read no traceback of that."""
     with contextlib.suppress(OSError):
         tell.send(what)
 

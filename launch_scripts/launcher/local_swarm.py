@@ -209,13 +209,13 @@ class LocalSwarm:
                 self._start(running)
 
     def add(self, spec: ProcessSpec) -> None:
-        """Start one more process. Raises SwarmError, and adds none, where it cannot be started."""
+        """Starts one more process. Raises SwarmError, and adds none, where it cannot be started."""
         running = Running(spec)
         self._start(running)
         self.running.append(running)
 
     def dismiss(self, spec: ProcessSpec) -> None:
-        """Ask a process to end for good. Once it has, it is not in `running` any more."""
+        """Asks a process to end for good. Once it has, it is not in `running` any more."""
         for running in self.running:
             if running.spec.name == spec.name and running.dismissed_s is None:
                 running.dismissed_s, running.due_s = time.monotonic(), None
@@ -223,7 +223,7 @@ class LocalSwarm:
                     running.process.terminate()
 
     def _let_go(self) -> None:
-        """Forget dismissed processes that have ended, and kill those that do not."""
+        """Forgets dismissed processes that have ended, and kill those that do not."""
         for running in [each for each in self.running if each.dismissed_s is not None]:
             if running.alive and running.exitcode is None:
                 if time.monotonic() - (running.dismissed_s or 0.0) > STOP_GRACE_S:
@@ -261,7 +261,7 @@ class LocalSwarm:
         return endings
 
     def _end_hung(self) -> None:
-        """End processes whose loop stands still: at first by SIGABRT, at which they write into their log where all
+        """Ends processes whose loop stands still: at first by SIGABRT, at which they write into their log where all
         of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
         SIGKILL."""
         now_s = time.monotonic()
@@ -415,7 +415,7 @@ class LocalSwarm:
 def _ask(
     processes: Sequence[Running], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
 ) -> None:
-    """Ask processes to end, and wait until all have, the time is over, or `force` says so."""
+    """Asks processes to end, and waits until all have, the time is over, or `force` says so."""
     for running in processes:
         if running.process is not None:
             running.process.terminate()
@@ -426,7 +426,7 @@ def _ask(
 def _wait(
     done: Callable[[], bool], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
 ) -> None:
-    """Wait until it is done, the time is over, or `force` says so."""
+    """Waits until it is done, the time is over, or `force` says so."""
     deadline_s = time.monotonic() + within_s
     while not done() and time.monotonic() < deadline_s and not force():
         while_waiting()

@@ -113,7 +113,7 @@ class LogFile(RotatingFileHandler):
 def log_to(
     path: Path | None, format: LogFormat = "text", speaker: Speaker | None = None, *, takes_output: bool = False
 ) -> None:
-    """Log to a file, or to standard error if there is none. `speaker`: who logs, where that is known."""
+    """Logs to a file, or to standard error if there is none. `speaker`: who logs, where that is known."""
     handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
     handler.setFormatter(JsonLines(speaker) if format == "json" else FORMAT)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

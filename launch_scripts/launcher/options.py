@@ -188,7 +188,7 @@ both versions agree on one."""
 
 
 def common_run_id(scenario: Scenario) -> str:
-    """Run id derived from the scenario, so that separately started parts agree on it."""
+    """Runs id derived from the scenario, so that separately started parts agree on it."""
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )

@@ -76,7 +76,7 @@ class _RefusedError(SwarmError):
 
 
 def run_swarm(options: UpOptions) -> int:
-    """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
+    """Runs to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
     for spec in options.table:
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing

@@ -51,7 +51,7 @@ class OwnPart(LatestState):
         return self
 
     def look_after(self, own: frozenset[ProcessSpec]) -> None:
-        """Take these processes for the launcher's own."""
+        """Takes these processes for the launcher's own."""
         crew = tuple(sorted((spec.role, spec.id) for spec in own if TABLE[spec.role].is_needed))
         targets = tuple(dict.fromkeys(job_of(id) for role, id in crew if role == "planner"))
         self.own, self.plan = own, RunPlan(targets, crew, 0, self.plan.started_ns)
@@ -126,8 +126,8 @@ class Watcher(RunObserver):
             self.ask_gone()  # of a run that this is a part of
 
     def look_after(self, processes: Collection[ProcessSpec]) -> None:
-        """Hear these processes and no others, where another launcher records the run; call it again whenever they
-        may have changed."""
+        """Receives these processes and no others, where another launcher records the run; call it again whenever
+        they may have changed."""
         if not isinstance(self.known, OwnPart) or self.known.own == (own := frozenset(processes)):
             return
         for spec in self.known.own - own:

@@ -326,7 +326,7 @@ class FiguresPanel:
 
 
 def level_of(kind: str) -> str:
-    """Log level of a note, as rerun names it."""
+    """Logs level of a note, as rerun names it."""
     return "WARN" if kind in KINDS or any(word in kind for word in _WARNINGS) else "INFO"
 
 

@@ -28,7 +28,7 @@ _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba"
 
 
 def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True) -> list[str]:
-    """Write `scenario.toml` and `run.json`, and make `LAST` point here. Returns what a person should know: a run
+    """Writes `scenario.toml` and `run.json`, and makes `LAST` point here. Returns what a person should know: a run
     goes on without them, as on a full disk.
 
     recorded  whether a report follows; else another launcher of the run makes it
@@ -84,7 +84,7 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 
 def point_last(folder: Path) -> str | None:
-    """Let `LAST` beside a run's folder mean that run, at one instant. Returns a sentence the first time that it
+    """Makes `LAST` beside a run's folder mean that run, at one instant. Returns a sentence the first time that it
     cannot be a link, and whenever it cannot be at all."""
     last = folder.parent / LAST
     partial = folder.parent / f".{LAST}.{os.getpid()}"
@@ -173,7 +173,7 @@ def processor() -> str:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Replace a file at one instant. Raises OSError."""
+    """Replaces a file at one instant. Raises OSError."""
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
@@ -229,7 +229,7 @@ class DiskWatch:
 
 
 def can_write(folder: Path, size: int = _PROBE_BYTES) -> None:
-    """Write a file of some bytes and remove it. Raises OSError."""
+    """Writes a file of some bytes and removes it. Raises OSError."""
     probe = folder / ".space"
     try:
         probe.write_bytes(bytes(size))

@@ -62,7 +62,7 @@ _LEAST, _MOST = 8, 600
 
 
 def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
-    """Write the recording of a run; returns a line about it. Raises ConfigError or StoreError in one sentence."""
+    """Writes the recording of a run; returns a line about it. Raises ConfigError or StoreError in one sentence."""
     tracks = tracks_of_run(folder)
     report = read_report(folder) if (folder / REPORT_FILE).exists() else {}
     ground = read_ground(folder, tracks.grid)
@@ -88,7 +88,7 @@ class Told(NamedTuple):
 
 
 def _write(path: Path, timeline: Iterable[Told], types: RosTypes, facts: Mapping[str, str]) -> Counter[str]:
-    """Write messages as they come, in compressed chunks of a megabyte; returns how many each topic has.
+    """Writes messages as they come, in compressed chunks of a megabyte; returns how many each topic has.
     Raises StoreError.
 
     facts  about the run, for a reader of the file

@@ -47,7 +47,7 @@ _PLOT_IN, _PLOT = (4.1, 1.8), (0.125, 0.135, 0.775, 0.7)
 
 
 def write_page(folder: Path) -> Path:
-    """Write the page of a run from what its folder holds. Raises ConfigError or StoreError in one sentence."""
+    """Writes the page of a run from what its folder holds. Raises ConfigError or StoreError in one sentence."""
     report = read_report(folder)
     path = folder / PAGE_FILE
     try:

@@ -123,7 +123,7 @@ class Node:
         return self._clock.now_ns() + self._offset_ns
 
     def boot(self) -> None:
-        """Start a new incarnation."""
+        """Starts a new incarnation."""
         if self.bus is not None or self.retired:
             return
         simulation = self._simulation

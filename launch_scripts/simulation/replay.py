@@ -144,7 +144,7 @@ def _heads(folder: Path) -> tuple[list[tuple[Head, Path]], list[tuple[Path, str]
 
 
 def replay_run(folder: Path, process: str | None = None, until_s: float | None = None) -> Iterator[Replayed]:
-    """Feed the recordings of a run to the services of this build, each in turn. Raises as `recordings_of`."""
+    """Feeds the recordings of a run to the services of this build, each in turn. Raises as `recordings_of`."""
     grounds: dict[str, tuple[Terrain, Floats]] = {}
     for recorded in recordings_of(folder, process):
         outcome, why, head = None, None, recorded.head
@@ -192,7 +192,7 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
 
 
 def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
-    """Copy a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
+    """Copies a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
     StoreError."""
     head, scenario = recorded.head, folder / SCENARIO_FILE
     path = path_of(folder, head.role, head.id, head.incarnation)

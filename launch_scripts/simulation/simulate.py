@@ -58,7 +58,7 @@ class EventLog:
         self._write(f"{whole}.{rest:09d} {what} {whom}\n")
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Writes what waits."""
         self._write("")
 
     def _write(self, line: str) -> None:

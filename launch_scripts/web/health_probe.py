@@ -50,7 +50,7 @@ class Answer(NamedTuple):
 
 
 def ask(url: str, *, live: bool) -> Answer:
-    """Ask whether processes are ready, or with `live` whether they live. Raises BusError if there is no reply,
+    """Asks whether processes are ready, or with `live` whether they live. Raises BusError if there is no reply,
     ConfigError if the address is invalid."""
     host, port, path = _place(url)
     try:

@@ -53,7 +53,7 @@ def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
 
 @kernel(f"(f4[:, ::1], f8, f8, {BOX}, i8, f4[::1], i8[::1], f4[::1])")
 def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before):
-    """Update the cell costs of a window, and list what changed.
+    """Updates the cell costs of a window, and list what changed.
 
     pace           none of the window is NaN, zero or negative
     cells, before  int64 padded cells and float32 cost before, written; both have room for the whole window
@@ -77,7 +77,7 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
 
 @kernel("(i4[::1], i8[::1])")
 def count_classes(bits, counts):
-    """Add to `counts` (int64, 1 << 11) how many cell costs begin with the same 11 bits."""
+    """Adds to `counts` (int64, 1 << 11) how many cell costs begin with the same 11 bits."""
     for i in range(bits.size):
         counts[np.uint64(bits[i] >> 20)] += 1
 
@@ -129,7 +129,7 @@ def cut_window(cell_cost_bits, stride, box, part_bits):
 
 @kernel(f"(f4[::1], {BOX}, f8, i8, f4[::1], i8)")
 def merge_window(part, box, offset, old_root, cost, stride):
-    """Lower a tree's costs, which are stored less `offset` (s), to those of a window grown around a new root
+    """Lowers a tree's costs, which are stored less `offset` (s), to those of a window grown around a new root
     (`part`).
 
     Only cells that get cheaper are rewritten, and the old root, so that costs stay upper bounds of the cost driven

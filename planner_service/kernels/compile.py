@@ -241,7 +241,7 @@ def _load(compiled: Any) -> Any:
 
 
 def load(compiled: Any, compiling: bool = True) -> bool:
-    """Make a kernel ready to be called. Returns whether it is; without `compiling`, only if it is on disk."""
+    """Makes a kernel ready to be called. Returns whether it is; without `compiling`, only if it is on disk."""
     if not is_loaded(compiled) and (compiling or is_on_disk(compiled)):
         _load(compiled)
     return is_loaded(compiled)

@@ -74,7 +74,7 @@ def make_walk(size: int, stride: int, rule: int) -> Walk:
 
 @helper
 def _find_children(parent, stride, children):
-    """Write `children` of all inner cells. Vectorises."""
+    """Writes `children` of all inner cells. Vectorises."""
     s = np.uint64(stride)
     for i in range(s + _ONE, np.uint64(parent.size) - s - _ONE):
         bits = np.uint8(1) if parent[i - s] == 4 else np.uint8(0)
@@ -164,7 +164,7 @@ def _improve(grid, climbs, labels, rows, best, lowered):
 
 @helper
 def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
-    """Lower what hangs on the `count` cells of `queue`, whose costs have fallen, along the parents, and note all
+    """Lowers what hangs on the `count` cells of `queue`, whose costs have fallen, along the parents, and note all
     that in `rows`. A cell that hangs on two of them may be lowered twice. Returns how many times one was, or -1
     beyond the queue's room."""
     cell_cost, _, stride, _, _ = grid
@@ -201,7 +201,7 @@ def _note_all(rows, stride):
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, {BUCKETS}, f8, i8, {SCRATCH}, {_WALK})", CLIMBS)
 def mend(grid, climbs, labels, buckets, farthest, most, scratch, walk):
-    """Make a tree exact, whatever its costs are, as long as its parents lead to the root.
+    """Makes a tree exact, whatever its costs are, as long as its parents lead to the root.
 
     buckets   as `repair.spread` says
     farthest  s; the tree must be grown where a cost exceeds it

@@ -147,7 +147,7 @@ def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
 
 @step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)
 def point_to_parents(grid, climbs, cost, root, box, parent):
-    """Write the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
+    """Writes the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
     north, east, south, west, then of the diagonals clockwise."""
     row0, col0, row1, col1 = box
     stride = grid[2]

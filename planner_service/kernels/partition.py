@@ -290,7 +290,7 @@ def next_in(which, n, sets, words):
 
 @helper
 def push_around(which, t, across, place, sets):
-    """Put a tile and those about it into a set."""
+    """Puts a tile and those about it into a set."""
     row, col = t // across, t % across
     down = place.size // across
     for i in range(max(row - 1, 0), min(row + 2, down)):
@@ -300,7 +300,7 @@ def push_around(which, t, across, place, sets):
 
 @helper
 def _load_own(t, grid, across, scratch):
-    """Put cell costs of a tile on the scratch."""
+    """Puts cell costs of a tile on the scratch."""
     cell_cost, _, stride, _, _ = grid
     own = scratch.own
     origin, rows, cols = corner_of(grid, across, t)
@@ -315,7 +315,7 @@ def _load_own(t, grid, across, scratch):
 
 @helper
 def _load_parents(t, grid, tree, across, scratch):
-    """Put the parents of a tile on the scratch. The costs of its cells inside it are less than 0 until known, and
+    """Puts the parents of a tile on the scratch. The costs of its cells inside it are less than 0 until known, and
     they have no piece."""
     stride, parent = grid[2], tree.parent
     inner, code, name = scratch.inner, scratch.code, scratch.name
@@ -365,7 +365,7 @@ def _follow(t, grid, across, scratch):
 
 @helper
 def load_offsets(t, grid, tree, tiles, scratch):
-    """Put cell costs of a tile on the scratch, and what each cell costs inside it."""
+    """Puts cell costs of a tile on the scratch, and what each cell costs inside it."""
     exits, many, across = tiles.exits, tiles.many, tiles.across
     names, inner, kept, place = scratch.border, scratch.inner, scratch.kept, scratch.place
     _load_own(t, grid, across, scratch)
@@ -387,8 +387,8 @@ def load_offsets(t, grid, tree, tiles, scratch):
 
 @helper
 def _cache_offsets(t, scratch):
-    """Keep what the cells of a tile cost inside it, from the scratch, in the place of another tile where all places
-    are taken: of the one that has had its place for longest."""
+    """Keeps what the cells of a tile cost inside it, from the scratch, in the place of another tile where all
+    places are taken: of the one that has had its place for longest."""
     inner, kept, place, holder = scratch.inner, scratch.kept, scratch.place, scratch.holder
     if place[t] < 0:
         next = holder[holder.size - 1]
@@ -406,7 +406,7 @@ def _cache_offsets(t, scratch):
 
 @helper
 def store_offsets(t, tree, scratch):
-    """Keep what the cells of a tile cost inside it, from the scratch: those on its border for good."""
+    """Keeps what the cells of a tile cost inside it, from the scratch: those on its border for good."""
     rim = tree.rim
     names, inner = scratch.border, scratch.inner
     for each in range(4 * SIDE - 4):
@@ -416,7 +416,7 @@ def store_offsets(t, tree, scratch):
 
 @helper
 def relabel_tile(t, grid, tree, tiles, scratch):
-    """Write which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
+    """Writes which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
     one that has no parent have no way."""
     piece, root = tree.piece, tree.root
     exits, many, span, across = tiles.exits, tiles.many, tiles.span, tiles.across
@@ -457,7 +457,7 @@ def relabel_tile(t, grid, tree, tiles, scratch):
 
 @helper
 def request_around(tiles, t, what):
-    """Ask something of a tile, and of those about it."""
+    """Asks something of a tile, and of those about it."""
     across = tiles.across
     wanted = tiles.wanted
     row, col = t // across, t % across

@@ -71,7 +71,7 @@ _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 @helper
 def _load_line(count, first, steps, other, grid, tree, scratch):
-    """Put `count` cells of tile `other` on the scratch; there is no such tile where cells are lethal.
+    """Puts `count` cells of tile `other` on the scratch; there is no such tile where cells are lethal.
 
     first  where the first is on the map, in its tile, on the scratch
     steps  from one to the next, in the same order
@@ -93,7 +93,7 @@ def _load_line(count, first, steps, other, grid, tree, scratch):
 
 @helper
 def _load_tile(t, grid, tree, tiles, scratch):
-    """Put a tile on the scratch, with the cells around."""
+    """Puts a tile on the scratch, with the cells around."""
     stride = grid[2]
     piece, across = tree.piece, tiles.across
     cost, inner = scratch.cost, scratch.inner
@@ -237,7 +237,7 @@ def _spread(t, grid, tree, tiles, scratch, count, least):
 
 @helper
 def _improve_tile(t, grid, tree, tiles, scratch):
-    """Look at a tile; returns whether a parent has changed."""
+    """Checks a tile; returns whether a parent has changed."""
     _, _, _, rule, corners = grid
     piece = tree.piece
     total = tree.total
@@ -373,7 +373,7 @@ def _merge_tile(t, grid, tree, across, window, inner, old_root, changed):
 
 @kernel(GRID, TREE, TILES, SCRATCH, _WINDOW, "i8", "u1[::1]")
 def merge_parents(grid, tree, tiles, scratch, window, old_root, changed):
-    """Take the parents of a window that was grown around a new root (`tree`), where its costs are less than the
+    """Takes the parents of a window that was grown around a new root (`tree`), where its costs are less than the
     tree's and the way from the old root to the new one.
 
     window   (part, part_parent, box, way): its costs and parents, and the way between the roots, s

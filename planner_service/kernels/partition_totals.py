@@ -83,8 +83,8 @@ def _change(total, y):
 
 @helper
 def note_changes(t, tree, tiles):
-    """Write `falls` and `ends` of a tile whose totals have changed, and whether pieces have lost their way or found
-    one."""
+    """Writes `falls` and `ends` of a tile whose totals have changed, and whether pieces have lost their way or
+    found one."""
     total = tree.total
     exits, many, wanted, falls, ends = tiles.exits, tiles.many, tiles.wanted, tiles.falls, tiles.ends
     least, most, near, far = np.inf, -np.inf, np.inf, 0.0
@@ -227,7 +227,7 @@ def _rise(t, tiles):
 
 @helper
 def queue_checks(tree, tiles, scratch, schedule):
-    """Put tiles into `CHECKING` that are to be checked: where it is wanted, and where a piece's total has risen by
+    """Puts tiles into `CHECKING` that are to be checked: where it is wanted, and where a piece's total has risen by
     more than that of one beside it since they were looked at. Only tiles about which totals have changed, and those
     of `NEARBY`, are asked; others stay in it or out of it."""
     wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
@@ -275,7 +275,7 @@ def _forget_all(t, tree, tiles):
 
 @helper
 def _link(t, name, grid, tree, across, names):
-    """Write where a piece leads, and how far that is."""
+    """Writes where a piece leads, and how far that is."""
     cell_cost, offsets, stride, rule, _ = grid
     parent, piece, rim = tree.parent, tree.piece, tree.rim
     total, successor = tree.total, tree.successor
@@ -411,7 +411,7 @@ def begin(tiles, schedule):
 
 @kernel(GRID, TREE, TILES, SCRATCH, SCHEDULE)
 def add_up(grid, tree, tiles, scratch, schedule):
-    """Evaluate totals, and note where they have risen."""
+    """Evaluates totals, and note where they have risen."""
     begin(tiles, schedule)
     evaluate_totals(grid, tree, tiles, scratch.border, schedule, schedule.now)
     queue_checks(tree, tiles, scratch, schedule)

@@ -111,7 +111,7 @@ def segment_cost(pace, flight, cols, corners, start, end, limit):
 
 @helper
 def _pull(pace, flight, cols, corners, scratch, size):
-    """Write `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never
+    """Writes `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never
     costlier than the route itself: the any-angle cost of each cell is at most that of the cell before plus the step
     between."""
     cells, costs, before, turns = scratch
@@ -161,7 +161,8 @@ def _goes_straight(cols, a, b, c):
 
 @helper
 def _lay_out(cols, start, end, directions, at):
-    """Write the steps along the cells that a segment crosses, from index `at` on; returns the index behind them."""
+    """Writes the steps along the cells that a segment crosses, from index `at` on; returns the index behind
+    them."""
     down, right = end // cols - start // cols, end % cols - start % cols
     rows_left, cols_left = abs(down), abs(right)
     whole = 2 * max(rows_left, 1) * max(cols_left, 1)
@@ -192,7 +193,7 @@ def _lay_out(cols, start, end, directions, at):
     _FLIGHT,
 )
 def pull_routes(pace, flight, offsets, corners, routes, scratch, pulled, prices):
-    """Write `pulled` and `prices`. A route that is not to be pulled stays as it is, each step a segment; so does
+    """Writes `pulled` and `prices`. A route that is not to be pulled stays as it is, each step a segment; so does
     one that meets a lethal cell, which costs inf."""
     cols = offsets[4]
     starts, directions, ends, stays = routes

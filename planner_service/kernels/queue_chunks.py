@@ -53,7 +53,7 @@ def empty(queue, buckets):
 
 @helper
 def put(queue, cells, count, buckets, mask, first):
-    """Put cells into the queue, each into its bucket, modulo the length of the circular queue that begins at
+    """Puts cells into the queue, each into its bucket, modulo the length of the circular queue that begins at
     bucket `first`; `mask` is that length less one."""
     pool, link, spare, _, tail, counts = queue
     low = (_ONE << _SHIFT) - _ONE
@@ -76,7 +76,7 @@ def put(queue, cells, count, buckets, mask, first):
 
 @helper
 def take(queue, b, batch):
-    """Move all cells of a bucket to `batch`. Returns how many."""
+    """Moves all cells of a bucket to `batch`. Returns how many."""
     pool, link, spare, head, tail, counts = queue
     size = _ONE << _SHIFT
     position = head[b]

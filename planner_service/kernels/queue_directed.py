@@ -80,7 +80,7 @@ def make_scratch(size: int) -> Scratch:
 
 @helper
 def _serve_once(cost, batch, n):
-    """Keep those cells of a batch that were not served yet, and mark them. Returns how many."""
+    """Keeps those cells of a batch that were not served yet, and mark them. Returns how many."""
     kept = _ZERO
     for p in range(n):
         ahead = np.uint64(batch[p + np.uint64(_AHEAD)])
@@ -240,7 +240,7 @@ def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
 
 @helper
 def _look(cell_cost, cost, inverse, end, batch, n):
-    """Keep those cells of a batch that were not served yet. Returns how many; how many of them may offer less than
+    """Keeps those cells of a batch that were not served yet. Returns how many; how many of them may offer less than
     index `end`; and the least that any may offer."""
     kept = _ZERO
     within = _ZERO
@@ -262,7 +262,7 @@ def _look(cell_cost, cost, inverse, end, batch, n):
 
 @helper
 def _put_back(cost, inverse, served, level, batch, n, least, scratch):
-    """Let those cells of a batch wait, at `level` or above, that cost more than `least`. Returns how many are
+    """Makes those cells of a batch wait, at `level` or above, that cost more than `least`. Returns how many are
     left."""
     touched, chosen, _, _, waiting, queue = scratch
     room = np.uint64(8) * _PIECE
@@ -286,7 +286,7 @@ def _put_back(cost, inverse, served, level, batch, n, least, scratch):
 
 @helper
 def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
-    """Let the cells of the batch that have not yet make their offers."""
+    """Makes the cells of the batch that have not yet make their offers."""
     cell_cost, _, stride, rule, corners = grid
     touched, chosen, batch, steps, waiting, queue = scratch
     s = np.uint64(stride)

@@ -15,7 +15,7 @@ from planner_service.kernels.layout import INF
 
 @helper
 def heap_pop(keys, items, place, size):
-    """Remove the first of `size` elements."""
+    """Removes the first of `size` elements."""
     place[items[0]] = -1
     size -= 1
     if size == 0:
@@ -42,7 +42,7 @@ def heap_pop(keys, items, place, size):
 
 @helper
 def heap_lower(keys, items, place, size, key, item):
-    """Give an item a lower key; one that is not in the heap of `size` elements comes in. Returns its size."""
+    """Gives an item a lower key; one that is not in the heap of `size` elements comes in. Returns its size."""
     hole = place[item]
     if hole < 0:
         hole = size
@@ -63,7 +63,7 @@ def heap_lower(keys, items, place, size, key, item):
 
 @kernel("void(f4[::1], i8[::1], f8, i8, f4[::1], Tuple((f4[::1], i8[::1], i4[::1])))")
 def arrivals(cell_cost, offsets, diagonal, start, cost, heap):
-    """Write how soon something that begins on a cell can be on each other one, by Dijkstra's algorithm.
+    """Writes how soon something that begins on a cell can be on each other one, by Dijkstra's algorithm.
 
     cell_cost  float32 (n,), padded; inf is lethal, and the border
     cost       float32 (n,), written, from the start to each cell; inf where there is no way

@@ -89,7 +89,7 @@ def _bucket(key, base, inverse):
 
 @helper
 def _file(cell_cost, cost, length, first, era, current, cells, count, queue, left, places):
-    """Put those cells into the queue whose exit key lies beyond the bucket `current`: into the circle of this kind
+    """Puts those cells into the queue whose exit key lies beyond the bucket `current`: into the circle of this kind
     of step, which begins at `first`, or behind it if their turn does not come within a circle. Returns how many."""
     base, inverse = era
     n = _ZERO
@@ -133,7 +133,7 @@ def _gather(grid, cost, queue, kind, length, first, least, cells, batch):
 
 @helper
 def _begin_anew(grid, cost, width, batch, slanted, places, queue):
-    """Fill the circles from the lowest exit key on. Returns (that key, how many wait)."""
+    """Fills the circles from the lowest exit key on. Returns (that key, how many wait)."""
     cell_cost, _, _, rule, _ = grid
     n, base = _gather(grid, cost, queue, 2 if rule == RULE_PAPER else 0, _ONE32, _STRAIGHT, INF, batch, places)
     m = _ZERO
@@ -148,7 +148,7 @@ def _begin_anew(grid, cost, width, batch, slanted, places, queue):
 
 @helper
 def _serve_again(grid, cost, era, current, touched, count, ring, most):
-    """Serve those touched cells whose exit key falls back into the bucket that touched them, until none is offered
+    """Serves those touched cells whose exit key falls back into the bucket that touched them, until none is offered
     less.
 
     Returns (how many cells are touched now, how many were served, whether they are no more than `most`; if not,

@@ -160,7 +160,7 @@ def _best_offers(cell_cost, cost, climbs, s, begin, end, diagonal, corners, best
 
 @helper
 def _sweep(grid, climbs, cost, rows, floor, best, lowered, count):
-    """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
+    """Lowers the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
     more and are offered less. Appends them to the `count` that are in `lowered`; returns how many there are."""
     cell_cost, _, stride, rule, corners = grid
     first, last = rows
@@ -203,7 +203,7 @@ def _begin_anew(keys, behind, heads, overflow, inverse):
 
 @helper
 def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, heads):
-    """Let costs that have fallen spread, until no cell is offered less than it costs.
+    """Spreads costs that have fallen, until no cell is offered less than it costs.
 
     buckets  width: up to the lowest cell cost no cell is served twice; beyond, costs are right too
     lowered  `count` cells whose cost has fallen; taken over
@@ -307,7 +307,7 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
 
 @helper
 def point_near(grid, climbs, labels, rows):
-    """Write the parents of the cells of `rows`, and of those next to them."""
+    """Writes the parents of the cells of `rows`, and of those next to them."""
     stride = grid[2]
     cost, parent, root = labels
     first, last = rows
@@ -357,7 +357,7 @@ def _detach(grid, cost, parent, changed, before, limit, detached):
 
 @helper
 def _detach_behind(cost, parent, offsets, detached, count, limit):
-    """Detach all whose way leads over the `count` cells that are detached already."""
+    """Detaches all whose way leads over the `count` cells that are detached already."""
     done = 0
     while done < count and count <= limit:
         u = np.uint64(detached[done])
@@ -374,7 +374,7 @@ def _detach_behind(cost, parent, offsets, detached, count, limit):
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {SCRATCH})", CLIMBS)
 def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
-    """Bring a tree up to date after the costs of `changed` cells became what they are now.
+    """Brings a tree up to date after the costs of `changed` cells became what they are now.
 
     buckets  as `spread` says
     most     (detached, with_cheaper, served): how many cells may lose their way, the same where some cells got

@@ -114,7 +114,7 @@ def tighten(grid, climbs, labels, stamp, now, cells, trail):
     CLIMBS,
 )
 def grow_strides(grid, climbs, labels, network, stamps, box, reach, scratch):
-    """Let the costs of a window around the root spread outward over the networks of strides.
+    """Spreads the costs of a window around the root outward over the networks of strides.
 
     stamps  (stamp, now)
     box     the window, whose costs are new
@@ -152,7 +152,7 @@ def grow_strides(grid, climbs, labels, network, stamps, box, reach, scratch):
 
 @helper
 def _seed(cost, network, stride, root, box, reach, scratch):
-    """Begin the heap with the nodes of the least stride inside the window, and shut out those of the wrong stride.
+    """Begins the heap with the nodes of the least stride inside the window, and shut out those of the wrong stride.
 
     A node takes part where its stride is the one for its distance, or a block nearer or further: the centre of any
     cell's node is less than a block away. Returns how many are in the heap.

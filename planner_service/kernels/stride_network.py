@@ -43,7 +43,7 @@ def _leads(cell_cost, offsets, corners, u, k):
 
 @kernel(f"({GRID}, i8, i4[::1], u4[::1], u4[::1])")
 def cut_blocks(grid, side, node, centre, queue):
-    """Find the nodes of blocks of `side` x `side` cells, and their centres: cells that are cheap, and near the
+    """Finds the nodes of blocks of `side` x `side` cells, and their centres: cells that are cheap, and near the
     middle of their block.
 
     node    which cells there are: OPEN, or -1; written
@@ -70,7 +70,7 @@ def cut_blocks(grid, side, node, centre, queue):
 
 @helper
 def _flood(grid, side, box, node, count, first, queue):
-    """Give a component its number. Returns its centre."""
+    """Gives a component its number. Returns its centre."""
     cell_cost, offsets, stride, rule, corners = grid
     row0, col0, row1, col1 = box
     node[first] = count
@@ -102,7 +102,7 @@ def _flood(grid, side, box, node, count, first, queue):
 
 @kernel(f"({GRID}, i4[::1], u4[::1], f4[::1], u1[::1], i4[::1], Tuple((f4[::1], i8[::1], i4[::1])))")
 def find_ways_to_centres(grid, node, centre, cost, parent, depth, heap):
-    """Grow a tree from each centre over the cells of its node (Dijkstra's algorithm with a binary heap). Writes
+    """Grows a tree from each centre over the cells of its node (Dijkstra's algorithm with a binary heap). Writes
     cost, parent and depth of all cells that belong to a node.
 
     heap  keys, items, place: the first two with room for the cells of a block, the last for all
@@ -136,7 +136,7 @@ def find_ways_to_centres(grid, node, centre, cost, parent, depth, heap):
 
 @kernel(f"({GRID}, i4[::1], f4[::1], i8, i8[::1], f4[::1], i8[::1])")
 def join_nodes(grid, node, cost, nodes, pairs, prices, steps):
-    """Find all links, each with its cheapest step.
+    """Finds all links, each with its cheapest step.
 
     pairs   int64, a power of two, 0: a hash table; written: lower node * `nodes` + higher node + 1
     prices  float32, s, of the same size; written: of the way through the step
@@ -173,7 +173,7 @@ def join_nodes(grid, node, cost, nodes, pairs, prices, steps):
 
 @kernel("(i8[::1], u1[::1], i4[::1], i8[::1], i8[::1], u1[::1], u4[::1], i4[::1])")
 def write_paths(offsets, parent, depth, steps, begins, paths, centre, node):
-    """Write the ways of links, from the centre of the node that the step leaves to that of the other.
+    """Writes the ways of links, from the centre of the node that the step leaves to that of the other.
 
     steps   int64, as `join_nodes` writes them; less than 0: ~padded cell, where the way ends
     begins  int64, where each begins in `paths`

@@ -221,7 +221,7 @@ class Belief:
         return reached
 
     def predict(self, seconds: float) -> None:
-        """Let the target drive on for some seconds."""
+        """Moves the target on for some seconds."""
         steps = min(max(math.ceil(seconds / self._most_s), 1), _MOST_STEPS)
         for _ in range(steps):
             self._drive(seconds / steps)

@@ -55,7 +55,7 @@ class Ways:
         return self._costs.passable(cell)
 
     def grow(self, cell: int) -> None:
-        """Find the cheapest ways from a passable cell to all others."""
+        """Finds the cheapest ways from a passable cell to all others."""
         if not self._cost.size:
             self._cost = np.empty(self._costs.size, np.float32)
             self._parent = np.empty(self._costs.size, np.uint8)

@@ -111,7 +111,7 @@ class TargetSearch:
         pace: Floats,
         now_ns: int,
     ) -> None:
-        """Begin or end the search if it is time to, and follow what vehicles have looked at.
+        """Begins or end the search if it is time to, and follow what vehicles have looked at.
 
         pose     the newest; None before the first
         place_m  its (east, south) from the grid's corner

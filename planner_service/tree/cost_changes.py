@@ -56,7 +56,7 @@ class CostRange:
         block_ranges(costs.view(np.int32), np.arange(self._ranges.shape[1]), self._ranges)
 
     def change(self, costs: Floats, cells: Cells) -> None:
-        """Become the range of the array after these cells of it have changed."""
+        """Becomes the range of the array after these cells of it have changed."""
         block_ranges(costs.view(np.int32), np.unique(cells // BLOCK), self._ranges)
 
     @property
@@ -115,7 +115,7 @@ class Rounding:
 
     @cached_property
     def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower bounds on the sum of the n cheapest cells, s, and their numbers; both begin with 0."""
+        """Lowers bounds on the sum of the n cheapest cells, s, and their numbers; both begin with 0."""
         classes = np.flatnonzero(self.classes[:_LETHAL])
         counts = self.classes[classes]
         least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)

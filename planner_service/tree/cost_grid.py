@@ -191,7 +191,7 @@ class CostGrid:
         return padded
 
     def load(self, pace: Floats) -> None:
-        """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative; the grid is then as it
+        """Takes the whole map. Raises ValueError on a pace that is NaN, zero or negative; the grid is then as it
         was.
 
         A cell costs between `CHEAPEST_S` and `DEAREST_S`, whatever its pace is; the log says where that holds.
@@ -237,7 +237,7 @@ class CostGrid:
         return self._lowest_time / (self._lowest_time + self.length_weight_s) * (1.0 - 2.0**-22)
 
     def share(self, time_cost: Floats) -> None:
-        """Take the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
+        """Takes the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
         Cells changed by `apply` are this grid's own. Raises ValueError unless they are of this grid, and such as
         `load` makes."""
         if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
@@ -307,7 +307,7 @@ class CostGrid:
         self._lowest_time = self._time_range.lowest
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
-        """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
+        """Takes what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
         the grid is then as it was. Costs are bounded as by `load`."""
         check_pace(self.grid, pace)
         boxes = list(self._boxes(dirty))

@@ -72,7 +72,7 @@ class CostToGoTree:
         """Raised whenever paths change, so that all stamps are old; starts again with new stamps at 255."""
 
     def grow(self, root: int) -> None:
-        """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
+        """Grows the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
         it is lethal."""
         self.cost_grid.check_root(root)
         if not self.cost.size:
@@ -139,7 +139,7 @@ class CostToGoTree:
         return visited
 
     def move(self, root: int, window: Window) -> int:
-        """Lead to a new root, by growing only a window that holds it and the old root.
+        """Leads to a new root, by growing only a window that holds it and the old root.
 
         Costs outside become upper bounds: the old ones plus the cost from the old root to the new. Returns cells
         grown, or 0 if nothing was done because the old root has no way to the new one inside the window. Raises as
@@ -174,7 +174,7 @@ class CostToGoTree:
         return window.cells
 
     def repair(self, changes: Changes) -> int:
-        """Bring the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned
+        """Brings the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned
         that a full search costs less: then it must be searched before any other use."""
         if changes.cells.size == 0:
             return 0
@@ -189,7 +189,7 @@ class CostToGoTree:
         return int(visited)
 
     def mend(self) -> int:
-        """Make the tree exact by the parents that it has, after whatever windows, moves and repairs.
+        """Makes the tree exact by the parents that it has, after whatever windows, moves and repairs.
 
         It equals one grown from scratch then, in costs and parents, bit for bit. Returns cells visited. `exact`
         tells whether it worked: if not, to grow the tree takes less time. Either way the offset is 0. Raises

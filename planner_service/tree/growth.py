@@ -48,7 +48,7 @@ def grow_tree(
     parent: NDArray[np.uint8] | None,
     kept: KeptScratch | None = None,
 ) -> float:
-    """Grow the exact tree of a padded, passable root. Returns a bound, s, that no cost exceeds.
+    """Grows the exact tree of a padded, passable root. Returns a bound, s, that no cost exceeds.
 
     climbs         of the same cells; None where entering a cell costs the same from everywhere
     cost, parent   padded, written whole; None where parents, and a bound, are not wanted
@@ -165,7 +165,7 @@ class GrownWindow(NamedTuple):
 def grow_window(
     grid: CostGrid, root: int, old: int, window: Window, kept: KeptScratch, with_parents: bool
 ) -> GrownWindow:
-    """Grow a window that holds the new root and the old one. Raises OutsideGridError where it is not inside the
+    """Grows a window that holds the new root and the old one. Raises OutsideGridError where it is not inside the
     grid or does not hold both.
 
     kept  scratch of the last window of one tree

@@ -101,7 +101,7 @@ class PieceTree:
         return grid.padded, Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
 
     def grow(self, root: int) -> None:
-        """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
+        """Grows the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
         it is lethal."""
         self.cost_grid.check_root(root)
         parent = np.full(self.cost_grid.size, NONE, np.uint8)
@@ -125,7 +125,7 @@ class PieceTree:
         self._mend(math.inf, self._at_once)
 
     def move(self, root: int, window: Window) -> int:
-        """Lead to a new root, by a window that holds it and the old one; `mend` makes the tree exact again.
+        """Leads to a new root, by a window that holds it and the old one; `mend` makes the tree exact again.
 
         Returns cells grown, or 0 if nothing was done because the old root has no way to the new one inside the
         window. Raises as `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both
@@ -152,12 +152,12 @@ class PieceTree:
         return window.cells
 
     def mend(self) -> int:
-        """Make the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
+        """Makes the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
         cells looked at."""
         return self._mend(self._most, self._at_once)
 
     def repair(self, changes: Changes) -> int:
-        """Bring the tree up to date after the map changed, and make it exact, or give way: `exact` tells.
+        """Brings the tree up to date after the map changed, and makes it exact, or gives way: `exact` tells.
 
         Returns cells looked at; -1 if it gave way and cells may be without a way that have one: then it must be
         grown before anything else.
@@ -214,11 +214,11 @@ class PieceTree:
         return Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
 
     def _add_up(self) -> None:
-        """Evaluate the totals."""
+        """Evaluates the totals."""
         partition_totals.add_up(*self._arrays, self._tiles, self._scratch, self._schedule(self._at_once))
 
     def _mend(self, most: float, turn: NDArray[np.float64]) -> int:
-        """Look at tiles until the tree is exact, or as many as `most` have been."""
+        """Checks tiles until the tree is exact, or as many as `most` have been."""
         looked, mended, rounds, left = partition_search.improve_tiles(
             *self._arrays, self._tiles, self._scratch, self._schedule(turn), most
         )

@@ -168,7 +168,7 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
 
 
 def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bools) -> None:
-    """Add to a mask of lakes what lies lower right beside them."""
+    """Adds to a mask of lakes what lies lower right beside them."""
     from scipy import ndimage
 
     lakes = np.where(rippled[found.labels], found.labels, 0)

@@ -50,7 +50,7 @@ class Placed:
         return self.grid.resolution_m >= 1.5 * max(width, height)
 
     def warp(self, source: Any, onto: NDArray[Any], how: str, row0: int = 0, **given: Any) -> NDArray[Any]:
-        """Bring a band, or an array in its place, onto rows of the grid, in place.
+        """Brings a band, or an array in its place, onto rows of the grid, in place.
 
         Parameters
         ----------

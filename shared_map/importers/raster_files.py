@@ -117,7 +117,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
 
 
 def _check_size(dataset: Any, what: str) -> None:
-    """Refuse what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
+    """Refuses what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
     if dataset.count == 0:
         held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
         raise TerrainError(

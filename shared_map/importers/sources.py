@@ -56,7 +56,7 @@ class Source:
 
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
-    """Read or make what the scenario names.
+    """Reads or make what the scenario names.
 
     Parameters
     ----------

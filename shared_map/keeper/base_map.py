@@ -185,7 +185,7 @@ class BaseMapCopy:
         return 1.0 - left / (len(self._missing) * self.grid.regions)
 
     def take(self, tile: BaseMapTile) -> bool:
-        """Put a piece into its place; False if it is there already.
+        """Puts a piece into its place; False if it is there already.
 
         Raises
         ------

@@ -58,7 +58,7 @@ class CompactionPlan:
             self._due[mark_set.tile] = None
 
     def update(self, ledger: Ledger, now_ns: int) -> None:
-        """Find the authors that died, or turned out to live, since the last call, and make their tiles due."""
+        """Finds the authors that died, or turned out to live, since the last call, and makes their tiles due."""
         self._heard_ns = {a: when for a, when in self._heard_ns.items() if now_ns - when <= self._after_ns}
         gone = {author for author in ledger.authors if self.is_gone(author)}
         for rows in ledger.held(sorted(gone ^ self._gone)).values():

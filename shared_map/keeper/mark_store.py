@@ -280,7 +280,7 @@ class KeeperStore:
             return [msgspec.json.decode(row[0], type=Order) for row in rows]
 
     def close(self) -> None:
-        """Release the file, and its lock."""
+        """Releases the file, and its lock."""
         self._db.close()
         self._unlock()
 
@@ -357,7 +357,7 @@ def _damaged(path: Path | str, reason: str) -> str:
 
 
 def _lock(path: Path) -> IO[bytes]:
-    """Refuse a second writer on the same file. The lock ends with its process."""
+    """Refuses a second writer on the same file. The lock ends with its process."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = open(f"{path}.lock", "wb")  # noqa: SIM115 - held until close

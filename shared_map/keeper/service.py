@@ -183,7 +183,7 @@ class KeeperService:
             self._stats[key] = stats
 
     def _save_sightings(self, now_ns: int) -> None:
-        """Save the newest sightings. They are for people to look at, so a full disk is no reason to try again."""
+        """Saves the newest sightings. They are for people to look at, so a full disk is no reason to try again."""
         self._sightings_due_ns = now_ns + NS_PER_S
         new = {id: each for id, each in self._sightings.best(now_ns).items() if self._seen.get(id) != each}
         self._sightings.expire(now_ns)
@@ -193,7 +193,7 @@ class KeeperService:
                 self._store.save_sightings(new.values())
 
     def _name_throttled(self, now_ns: int) -> None:
-        """Note each author that begins to exceed its quota."""
+        """Notes each author that begins to exceed its quota."""
         throttled = self._sync.throttled
         self.counters.gauge("authors_throttled", float(len(throttled)))
         for author in self._named:
@@ -213,7 +213,7 @@ class KeeperService:
         self._plan.accepted(mark_set)
 
     def _order_zone(self, asked: Asked, order: ZoneOrder, now_ns: int) -> None:
-        """Write the marks of a zone: on the disk first, as an answer promises that they stay."""
+        """Writes the marks of a zone: on the disk first, as an answer promises that they stay."""
         sets: list[MarkSet] = []
         if order.action != "list":
             if not order.name:

@@ -46,7 +46,7 @@ class Capacity:
         self._owners: dict[str, tuple[int, int]] = {}  # process -> (sets, marks), of those that hold any
 
     def take(self, new: MarkSet, old: MarkSet | None, *, own: bool = False) -> bool:
-        """Count `new` instead of `old`; False, and nothing changes, if that exceeds a bound. A set which takes no
+        """Counts `new` instead of `old`; False, and nothing changes, if that exceeds a bound. A set which takes no
         more than before is never refused.
 
         own  no bound applies
@@ -151,7 +151,7 @@ class Quota:
         return sorted(self._waiting)
 
     def forget(self, now_ns: int) -> None:
-        """Drop the buckets of those that were silent for a minute: they are full again."""
+        """Drops the buckets of those that were silent for a minute: they are full again."""
         for owner, each in list(self._owners.items()):
             if now_ns - each.heard_ns > _FORGET_NS and owner not in self._waiting:
                 del self._owners[owner]

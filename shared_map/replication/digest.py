@@ -161,7 +161,7 @@ class PendingDigests:
         self._newest = Newest(_MAX_SENDERS)  # of the digests whose senders count them
 
     def add(self, digest: Digest, now_ns: int) -> bool:
-        """Take in a digest; false if a newer one of the same sender overtook it."""
+        """Takes in a digest; false if a newer one of the same sender overtook it."""
         sender = (digest.author, digest.whole)
         if digest.seq and not self._newest.is_news(sender, (0, digest.seq), now_ns):
             return False

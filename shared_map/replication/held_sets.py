@@ -56,7 +56,7 @@ class Tombstones:
             del self._deleted[next(iter(self._deleted))]
 
     def expire(self, now_ns: int) -> None:
-        """Forget tombstones which are older than REMEMBERED_NS."""
+        """Forgets tombstones which are older than REMEMBERED_NS."""
         while self._deleted:
             key, (_, _, since_ns) = next(iter(self._deleted.items()))
             if now_ns - since_ns <= REMEMBERED_NS:
@@ -115,7 +115,7 @@ class HeldSets:
         return not self.tombstones.covers(received) if held is None else supersedes(received, held)
 
     def put(self, new: MarkSet, *, own: bool = False) -> bool:
-        """Hold a set instead of the one which it supersedes; False if there is no capacity for it.
+        """Holds a set instead of the one which it supersedes; False if there is no capacity for it.
 
         own  capacity does not matter
         """
@@ -131,7 +131,7 @@ class HeldSets:
         return True
 
     def delete(self, tombstone: MarkSet, now_ns: int) -> None:
-        """Delete what its author stated about a tile, and remember under which number."""
+        """Deletes what its author stated about a tile, and remember under which number."""
         assert is_tombstone(tombstone)
         self.tombstones.add(tombstone, now_ns)
         held = self.get(tombstone.tile, tombstone.author)
@@ -139,7 +139,7 @@ class HeldSets:
             self.remove(held)
 
     def remove(self, held: MarkSet) -> None:
-        """Forget a set as if it had never come."""
+        """Forgets a set as if it had never come."""
         sets = self._tiles[held.tile]
         del sets[held.author]
         if not sets:

@@ -120,7 +120,7 @@ class MapReplica:
     # --- merging --------------------------------------------------------------------------------------------
 
     def merge(self, received: Sequence[MarkSet], *, measured: bool = True) -> Merged:
-        """Take in sets, and tell the cost map whose winners changed. Sets that are known, superseded, filtered out
+        """Merges sets, and reports changed winners to the cost map. Sets that are known, superseded, filtered out
         or beyond the capacity are left out of the result, and counted. Raises nothing, whatever the sets state.
 
         measured  counts for `take_newest_stamp_ns`; false for the sets of a late join, which are old
@@ -205,7 +205,7 @@ class MapReplica:
         return won.counts
 
     def _learn(self) -> None:
-        """Bring the cost map to the words that are held; later if it was changed by words just now."""
+        """Brings the cost map to the words that are held; later if it was changed by words just now."""
         if self._cost_map is None:
             return
         self._learn_due_ns = self._learned_ns + _LEARN_EVERY_NS
@@ -225,19 +225,19 @@ class MapReplica:
         return newest_ns
 
     def limit_to(self, regions: frozenset[int]) -> None:
-        """Hold only sets about these regions from now on, besides our own. Cells elsewhere get back what the prior
+        """Holds only sets about these regions from now on, besides our own. Cells elsewhere get back what the prior
         map and we ourselves state."""
         self.filter.limit_to(regions)
         self._drop_unwanted()
 
     def read_groups(self, groups: frozenset[str] | None) -> None:
-        """Hold only sets of these groups from now on, besides our own; of all if None. Digests then show the
+        """Holds only sets of these groups from now on, besides our own; of all if None. Digests then show the
         missing sets of authors that were not readable before."""
         self.filter.read_groups(groups)
         self._drop_unwanted()
 
     def _drop_unwanted(self) -> None:
-        """Forget the sets of others that the filter does not let in any more."""
+        """Forgets the sets of others that the filter does not let in any more."""
         wanted = self.filter
         before: dict[int, list[MarkSet]] = {}
         for tile in self.held.tiles:
@@ -252,7 +252,7 @@ class MapReplica:
     # --- time -----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> list[MarkSet]:
-        """Let statements expire. Returns the own sets that may be published now."""
+        """Drops expired statements. Returns the own sets that may be published now."""
         self._expire(now_ns)
         if self._learn_due_ns is not None and self._now_ns >= self._learn_due_ns:
             self._learn()
@@ -270,7 +270,7 @@ class MapReplica:
         return [own for tile in due if (own := self.held.get(tile, self.author)) is not None]
 
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
-        """Look at a tile again when the next statement of these sets expires."""
+        """Checks a tile again when the next statement of these sets expires."""
         ends = [end_ns for each in sets if (end_ns := next_expiry_ns(each, self._now_ns)) is not None]
         if not ends or min(ends) >= self._expiry_ns.get(tile, FOREVER):
             return
@@ -281,7 +281,7 @@ class MapReplica:
             heapq.heapify(self._expiries)
 
     def _expire(self, now_ns: int) -> None:
-        """Give cells whose winner expired their next one, and drop our own expired statements from our sets."""
+        """Gives cells whose winner expired their next one, and drops our own expired statements from our sets."""
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
         expired: dict[int, list[MarkSet]] = {}
         while self._expiries and self._expiries[0][0] <= now_ns:

@@ -200,7 +200,7 @@ class MapSync:
         self._send_digest(now_ns)
 
     def publish(self, actions: Iterable[MarkSet]) -> None:
-        """Put the sets that the replica decided to publish."""
+        """Puts the sets that the replica decided to publish."""
         for action in actions:
             self._put(action)
 
@@ -227,7 +227,7 @@ class MapSync:
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
     def _take_in(self, now_ns: int) -> None:
-        """Merge what others put since the last tick."""
+        """Merges what others put since the last tick."""
         if self._at_ticks and (samples := self._bus.collected_together(MARKS)):
             self._receive(samples, now_ns)
 
@@ -255,7 +255,7 @@ class MapSync:
         return sets
 
     def _admit(self, sets: Sequence[MarkSet], now_ns: int) -> None:
-        """Merge sets now, or later those of authors that exceed their quota."""
+        """Merges sets now, or later those of authors that exceed their quota."""
         taken: list[MarkSet] = []
         marks: dict[str, int] = {}  # author -> statements among those taken
         for each in sets:
@@ -345,7 +345,7 @@ class MapSync:
             self._digest_interest.keeper_spoke(digest.author, now_ns)
 
     def _choose_digests(self, now_ns: int) -> None:
-        """Listen to digests of those who may state something about what we hold."""
+        """Listens to digests of those who may state something about what we hold."""
         before, chosen = self._listened_to, self._digest_interest.update(now_ns)
         if chosen == before:
             return
@@ -360,7 +360,7 @@ class MapSync:
             self._bus.unsubscribe(DIGEST, author=author)
 
     def _send_digest(self, now_ns: int) -> None:
-        """Tell all that we hold every `digest_s`, and in between what we changed lately: so others notice a lost
+        """Reports all that we hold every `digest_s`, and in between what we changed lately: so others notice a lost
         set within a fraction of a second."""
         if self._name is None:
             return
@@ -383,7 +383,7 @@ class MapSync:
         self._bus.publish(DIGEST, digest, author=self._name)
 
     def _compare(self, pending: PendingDigest, now_ns: int) -> None:
-        """Ask for what they hold and we miss; give a keeper what it misses of authors that are gone."""
+        """Asks for what they hold and we miss; give a keeper what it misses of authors that are gone."""
         digest = pending.digest
         missing = self.replica.missing(digest.held)
         throttled = self.throttled
@@ -395,7 +395,7 @@ class MapSync:
         self._digests.compared(pending, not missing, now_ns)
 
     def _fetch(self, author: str, tiles: list[int], now_ns: int) -> None:
-        """Ask for an author's sets, unless they were asked for just now."""
+        """Asks for an author's sets, unless they were asked for just now."""
         # Not only when an ask has ended: if its end is lost, it ends by timeout, seconds later.
         asked_ns = self._asked_ns.get(author)
         again = asked_ns is not None and now_ns - asked_ns >= _ASK_AGAIN_NS
@@ -405,7 +405,7 @@ class MapSync:
             self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
 
     def _offer(self, kept: Held, now_ns: int) -> None:
-        """Put again what a keeper never got, and its author, being gone, cannot put again."""
+        """Puts again what a keeper never got, and its author, being gone, cannot put again."""
         silent = [author for author in self.replica.held.ledger.authors if self._silent(author, now_ns)]
         lost = self.replica.held.ahead_of(kept, silent)
         for mark_set in lost[:_OFFERS_AT_ONCE]:

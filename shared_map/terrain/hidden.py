@@ -53,7 +53,7 @@ def true_ground(
 
 
 def _flooded(truth: Floats, elevation_m: Floats, share: float, rng: np.random.Generator, whole: int) -> _Parts:
-    """Make a valley lethal, as much of it as leaves enough connected. Returns the parts that are left."""
+    """Makes a valley lethal, as much of it as leaves enough connected. Returns the parts that are left."""
     flood = _flood(truth, elevation_m, share, rng)
     while flood:
         wet = np.array(flood, np.intp)
@@ -82,7 +82,7 @@ class _Parts:
         return int(counted(labels, count + 1)[1:].max(initial=0))
 
     def close(self, block: tuple[slice, slice], least: float) -> bool:
-        """Make a block lethal, unless that leaves fewer than `least` cells in the largest part. Whether it did."""
+        """Makes a block lethal, unless that leaves fewer than `least` cells in the largest part. Whether it did."""
         kept = self.truth[block].copy()
         self.truth[block] = LETHAL
         left = self._largest()
@@ -96,7 +96,7 @@ class _Parts:
 def _close_roads(
     parts: _Parts, road: Bools, count: int, rng: np.random.Generator, whole: int, flooded_share: float
 ) -> None:
-    """Make stretches of road and the cells beside them lethal. Up to 20 places are tried for each; none fits if
+    """Makes stretches of road and the cells beside them lethal. Up to 20 places are tried for each; none fits if
     each would cut the largest passable part to too few cells."""
     truth, least = parts.truth, whole * (CONNECTED_SHARE - flooded_share)
     cols = truth.shape[1]

@@ -91,7 +91,7 @@ class _Stamp(msgspec.Struct, frozen=True):
 
 
 def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
-    """Write a terrain and its truth where `load_prepared` finds them. The description is written last."""
+    """Writes a terrain and its truth where `load_prepared` finds them. The description is written last."""
     arrays: dict[str, NDArray[Any]] = {
         "elevation": terrain.elevation_m,
         "photo": terrain.photo,
@@ -103,7 +103,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
 
 
 def save_ground(meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[Any]], key: str) -> None:
-    """Leave the ground of a terrain, and other arrays, in the folder of a description, which is written last.
+    """Leaves the ground of a terrain, and other arrays, in the folder of a description, which is written last.
 
     Raises TerrainError if the folder cannot be written.
     """
@@ -252,7 +252,7 @@ def homes_of(prior: Floats, truth: Floats) -> Bools:
 
 
 def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
-    """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
+    """Builds terrain and truth of a scenario, unless they are kept from an earlier run, and leaves them in a folder
     for the other processes. The result is mapped, as theirs."""
     key, kept = scenario_key(scenario), kept_key(scenario)
     if kept is None or not fetch_kept(kept, folder):
@@ -294,7 +294,8 @@ def kept_key(scenario: Scenario) -> str | None:
 
 
 def fetch_kept(key: str, into: Path) -> bool:
-    """Put the files of a kept terrain into a folder. False if there is none; a damaged one is dropped, and said."""
+    """Puts the files of a kept terrain into a folder. False if there is none; a damaged one is dropped, and
+    said."""
     folder = kept_root() / key
     if not folder.is_dir():
         return False
@@ -317,7 +318,7 @@ def fetch_kept(key: str, into: Path) -> bool:
 
 
 def keep(key: str, files: Iterable[Path]) -> None:
-    """Keep these files of a terrain. If that is not possible, no terrain is cached, without an error."""
+    """Keeps these files of a terrain. If that is not possible, no terrain is cached, without an error."""
     files = list(files)
     root = kept_root()
     partial = root / f"{key}.{os.getpid()}.part"
@@ -338,7 +339,7 @@ def keep(key: str, files: Iterable[Path]) -> None:
 
 
 def keep_beside(key: str, file: Path) -> None:
-    """Keep one more file of a kept terrain, which follows from it and took long to find."""
+    """Keeps one more file of a kept terrain, which follows from it and took long to find."""
     folder = kept_root() / key
     try:
         with _locked(folder):

@@ -82,7 +82,7 @@ class Question:
         return self.waited_s >= self.timeout_s
 
     def refuse(self, reason: str) -> None:
-        """Say in a sentence why there is no answer. It becomes `AskEnded.failure`."""
+        """States the reason why there is no answer. It becomes `AskEnded.failure`."""
         self.answerer.refuse(reason)
 
     def end(self) -> None:
@@ -103,7 +103,7 @@ class Asked(Question):
     answerer: Answerer
 
     def answer(self, message: Message, **fields: str | int) -> None:
-        """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
+        """Sends one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
         among those asked for is not sent. Raises RuntimeError after `end`."""
         self.answerer.answer(message, fields)
 
@@ -199,7 +199,7 @@ class Answerer(Protocol):
 
 
 def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
-    """Raise TypeError on a subscription that the topic does not allow."""
+    """Raises TypeError on a subscription that the topic does not allow."""
     if together and topic.trusted:
         raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
     if every_s and (together or not topic.newest):
@@ -242,14 +242,14 @@ class Bus(Protocol):
         ...
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        """Put a message under a key of which all fields are given. It is dropped where a link is congested. A
+        """Puts a message under a key of which all fields are given. It is dropped where a link is congested. A
         process hears its own samples. Nothing is sent after `close`."""
         ...
 
     def subscribe(
         self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
     ) -> None:
-        """Post `Heard` for every sample from now on.
+        """Posts `Heard` for every sample from now on.
 
         together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
                   compares each key with its message
@@ -260,8 +260,8 @@ class Bus(Protocol):
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For samples that are used at ticks
-        only: a sample that wakes no thread costs a fifth."""
+        """Keeps samples from now on until `collected`, the newest `Topic.buffer`. For samples that are used at
+        ticks only: a sample that wakes no thread costs a fifth."""
         ...
 
     def collected(self, topic: Topic) -> list[Heard]:
@@ -274,12 +274,12 @@ class Bus(Protocol):
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        """End every subscription that was made with exactly these fields, by `subscribe` or `collect`. Samples
+        """Ends every subscription that was made with exactly these fields, by `subscribe` or `collect`. Samples
         under way may be posted after it."""
         ...
 
     def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
-        """Post `Asked` for every query on the key. Raises TypeError on a topic without requests.
+        """Posts `Asked` for every query on the key. Raises TypeError on a topic without requests.
 
         undecoded  `post` is an inbox's, and may be given `Undecoded`: no thread has to wake up only to decode it
         """
@@ -305,20 +305,21 @@ class Bus(Protocol):
         ...
 
     def declare_alive(self, peer: Peer) -> None:
-        """Raise our liveliness token. It falls when the process ends, however it ends."""
+        """Raises our liveliness token. It falls when the process ends, however it ends."""
         ...
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
-        """Post `Appeared` for the tokens of others that are up now and later, `Disappeared` when they fall or
+        """Posts `Appeared` for the tokens of others that are up now and later, `Disappeared` when they fall or
         the link to them is lost. Our own is never posted."""
         ...
 
     def watch_links(self, post: Post) -> None:
-        """Post `LinkChanged` from now on."""
+        """Posts `LinkChanged` from now on."""
         ...
 
     def close(self) -> None:
-        """Leave the network: our token falls, nothing is sent any more. Returns within seconds. May be repeated."""
+        """Leaves the network: our token falls, nothing is sent any more. Returns within seconds. May be
+        repeated."""
         ...
 
 
@@ -326,12 +327,12 @@ class Worker(Protocol):
     """Runs long jobs beside the process's own thread, one after the other."""
 
     def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
-        """Run `job`, then post `WorkDone`. A job that raises ends the process.
+        """Runs `job`, then post `WorkDone`. A job that raises ends the process.
 
         model_ns  what the job is taken to cost in a simulation, whose clock does not see it
         """
         ...
 
     def close(self) -> None:
-        """Wait for the job in hand, but not for long; forget the others."""
+        """Waits for the job in hand, but not for long; forget the others."""
         ...

@@ -213,7 +213,7 @@ class Subscriptions:
         self._all.append(declaration)
 
     def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
-        """Forget the subscriptions of a bus: all, or those with exactly these fields."""
+        """Forgets the subscriptions of a bus: all, or those with exactly these fields."""
         self._found.clear()
         self._all = [
             each for each in self._all if each.bus is not bus or (narrow is not None and each.narrow != narrow)
@@ -306,7 +306,7 @@ class MemoryNetwork:
         """(namespace, topic) -> subscriptions of open buses."""
 
     def bus(self, node: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> MemoryBus:
-        """Open a bus. A node that was started again opens a new one."""
+        """Opens a bus. A node that was started again opens a new one."""
         bus = MemoryBus(self, node, namespace, authenticator)
         self.buses.append(bus)
         return bus
@@ -316,7 +316,7 @@ class MemoryNetwork:
         return source is to or self.links.connected(source.node, to.node, self.scheduler.clock.now_ns())
 
     def relink(self, nodes: Sequence[str], up: bool) -> None:
-        """Let nodes notice that their link came up or went down, and all nodes which tokens they see now."""
+        """Makes nodes notice that their link came up or went down, and all nodes which tokens they see now."""
         for bus in list(self.buses):
             if bus.node in nodes:
                 for post in bus.link_watchers:
@@ -324,7 +324,7 @@ class MemoryNetwork:
         self.compare_tokens()
 
     def compare_tokens(self) -> None:
-        """Let every watcher notice tokens that it sees since the last time, or no longer."""
+        """Makes every watcher notice tokens that it sees since the last time, or no longer."""
         for bus in self.buses:
             for watcher in bus.watchers:
                 watcher.compare()
@@ -364,7 +364,7 @@ class MemoryBus:
     def publish_bytes(
         self, topic: Topic, payload: bytes, fields: Mapping[str, str | int], *, in_json: bool = False
     ) -> None:
-        """Put any payload at all: tests send garbage with it, and JSON."""
+        """Puts any payload at all: tests send garbage with it, and JSON."""
         if self.closed:
             return
         self.sent(payload)
@@ -382,7 +382,7 @@ class MemoryBus:
             network.scheduler.after(delay_ns, partial(self._arrive, reached, sample))
 
     def _arrive(self, reached: Sequence[Declaration], sample: _Sample) -> None:
-        """Let a sample arrive at subscriptions which it reaches at one time, in the order of `find`."""
+        """Makes a sample arrive at subscriptions which it reaches at one time, in the order of `find`."""
         for subscription in reached:
             if subscription.bus.traced(self, sample.topic.name, sample.payload):
                 subscription.bus.arrived(sample, subscription)
@@ -410,7 +410,7 @@ class MemoryBus:
         return [(sample.key, heard.message) for sample in kept if (heard := self._heard(sample, together=True))]
 
     def arrived(self, sample: _Sample, subscription: Declaration) -> None:
-        """Post the event of a sample that has come, or keep it for `collected`."""
+        """Posts the event of a sample that has come, or keeps it for `collected`."""
         self.received(sample.payload)
         topic, post = sample.topic, subscription.post
         if post is None:
@@ -509,7 +509,7 @@ class MemoryBus:
         self.link_watchers.append(post)
 
     def close(self) -> None:
-        """Leave the network. To the others a crash looks the same."""
+        """Leaves the network. To the others a crash looks the same."""
         if self.closed:
             return
         self.closed = True
@@ -527,7 +527,7 @@ class MemoryBus:
         self.counts["bytes_in"] += len(payload)
 
     def later(self, delay_ns: int, post: Post, event: Event) -> None:
-        """Post an event after a delay, unless the bus is closed by then."""
+        """Posts an event after a delay, unless the bus is closed by then."""
         self.network.scheduler.after(delay_ns, lambda: None if self.closed else post(event))
 
     def traced(self, source: MemoryBus, what: str, payload: bytes) -> bool:

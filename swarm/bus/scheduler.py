@@ -34,7 +34,7 @@ class Scheduler:
         self.at(self.clock.now_ns() + delay_ns, action)
 
     def run_until(self, end_ns: int) -> int:
-        """Run all actions due up to `end_ns`, then move the clock there. Returns how many ran."""
+        """Runs all actions due up to `end_ns`, then moves the clock there. Returns how many ran."""
         happened = 0
         while self._due and self._due[0][0] <= end_ns:
             when_ns, _, action = heapq.heappop(self._due)

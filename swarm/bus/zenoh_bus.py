@@ -149,7 +149,7 @@ def open_bus(
     patient: bool = False,
     authenticator: Authenticator | None = None,
 ) -> ZenohBus:
-    """Open a session. Raises BusError when it cannot listen or no router answers.
+    """Opens a session. Raises BusError when it cannot listen or no router answers.
 
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
@@ -402,7 +402,8 @@ class ZenohBus:
         self._read(listener, arrive, "links", arrivals.take)
 
     def close(self) -> None:
-        """Leave the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten seconds."""
+        """Leaves the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten
+        seconds."""
         if self.closed:
             return
         self._closing.set()
@@ -426,7 +427,7 @@ class ZenohBus:
         self._session.close()  # type: ignore[no-untyped-call]
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
-        """Let what `take` returns arrive, one after the other on a thread of its own, until the entity is
+        """Makes what `take` returns arrive, one after the other on a thread of its own, until the entity is
         undeclared: then `take` returns None or raises ZError."""
         self._entities.append(entity)
 

@@ -83,7 +83,7 @@ _own = threading.local()
 
 
 def _keep_state() -> None:
-    """Keep what the interpreter knows of this thread of Zenoh's until the interpreter ends.
+    """Keeps what the interpreter knows of this thread of Zenoh's until the interpreter ends.
 
     Python makes a state when such a thread calls it and clears it away when the call is over, with the memory of
     its frames, which takes longer than most calls (decision 99). A state counts who needs it, and this is one more.

@@ -178,13 +178,13 @@ class Swarm:
         return Observer(self._session, self._session.number("every_s", every_s, 0, 1e6, more=True))
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
-        """Call with a sentence when something goes wrong that no call can raise: another process uses one of our
+        """Calls with a sentence when something goes wrong that no call can raise: another process uses one of our
         ids, a planner does not answer. Each problem is reported at most once a minute, logged, and counted in
         `counts`."""
         self._session.on_problem(callback)
 
     def close(self) -> None:
-        """Take away all vehicles and targets of this program, and leave. May be repeated."""
+        """Takes away all vehicles and targets of this program, and leave. May be repeated."""
         for guest in self._guests:
             guest.close()
         self._stop()

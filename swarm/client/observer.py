@@ -175,11 +175,11 @@ class Observer:
             return marked(sets, grid, self._session.swarm_now_ns())
 
     def on_note(self, callback: Callable[[Note], None]) -> None:
-        """Call with every note, on the connection's thread."""
+        """Calls with every note, on the connection's thread."""
         self._on_note.append(callback)
 
     def on_capture(self, callback: Callable[[Note], None]) -> None:
-        """Call with the note of every capture, on the connection's thread."""
+        """Calls with the note of every capture, on the connection's thread."""
         self.on_note(lambda note: callback(note) if note.kind == CAPTURE else None)
 
     def on_event(self, event: Event, now_ns: int) -> None:

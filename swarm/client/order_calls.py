@@ -30,34 +30,34 @@ class Orders:
         self._operator = Operator(session.bus)
 
     def pause(self) -> Acknowledged:
-        """Stop all vehicles and simulated targets where they are."""
+        """Stops all vehicles and simulated targets where they are."""
         return self._give(subject="pause")
 
     def resume(self) -> Acknowledged:
-        """Let all go on."""
+        """Resumes all."""
         return self._give(subject="pause", off=True)
 
     def stop(self, vehicle: str) -> Acknowledged:
-        """Stop one vehicle of the swarm."""
+        """Stops one vehicle of the swarm."""
         return self._give(subject="vehicle", name=vehicle)
 
     def go(self, vehicle: str) -> Acknowledged:
-        """Let it go on."""
+        """Resumes it."""
         return self._give(subject="vehicle", name=vehicle, off=True)
 
     def chase(self, group: str, targets: Sequence[str] | None) -> Acknowledged:
-        """Say which targets the vehicles of a group may chase; None: those of the scenario."""
+        """States which targets the vehicles of a group may chase; None: those of the scenario."""
         return self._give(subject="group", name=group, targets=list(targets or ()), off=targets is None)
 
     def add_target(
         self, id: str, x_m: float, y_m: float, *, walk: str | None = None, speed_m_per_s: float | None = None
     ) -> Acknowledged:
-        """Put a new simulated target somewhere."""
+        """Puts a new simulated target somewhere."""
         cell = self._session.frame.cell(x_m, y_m)
         return self._give(subject="target", name=id, cell=cell, walk=walk, speed_m_per_s=speed_m_per_s, new=True)
 
     def move_target(self, id: str, x_m: float, y_m: float) -> Acknowledged:
-        """Put a simulated target somewhere else."""
+        """Puts a simulated target somewhere else."""
         return self._give(subject="target", name=id, cell=self._session.frame.cell(x_m, y_m))
 
     def remove_target(self, id: str) -> Acknowledged:
@@ -65,7 +65,7 @@ class Orders:
         return self._give(subject="target", name=id, off=True)
 
     def set(self, key: str, value: float | None) -> Acknowledged:
-        """Change a setting of the scenario that may change live; None: what the scenario says."""
+        """Changes a setting of the scenario that may change live; None: what the scenario says."""
         return self._give(subject="set", name=key, value=value, off=value is None)
 
     def add_zone(
@@ -77,7 +77,7 @@ class Orders:
         for_s: float | None = None,
         vehicle_class: str | None = None,
     ) -> tuple[str, Acknowledged]:
-        """Close an area, or give it a pace. Returns the zone's name, too.
+        """Closes an area, or give it a pace. Returns the zone's name, too.
 
         polygon_m     corners (x_m, y_m)
         name          a zone that has it is replaced; the keeper finds one if it is empty
@@ -95,7 +95,7 @@ class Orders:
         return zones.changed, acknowledged
 
     def remove_zone(self, name: str) -> Acknowledged:
-        """Open an area again."""
+        """Opens an area again."""
         return self._operator.zone(_checked(ZoneOrder, action="remove", name=name))[1]
 
     def zones(self) -> list[Zone]:

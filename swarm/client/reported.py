@@ -41,7 +41,7 @@ class Reported:
         self._repeat_due_ns = 0
 
     def _join(self) -> None:
-        """Take part from now on: the last step of its making, as events and ticks come on another thread.
+        """Takes part from now on: the last step of its making, as events and ticks come on another thread.
 
         Raises ConfigError where the id is in use in this program.
         """
@@ -93,7 +93,7 @@ class Reported:
             self._repeat(now_ns)
 
     def leave(self) -> None:
-        """Take it away: others know at once. May be repeated."""
+        """Takes it away: others know at once. May be repeated."""
         session = self._session
         with session.lock:
             if self._word is not None and session.ended is None:

@@ -114,12 +114,12 @@ class Session:
             self._parts = [each for each in self._parts if each is not part]
 
     def check_open(self) -> None:
-        """Raise why nothing can be said any more."""
+        """Raises why nothing can be said any more."""
         if self.ended is not None:
             raise self.ended
 
     def publish(self, topic: Topic, message: M, **fields: str | int) -> M:
-        """Put a message that follows the rules of its type. Raises ConfigError, and counts it, if it does not."""
+        """Puts a message that follows the rules of its type. Raises ConfigError, and counts it, if it does not."""
         self.check_open()
         try:
             checked = decode(encode(message), type(message))
@@ -211,14 +211,14 @@ class Session:
             raise BusError(f"no answer within {timeout_s:g} s") from error
 
     def call(self, callback: Callable[[], None]) -> None:
-        """Call something of the program's once the lock is free."""
+        """Calls something of the program's once the lock is free."""
         self._later.append(callback)
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
         self._on_problem.append(callback)
 
     def problem(self, kind: str, sentence: str) -> None:
-        """Count a problem, and tell it in the log and to callbacks, once a minute."""
+        """Counts a problem, and reports it in the log and to callbacks, once a minute."""
         self.counts[kind] += 1
         now_ns = self.now_ns()
         if now_ns - self._said_ns.get(sentence, -_SAY_AGAIN_NS) < _SAY_AGAIN_NS:
@@ -359,7 +359,7 @@ class Stream(Generic[T]):
         """The value that came last, whether it was read or not; None before the first."""
 
     def put(self, value: T) -> None:
-        """Add a value, from any thread. Dropped once the stream is closed."""
+        """Adds a value, from any thread. Dropped once the stream is closed."""
         with self._changed:
             if not self.closed:
                 self._waiting.append(value)

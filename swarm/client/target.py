@@ -37,7 +37,7 @@ class Target(Reported):
         self._join()
 
     def at(self, x_m: float, y_m: float) -> None:
-        """Say where the target is, in the terrain's frame. It is repeated until the next call or `leave`.
+        """States where the target is, in the terrain's frame. It is repeated until the next call or `leave`.
 
         Raises ConfigError on a location outside the terrain and on a value that is not a number; the previous pose
         is kept.

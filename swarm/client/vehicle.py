@@ -77,9 +77,9 @@ class Vehicle(Reported):
     # --- place --------------------------------------------------------------------------------------------------
 
     def at(self, x_m: float, y_m: float, *, heading_rad: float | None = None, speed_m_per_s: float = 0.0) -> None:
-        """Say where the vehicle is. All vehicles of the swarm avoid this place from their next tick on, and where
-        it will be soon. It is repeated until the next call or `leave`: without another call the vehicle counts as
-        at rest.
+        """States where the vehicle is. All vehicles of the swarm avoid this place from their next tick on, and
+        where it will be soon. It is repeated until the next call or `leave`: without another call the vehicle
+        counts as at rest.
 
         x_m, y_m       in the terrain's frame; of a latitude and longitude: `at(*swarm.frame.from_wgs84(lat, lon))`
         heading_rad    clockwise from north; None if it may go any way
@@ -114,11 +114,11 @@ class Vehicle(Reported):
     # --- right of way -------------------------------------------------------------------------------------------
 
     def give_way(self, way: GuestSession) -> None:
-        """Let it reserve cells from now on. Called once, before the first `at`."""
+        """Makes it reserve cells from now on. Called once, before the first `at`."""
         self._way = way
 
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
-        """Say into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
+        """States into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
         and wait until it may enter the first. Returns the cells that it may enter now: no other vehicle enters them
         before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
 
@@ -174,12 +174,12 @@ class Vehicle(Reported):
         return stream
 
     def on_route(self, callback: Callable[[Route], None]) -> None:
-        """Call with every route of the target that is followed. It is called on the connection's thread, so it must
-        not wait for answers."""
+        """Calls with every route of the target that is followed. It is called on the connection's thread, so it
+        must not wait for answers."""
         self._on_route.append(callback)
 
     def unfollow(self) -> None:
-        """Follow nothing any more; streams of routes end."""
+        """Follows nothing any more; streams of routes end."""
         with self._session.lock:
             if self._target is not None:
                 self._session.bus.unsubscribe(PUSHED_ROUTE, agent=self.id, vehicle=self.id)
@@ -331,7 +331,7 @@ class Vehicle(Reported):
             self._session.bus.publish(DIGEST, self._marks.digest(), author=self._marks.author)
 
     def leave(self) -> None:
-        """Take the vehicle away: its place is free at once. Its marks stay. May be repeated."""
+        """Takes the vehicle away: its place is free at once. Its marks stay. May be repeated."""
         session = self._session
         with session.lock:
             self.unfollow()

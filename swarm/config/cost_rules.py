@@ -122,7 +122,7 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
 
 
 def check_cost(cost: CostConfig, source: str) -> None:
-    """Raise ConfigError where settings of cost that are valid each do not fit together."""
+    """Raises ConfigError where settings of cost that are valid each do not fit together."""
     where = f"{source}: cost"
     if bool(cost.slope_table) != (cost.slope_rule == "table"):
         needs = (

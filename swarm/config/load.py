@@ -26,7 +26,7 @@ from swarm.places import read_place
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read and check a scenario. Raises ConfigError that names the file and the key."""
+    """Reads and check a scenario. Raises ConfigError that names the file and the key."""
     return parse_scenario(read_text(path, FileKind.SCENARIO), str(path), base=path.parent)
 
 
@@ -108,7 +108,7 @@ def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:
 
 
 def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
-    """Remove a key, so that msgspec finds the next fault. False if there is none."""
+    """Removes a key, so that msgspec finds the next fault. False if there is none."""
     parent: Any = raw
     for step in place[:-1]:
         parent = parent[step]

@@ -128,7 +128,7 @@ def installed(kind: PluginKind) -> dict[str, list[EntryPoint]]:
 
 
 def check_name(plugin: NamedPlugin, source: str) -> None:
-    """Raise ConfigError where a name is neither built in, nor installed, nor `module:Name`. Imports nothing."""
+    """Raises ConfigError where a name is neither built in, nor installed, nor `module:Name`. Imports nothing."""
     kind, name = plugin.kind, plugin.name
     if name in kind.built_in or ":" in name:
         return

@@ -58,8 +58,8 @@ class Plugin:
 
 
 def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
-    """Import what a scenario names, and check its options. Raises ConfigError with the key, the value found and the
-    value expected.
+    """Imports what a scenario names, and check its options. Raises ConfigError with the key, the value found and
+    the value expected.
 
     folder  where modules lie that are not installed
     """
@@ -73,7 +73,7 @@ def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
 
 
 def check_plugins(scenario: Scenario, roles: Collection[str]) -> None:
-    """Find every plug-in that these roles call, so that a fault is said once, before processes start."""
+    """Finds every plug-in that these roles call, so that a fault is said once, before processes start."""
     for named in plugins_of(scenario):
         if named.kind.role in roles:
             find_plugin(named, scenario.plugin_folder)
@@ -94,7 +94,7 @@ def source_of(named: NamedPlugin, folder: str) -> bytes:
 
 
 def _reach(folder: str) -> None:
-    """Let modules of this folder be imported."""
+    """Makes modules of this folder be imported."""
     if folder not in sys.path:
         sys.path.append(folder)  # last: it hides nothing that is installed
         importlib.invalidate_caches()

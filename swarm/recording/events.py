@@ -179,7 +179,7 @@ class LoopCounters(Counters):
 
 
 def set_figures(counters: Counters, figures: LoopFigures | None) -> None:
-    """Write recorded figures into a service's counters."""
+    """Writes recorded figures into a service's counters."""
     if figures is None:
         return
     counters.set_counts(figures.counts)

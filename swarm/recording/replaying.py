@@ -152,7 +152,7 @@ def replay(
     namespace: str,
     until_s: float | None = None,
 ) -> Outcome:
-    """Feed a recording to a service until its outputs differ. Raises StoreError on records that make no sense.
+    """Feeds a recording to a service until its outputs differ. Raises StoreError on records that make no sense.
 
     make  makes the service behind a boundary
     """

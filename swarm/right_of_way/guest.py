@@ -82,7 +82,7 @@ class Guest:
         return self._host.holdings.refused
 
     def enter(self, cell: int) -> None:
-        """Ask for the cell on which it stands, or wants to begin. Raises ValueError where it has one already, or
+        """Asks for the cell on which it stands, or wants to begin. Raises ValueError where it has one already, or
         there is none."""
         if self.cells:
             raise ValueError(f"it holds cell {self.cells[0]}: leave before it enters elsewhere")
@@ -93,7 +93,7 @@ class Guest:
             self._host.holdings.enter(self.vehicle, cell)
 
     def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
-        """Say where it would go. Cells that it holds and that are not the beginning of this path are given back.
+        """States where it would go. Cells that it holds and that are not the beginning of this path are given back.
 
         path   cells, each next to the one before: the one on which it stands, then where it drives
         aside  neighbours to which it would also go, to let others pass, if it stands
@@ -141,7 +141,7 @@ class Guest:
         self._host.hear_known(known.agent, known.life, known.plots)
 
     def begin(self, chance: int) -> list[GuestAction]:
-        """Begin a life, once all agents that could be asked have answered.
+        """Begins a life, once all agents that could be asked have answered.
 
         chance  a random number
         """

@@ -93,7 +93,7 @@ class GuestService:
         self._bus.unsubscribe(GRANTED, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
-        """Ask for the cell on which the vehicle stands. Raises as `Guest.enter`."""
+        """Asks for the cell on which the vehicle stands. Raises as `Guest.enter`."""
         if not 0 <= cell < self._grid.cells:
             raise ValueError(f"cell {cell} is outside the map of {self._grid.cells} cells")
         self._cell = cell
@@ -104,7 +104,7 @@ class GuestService:
         self.tell(now_ns)
 
     def leave(self, now_ns: int) -> None:
-        """Give all cells back."""
+        """Gives all cells back."""
         self._cell = None
         if self.guest is not None:
             self.guest.leave()
@@ -274,7 +274,7 @@ class GuestSession:
             return guest is not None and guest.replaced
 
     def enter(self, cell: int, timeout_s: float | None = None) -> bool:
-        """Ask for the cell where the vehicle stands. Returns whether it is granted within `timeout_s`; None asks
+        """Asks for the cell where the vehicle stands. Returns whether it is granted within `timeout_s`; None asks
         without waiting. It stays asked for: call again to ask for another one.
 
         Raises ValueError for a cell outside the map, or if it has entered already.
@@ -284,7 +284,7 @@ class GuestSession:
         return self._wait(lambda: bool(self.cells), timeout_s)
 
     def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
-        """Say where it would go: the cell on which it stands first, each next to the one before. Cells that it
+        """States where it would go: the cell on which it stands first, each next to the one before. Cells that it
         holds and that are not the beginning of this path are given back.
 
         aside  neighbours to which it would go, too, to let others pass; `cells` then names one instead

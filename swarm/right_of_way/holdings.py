@@ -111,7 +111,7 @@ class Holdings:
         self.end()
 
     def end(self) -> None:
-        """Hold nothing and know nothing, as before the first life."""
+        """Holds nothing and know nothing, as before the first life."""
         self.life = self.newest = 0
         self.replaced = False
         self.plots: dict[int, None] = {}
@@ -133,7 +133,7 @@ class Holdings:
         self._seq = 0
 
     def begin(self, life: int, dead: Sequence[int]) -> None:
-        """Begin a life; `dead` are earlier ones that are proved to have ended."""
+        """Begins a life; `dead` are earlier ones that are proved to have ended."""
         self.life = life
         self._dead = list(dead)
 
@@ -176,13 +176,13 @@ class Holdings:
         self._paths[vehicle] = path[path.index(cell) :]
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
-        """Keep only the first cells of the path. The rest must not be entered any more."""
+        """Keeps only the first cells of the path. The rest must not be entered any more."""
         keep = max(keep, 1)
         if len(self._paths[vehicle]) > keep:
             self._paths[vehicle] = self._paths[vehicle][:keep]
 
     def enter(self, vehicle: str, cell: int) -> None:
-        """Ask for a first cell for a vehicle that holds none; the newest call counts. If an earlier life of ours
+        """Asks for a first cell for a vehicle that holds none; the newest call counts. If an earlier life of ours
         was granted cells for it, it takes this one of them and releases all others."""
         if vehicle not in self._paths:
             self._enters[vehicle] = cell
@@ -219,7 +219,7 @@ class Holdings:
     # --- what wardens say -----------------------------------------------------------------------------------
 
     def watch(self, plots: Collection[int]) -> None:
-        """Let these plots concern us, until they are seen to hold nothing of ours."""
+        """Makes these plots concern us, until they are seen to hold nothing of ours."""
         for plot in plots:
             self.plots.setdefault(plot)
             self._views.setdefault(plot, _View())
@@ -251,7 +251,7 @@ class Holdings:
         return self._take(view, granted, place)
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
-        """Take in the cells that are granted to each vehicle."""
+        """Takes in the cells that are granted to each vehicle."""
         before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of
         view.seen = grants
         changed = [id for id, cells in grants.items() if before.get(id) != cells or id not in paths]
@@ -414,7 +414,7 @@ class Holdings:
         return Wish(ahead, [cell for cell in wish.wants if cell not in lapsed], better, wish.age_ms)
 
     def _forget_left(self, by_plot: Mapping[int, Mapping[str, _Told]]) -> None:
-        """Leave the plots where we hold and want nothing, once their tables show that they know it."""
+        """Leaves the plots where we hold and want nothing, once their tables show that they know it."""
         for plot, stands in by_plot.items():
             view = self._views.setdefault(plot, _View())
             if stands:

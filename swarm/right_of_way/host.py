@@ -69,8 +69,8 @@ class Host:
         return all(len(self._told_by.intersection(of)) > len(of) - self.plots.majority for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
-        """Begin a new life, once those who could be asked have answered. Returns the lives to keep on file; nothing
-        may be said before they are.
+        """Begins a new life, once those who could be asked have answered. Returns the lives to keep on file;
+        nothing may be said before they are.
 
         dead    our lives that are on the file which this process has locked: they have ended
         chance  a random number

@@ -49,7 +49,7 @@ class MemoryLives:
         self.lives = list(lives)
 
     def close(self) -> None:
-        """Let another process have it."""
+        """Gives it to another process."""
 
 
 class LifeFile(MemoryLives):

@@ -95,7 +95,7 @@ class Leadership:
             self._led_ns = heard_ns - self.lease_ns  # it has stopped: there is nothing to wait for
 
     def tick(self, ready: bool, now_ns: int) -> bool:
-        """Decide whether this process leads from now on. `ready`: whether it can do its job."""
+        """Decides whether this process leads from now on. `ready`: whether it can do its job."""
         if self._alone:
             return True
         stalled = self._ticked_ns is not None and now_ns - self._ticked_ns >= self.lease_ns
@@ -165,7 +165,7 @@ class Candidacy:
         return self._core.leads
 
     def start(self) -> None:
-        """Listen to all candidates of this job, other lives of this id among them."""
+        """Listens to all candidates of this job, other lives of this id among them."""
         for rank in range(self._standbys + 1 if self._standbys else 0):
             id = ranked_id(job_of(self._setup.id), rank)
             self._bus.subscribe(LEAD, self._post, role=self._setup.role, id=id)
@@ -187,7 +187,7 @@ class Candidacy:
         return leads
 
     def tell(self, member: Member, now_ns: int) -> None:
-        """Say to people that another leads from now on. Without standbys there is nothing to say."""
+        """States to people that another leads from now on. Without standbys there is nothing to say."""
         if not self._standbys:
             return
         text = "leads from now on" if self.leads else "stands by from now on"
@@ -195,7 +195,7 @@ class Candidacy:
         member.note(now_ns, "leader", text)
 
     def stop(self) -> None:
-        """Let another take over at once."""
+        """Makes another take over immediately."""
         if self._standbys:
             self._beat(False, False)
 

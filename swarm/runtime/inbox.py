@@ -66,7 +66,7 @@ class Inbox:
         their turn came."""
 
     def post(self, event: Event) -> None:
-        """Add an event, from any thread.
+        """Adds an event, from any thread.
 
         With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
         oldest samples instead of this inbox growing.
@@ -91,13 +91,13 @@ class Inbox:
             self._put(event, _KEPT)
 
     def fail(self, error: BaseException) -> None:
-        """Make the owner raise: how another thread ends its process."""
+        """Makes the owner raise: how another thread ends its process."""
         self._put(error, _KEPT)
 
     def _put(
         self, event: Event | BaseException, name: str, newest: Hashable | None = None
     ) -> Event | BaseException | None:
-        """Add an event to a queue. Returns the one that is dropped for it.
+        """Adds an event to a queue. Returns the one that is dropped for it.
 
         newest  what only the newest event counts of; None if each counts
         """
@@ -145,7 +145,7 @@ class Inbox:
         return event.decoded() if isinstance(event, Undecoded) else event
 
     def _pop(self, expired: list[Question]) -> Event | BaseException | None:
-        """Remove the next event. Questions whose time is over are removed on the way, into `expired`."""
+        """Removes the next event. Questions whose time is over are removed on the way, into `expired`."""
         while self._unread:
             name, newest_first = self._choose(expired)
             if name is None:
@@ -188,7 +188,7 @@ class Inbox:
         expired.append(asked)
 
     def wake(self) -> None:
-        """End a `take` that waits, from any thread and from a signal handler."""
+        """Ends a `take` that waits, from any thread and from a signal handler."""
         with self._lock:
             self._ring()
 

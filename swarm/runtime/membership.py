@@ -149,8 +149,8 @@ class Member:
         return [what for what, met in own if not met] + [what for what, met in self._needs if not met()]
 
     def join(self) -> None:
-        """Serve our run, then ask for those of others, in this order: of two processes that start at once at least
-        one hears the other. Called once for each bus."""
+        """Serves our run, then asks for those of others, in this order: of two processes that start at once at
+        least one hears the other. Called once for each bus."""
         self._bus.serve(RUN, self._post, role=self.info.role, id=self.info.id)
         self._bus.watch_links(self._post)
         self._bus.watch_alive(self._post, role=ROUTER)
@@ -158,7 +158,7 @@ class Member:
         self._ask()
 
     def move_to(self, bus: Bus) -> None:
-        """Go on, and join, on another bus; the one before is closed."""
+        """Goes on, and join, on another bus; the one before is closed."""
         self._bus = bus
         self.join()
 
@@ -207,7 +207,7 @@ class Member:
             self.publish_stats(now_ns)
 
     def publish_stats(self, now_ns: int) -> None:
-        """Publish the counters now: the last time when the service stops."""
+        """Publishes the counters now: the last time when the service stops."""
         counts = {**self.counters.counts, **self._bus.counts}
         self._measure(counts, now_ns)
         self.counters.gauge(READY, float(not self.lacks()))
@@ -254,7 +254,7 @@ class Member:
     def note(
         self, now_ns: int, kind: str, text: str, cell: int | None = None, *, target: str | None = None
     ) -> None:
-        """Publish a sentence for people who watch the run."""
+        """Publishes a sentence for people who watch the run."""
         info = self.info
         note = Note(
             role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell, target=target
@@ -262,13 +262,13 @@ class Member:
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
 
     def warn(self, now_ns: int, kind: str, text: str) -> None:
-        """Say what went wrong in the log and to people who watch the run, and count it as `kind`."""
+        """States what went wrong in the log and to people who watch the run, and counts it as `kind`."""
         log.warning("%s: %s", kind, text)
         self.counters.count(kind)
         self.note(now_ns, kind, text)
 
     def tell_faults(self, faults: list[str], now_ns: int) -> None:
-        """Say what plug-ins did wrong, and clear the list."""
+        """States what plug-ins did wrong, and clears the list."""
         for fault in faults:
             self.warn(now_ns, "plugin_failed", fault)
         faults.clear()
@@ -310,7 +310,8 @@ def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
 
 
 def check_same_run(mine: RunInfo, other: RunInfo) -> None:
-    """Raise RunMismatchError, with a sentence on the difference, where two processes must not share a namespace."""
+    """Raises RunMismatchError, with a sentence on the difference, where two processes must not share a
+    namespace."""
     who = f"{other.role} {other.id}"
     if other.run_id != mine.run_id:
         raise RunMismatchError(

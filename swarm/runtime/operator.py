@@ -70,7 +70,7 @@ class Operator:
         return self._order_zone(ZoneOrder(action="list"), self._keeper())
 
     def zone(self, order: ZoneOrder) -> tuple[Zones, Acknowledged]:
-        """Add or remove a zone, and wait until it is in the maps of all agents and the trees of all planners.
+        """Adds or removes a zone, and waits until it is in the maps of all agents and the trees of all planners.
 
         Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
         """

@@ -40,7 +40,7 @@ class OrderBook:
         return len(self._orders)
 
     def merge(self, orders: Iterable[Order], now_ns: int) -> list[Order]:
-        """Take in orders; returns those that were news."""
+        """Takes in orders; returns those that were news."""
         news = []
         for order in orders:
             key: Key = (order.subject, order.name)

@@ -92,7 +92,7 @@ class OrderClient:
         self._answer()
 
     def _answer(self) -> None:
-        """Answer those whose order is obeyed now, and leave those who ask no more."""
+        """Answers those whose order is obeyed now, and drops those who ask no more."""
         left: list[Asked] = []
         for asked in self._waiting:
             assert isinstance(asked.request, Obey)

@@ -80,7 +80,7 @@ class Service(Protocol):
         ...
 
     def stop(self, now_ns: int) -> None:
-        """Publish what must not be lost. Called once, after all others; the bus is closed after it."""
+        """Publishes what must not be lost. Called once, after all others; the bus is closed after it."""
         ...
 
 
@@ -125,14 +125,14 @@ class ThreadWorker:
                 _give_way()
 
     def close(self) -> None:
-        """Begin no other job. The current job is abandoned: `close` does not wait for it, and the process's end
+        """Begins no other job. The current job is abandoned: `close` does not wait for it, and the process's end
         ends it."""
         self._closed = True
         self._jobs.put(None)
 
 
 def _give_way() -> None:
-    """Make this thread less urgent than the others of its process, by `_WORKER_NICE`."""
+    """Makes this thread less urgent than the others of its process, by `_WORKER_NICE`."""
     thread = threading.get_native_id()
     with suppress(OSError):  # not every system gives threads a priority of their own
         nice = os.getpriority(os.PRIO_PROCESS, thread) + _WORKER_NICE
@@ -182,20 +182,20 @@ class Process:
         """Signals handled by `stop`; ignored once the loop has ended."""
 
     def stop(self) -> None:
-        """End the loop after the event in hand. Callable from any thread and, as its lock is re-entrant, from a
+        """Ends the loop after the event in hand. Callable from any thread and, as its lock is re-entrant, from a
         signal handler."""
         self._stopping = True
         self._inbox.wake()
 
     def stop_on_signals(self) -> None:
-        """Let SIGTERM and SIGINT call `stop`. Call it on the main thread, and `run` too."""
+        """Makes SIGTERM and SIGINT call `stop`. Call it on the main thread, and `run` too."""
         self._signals = (signal.SIGTERM, signal.SIGINT)
         for number in self._signals:
             signal.signal(number, lambda *_: self.stop())
 
     def run(self) -> None:
-        """Start the service, loop, stop it. Of several late ticks one is run and the others are counted as dropped.
-        Raises what the service, a worker's job or any other thread raised, after stopping the service.
+        """Starts the service, loops, and stops it. Of several late ticks one is run and the others are counted as
+        dropped. Raises what the service, a worker's job or any other thread raised, after stopping the service.
 
         Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
         the next one is taken. A tick that takes its whole period therefore halves its rate, and delays no event.
@@ -258,7 +258,7 @@ class Process:
 
 @contextmanager
 def _failing_with_threads(inbox: Inbox) -> Iterator[None]:
-    """Let the owner of the inbox raise what any thread of this interpreter ends by.
+    """Makes the owner of the inbox raise what any thread of this interpreter ends by.
 
     A thread that dies alone leaves its process deaf: alive to the others, but without subscription, tokens or
     worker.
@@ -280,7 +280,7 @@ def _failing_with_threads(inbox: Inbox) -> Iterator[None]:
 
 
 def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:
-    """Stop when the parent process ends; after `grace_s` more seconds end this process with exit code 1.
+    """Stops when the parent process ends; after `grace_s` more seconds end this process with exit code 1.
 
     parent_gone  blocks until the parent has ended, as `wait([parent_process().sentinel])` does
     """

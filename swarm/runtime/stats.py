@@ -58,7 +58,7 @@ class Histogram:
         self.buckets: dict[int, int] = dict(buckets or {})
 
     def add(self, value: float, times: int = 1) -> None:
-        """Count a value. Zero and below count as zero; infinities and NaN are ignored."""
+        """Counts a value. Zero and below count as zero; infinities and NaN are ignored."""
         if not math.isfinite(value):
             return
         bucket = ZERO_BUCKET if value <= 0 else min(round(math.log(value) / _LOG_BASE), TOP_BUCKET)
@@ -76,7 +76,7 @@ class Histogram:
             self.merge({ZERO_BUCKET: values.size - positive.size})
 
     def merge(self, buckets: Mapping[int, int]) -> None:
-        """Add the counts of another histogram's buckets."""
+        """Adds the counts of another histogram's buckets."""
         for bucket, count in buckets.items():
             self.buckets[bucket] = self.buckets.get(bucket, 0) + count
 
@@ -167,7 +167,7 @@ class Counters:
         self.histograms_by: dict[str, dict[str, Histogram]] = {}
 
     def count_by(self, name: str, id: str) -> None:
-        """Count for one target or vehicle; those beyond `MOST_IDS` are counted as `ids_uncounted` only."""
+        """Counts for one target or vehicle; those beyond `MOST_IDS` are counted as `ids_uncounted` only."""
         counts = self.counts_by.setdefault(name, {})
         if id in counts or len(counts) < MOST_IDS:
             counts[id] = counts.get(id, 0) + 1
@@ -175,7 +175,7 @@ class Counters:
             self.count("ids_uncounted")
 
     def observe_by(self, name: str, id: str, value: float) -> None:
-        """Add a value to the histogram of one target or vehicle; bounded as `count_by`."""
+        """Adds a value to the histogram of one target or vehicle; bounded as `count_by`."""
         histograms = self.histograms_by.setdefault(name, {})
         if id in histograms or len(histograms) < MOST_IDS:
             _named(id, histograms).add(value)
@@ -190,14 +190,14 @@ class Counters:
         self.counts.update(counts)
 
     def gauge(self, name: str, value: float) -> None:
-        """Set the present value; infinities and NaN remove it."""
+        """Sets the present value; infinities and NaN remove it."""
         if math.isfinite(value):
             self.gauges[name] = value
         else:
             self.gauges.pop(name, None)
 
     def observe(self, name: str, value: float) -> None:
-        """Add a value to a histogram."""
+        """Adds a value to a histogram."""
         _named(name, self.histograms).add(value)
 
     def observe_all(self, name: str, values: NDArray[np.float64]) -> None:

@@ -97,7 +97,7 @@ class Tracking:
         return None if self.pose is None else max(now_ns - self.heard_ns, 0)
 
     def judge(self, pose: TargetPose, now_ns: int) -> Verdict:
-        """Take in a pose of this target. Only if it counts has `pose` changed."""
+        """Takes in a pose of this target. Only if it counts has `pose` changed."""
         if pose.cell == CELL_OF_PLACE:
             pose = msgspec.structs.replace(pose, cell=self._grid.cell_at(pose.x_m, pose.y_m))
         if not 0 <= pose.cell < self._grid.cells:
@@ -125,7 +125,7 @@ class Tracking:
         return Verdict.COUNTS
 
     def place(self, pose: TargetPose, now_ns: int) -> None:
-        """Take a pose for where a target without a tracker is, for as long as its lease says. The same once more
+        """Takes a pose for where a target without a tracker is, for as long as its lease says. The same once more
         changes nothing."""
         if pose != self.pose and 0 <= pose.cell < self._grid.cells:
             self.pose, self.heard_ns = pose, now_ns
@@ -152,7 +152,7 @@ class Trackings:
         self._of: dict[str, Tracking] = {}
 
     def counted(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
-        """Take in a pose of any target; returns it, with its cell, if it counts."""
+        """Takes in a pose of any target; returns it, with its cell, if it counts."""
         tracking = self._of.get(pose.target)
         if tracking is None:
             if len(self._of) >= _MOST_TARGETS:

@@ -119,7 +119,7 @@ def check_code(
     payload: bytes,
     asked: bytes = b"",
 ) -> None:
-    """Raise ProtocolError on what no process of the run has said, on a trusted topic."""
+    """Raises ProtocolError on what no process of the run has said, on a trusted topic."""
     right = code_of(authenticator, topic, key, payload, asked)
     if right is None or (code is not None and hmac.compare_digest(code, right)):
         return

@@ -139,7 +139,7 @@ def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | Pr
 
 
 def prime(message_type: type[Message]) -> None:
-    """Let msgspec build its description of a type now, on one thread.
+    """Makes msgspec build its description of a type now, on one thread.
 
     msgspec 0.20 builds it at the first use and lets other threads see it unfinished, which crashed an agent whose
     first replies came on several threads.

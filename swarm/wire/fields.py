@@ -207,13 +207,13 @@ def column(data: bytes, dtype: str) -> NDArray[Any]:
 
 
 def check_column(name: str, data: bytes, width: int, count: int) -> None:
-    """Raise ValueError unless `data` has `count` values of `width` bytes."""
+    """Raises ValueError unless `data` has `count` values of `width` bytes."""
     if len(data) != width * count:
         raise ValueError(f"{name} has {len(data)} bytes, expected {count} values of {width}")
 
 
 def check_id(name: str, value: object) -> None:
-    """Raise ValueError unless `value` can be one chunk of a key."""
+    """Raises ValueError unless `value` can be one chunk of a key."""
     if not isinstance(value, str):
         raise ValueError(f"{name} is {reprlib.repr(value)}, expected text")
     if value in _KNOWN_IDS:
@@ -242,12 +242,12 @@ class Bounded(msgspec.Struct, frozen=True):
             rule(self)
 
     def check_bounds(self) -> None:
-        """Raise ValueError where a field breaks a rule of its annotation, or `relate` says so: for types which do
+        """Raises ValueError where a field breaks a rule of its annotation, or `relate` says so: for types which do
         not do that when they are made."""
         Bounded.__post_init__(self)
 
     def relate(self) -> None:
-        """Raise ValueError where fields contradict each other. Rules of a single field are in its type."""
+        """Raises ValueError where fields contradict each other. Rules of a single field are in its type."""
 
 
 class Part(msgspec.Struct, frozen=True):

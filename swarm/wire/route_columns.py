@@ -342,7 +342,7 @@ _LEGS_FAULT = "legs do not end where the steps of their routes do"
 
 
 def check_legs(steps: Sequence[int], packed: bytes) -> None:
-    """Raise ValueError unless there are no legs at all, or those of each route go over all of its steps."""
+    """Raises ValueError unless there are no legs at all, or those of each route go over all of its steps."""
     legs = _listed(packed, "I") if packed else ()
     if legs and (sum(legs) != sum(steps) or not {*accumulate(steps)} <= {0, *accumulate(legs)}):
         raise ValueError(_LEGS_FAULT)

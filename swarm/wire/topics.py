@@ -126,7 +126,7 @@ class Topic:
         return match.groupdict() if match else None
 
     def check_key(self, fields: Mapping[str, str], message: Message) -> None:
-        """Raise ProtocolError on a message with a field that differs from its key. Routers grant access by key, so
+        """Raises ProtocolError on a message with a field that differs from its key. Routers grant access by key, so
         the key decides who a sender is."""
         for name in self._repeated:
             stated = str(getattr(message, name))

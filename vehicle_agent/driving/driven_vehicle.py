@@ -117,7 +117,7 @@ class Vehicle:
     # --- targets and planners -------------------------------------------------------------------------------
 
     def assign(self, target: str, now_ns: int) -> None:
-        """Go for this target from now on."""
+        """Goes for this target from now on."""
         if target == self.target and self.state is not VehicleState.STRANDED:
             self._settle()
             return
@@ -130,7 +130,7 @@ class Vehicle:
         self._need_route(Reason.ASSIGNED, now_ns)
 
     def release(self) -> None:
-        """Go for no target any more, until another is assigned."""
+        """Goes for no target any more, until another is assigned."""
         self.target = self.asked = self._need = None
         self.in_reach = self.planner_gone = self.searching = False
         self.route.drop()
@@ -199,7 +199,7 @@ class Vehicle:
         return self._need
 
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
-        """Begin the route, if it leads to the target and passes a cell of the vehicle's path."""
+        """Begins the route, if it leads to the target and passes a cell of the vehicle's path."""
         if not given.pushed:
             self.asked = None
         begun = None

@@ -57,13 +57,13 @@ class Driver:
         measured."""
 
     def begin(self, vehicles: Iterable[str], seconds: float) -> None:
-        """Give each of these so much time."""
+        """Gives each of these so much time."""
         self._left_s = dict.fromkeys(vehicles, seconds)
         if self._dynamics is not None:
             self._dynamics.begin(seconds)
 
     def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
-        """Let each drive until it comes to another cell, or its time is over.
+        """Makes each drive until it comes to another cell, or its time is over.
 
         stopped  whether a vehicle has to stand
         """
@@ -136,7 +136,7 @@ class Driver:
             self._steps[vehicle.id] = (head, step[1] + seconds)
 
     def end_path(self, vehicle: Vehicle) -> None:
-        """Give back what lies behind a step that the map does not allow any more."""
+        """Gives back what lies behind a step that the map does not allow any more."""
         path = self._holdings.path(vehicle.id)
         for index, (tail, head) in enumerate(pairwise(path), 1):
             if not self._passable(tail, head):
@@ -146,7 +146,7 @@ class Driver:
                 return
 
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
-        """Give back all but the first cells, and the one that it drives into."""
+        """Gives back all but the first cells, and the one that it drives into."""
         self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
 
 

@@ -62,7 +62,7 @@ class Motion:
         return None if self.cell == self.head else self.head
 
     def set_out(self, cell: int, to: Point | None = None) -> None:
-        """Begin a step to a neighbour cell. Raises ValueError if it is not at rest or the cell is no neighbour.
+        """Begins a step to a neighbour cell. Raises ValueError if it is not at rest or the cell is no neighbour.
 
         to  the point inside that cell where the step ends, as row and col; None is its middle
         """
@@ -80,7 +80,7 @@ class Motion:
         self._settle()
 
     def turn_back(self) -> None:
-        """Return to where the step began, if it has not entered the next cell."""
+        """Returns to where the step began, if it has not entered the next cell."""
         if self.entering is not None:
             self.tail, self.head = self.head, self.tail
             self._at, self._to = self._to, self._at

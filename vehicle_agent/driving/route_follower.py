@@ -39,7 +39,7 @@ class Follower:
     def begin(
         self, cells: Sequence[int], path: Sequence[int], partial: bool = False, turns: Sequence[int] = ()
     ) -> bool:
-        """Follow a route from the first cell of a vehicle's path that it passes. False if it passes none; then
+        """Follows a route from the first cell of a vehicle's path that it passes. False if it passes none; then
         nothing changes.
 
         turns  of a pulled route the indices of the cells in which it turns, its first and last included
@@ -136,7 +136,7 @@ class Follower:
         return self._cells[first:] if count is None else self._cells[first : first + count]
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
-        """End the route before the first step ahead that is not passable; True if there is one.
+        """Ends the route before the first step ahead that is not passable; True if there is one.
 
         passable  how many steps from the first of some cells on are
         """

@@ -135,7 +135,7 @@ class UntrackedTargets:
         return None if best is None else pose_of(best)
 
     def expire(self, now_ns: int) -> None:
-        """Forget expired sightings. A vehicle goes on to where it last knew its target to be."""
+        """Forgets expired sightings. A vehicle goes on to where it last knew its target to be."""
         self._sightings.expire(now_ns)
 
 
@@ -190,7 +190,7 @@ class EmptyPlaces:
             self._by_sight.discard(target)
 
     def find_gone(self, stood_at: Iterable[str], now_ns: int) -> bool:
-        """Find which targets are gone; returns whether one is that was not before.
+        """Finds which targets are gone; returns whether one is that was not before.
 
         stood_at  targets that a vehicle has within reach, by their known positions
         """

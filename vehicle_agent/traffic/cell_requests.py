@@ -84,7 +84,7 @@ class CellRequests:
         self._changed += windows
 
     def make_anew(self) -> None:
-        """Keep nothing: at the next call of `make` all are made."""
+        """Keeps nothing: at the next call of `make` all are made."""
         self._made_of.clear()
 
     def stay(self, vehicle: str) -> None:
@@ -93,7 +93,7 @@ class CellRequests:
         self._made_of.pop(vehicle, None)
 
     def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
-        """Make the wishes of these vehicles for which anything has changed. Called once in a tick, after all
+        """Makes the wishes of these vehicles for which anything has changed. Called once in a tick, after all
         changes of held cells."""
         holdings, steering = self._holdings, self._steering
         held = holdings.occupied()
@@ -134,7 +134,7 @@ class CellRequests:
                 self.of[id] = wish
 
     def _forget_near(self, vehicles: Sequence[Vehicle]) -> None:
-        """Keep no wish of a vehicle near which the ground has changed, or what bodies close and threaten."""
+        """Keeps no wish of a vehicle near which the ground has changed, or what bodies close and threaten."""
         changed = [*self._changed, *self._bodies.take_changed()]
         self._changed = []
         if not (changed and vehicles):

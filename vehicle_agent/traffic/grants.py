@@ -47,7 +47,7 @@ class Grants:
         return _NO_CELLS if grant is None else grant.cells
 
     def set(self, vehicle: str, cells: list[int], stamp: Stamp) -> None:
-        """Let a vehicle be granted these cells, or none."""
+        """Makes a vehicle be granted these cells, or none."""
         before, host = self.cells_of(vehicle), agent_of(vehicle)
         if cells:
             self._add(vehicle, Grant(cells, stamp))

@@ -130,7 +130,7 @@ class RightOfWay:
         return [self.own]
 
     def begin(self, chance: int) -> list[Action]:
-        """Begin a new life, once those who could be asked have answered.
+        """Begins a new life, once those who could be asked have answered.
 
         chance  a random number
         """

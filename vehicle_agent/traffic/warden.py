@@ -227,7 +227,7 @@ class Warden:
         self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
-        """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
+        """Drops what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
         cells, stamp = self._grants.of[vehicle].cells, self._grants.of[vehicle].stamp
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]

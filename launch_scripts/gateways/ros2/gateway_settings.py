@@ -265,8 +265,8 @@ def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_ta
 
 
 def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
-    """Read and check a file of settings, or none, and what options say over them. Raises ConfigError that names the
-    file, or options, and the key.
+    """Reads and check a file of settings, or none, and what options say over them. Raises ConfigError that names
+    the file, or options, and the key.
 
     options  key -> value, such as {"ros.domain": 3}; None changes nothing
     """

@@ -78,7 +78,7 @@ class RosTypes:
                     self._link_service(name.removesuffix(RESPONSE))
 
     def _link_service(self, name: str) -> None:
-        """Add the type of a service whose request and response are known: what its hash is computed from."""
+        """Adds the type of a service whose request and response are known: what its hash is computed from."""
 
         def at_most_one(part: str) -> Any:
             return Nodetype.SEQUENCE, ((Nodetype.NAME, name + part), 1)

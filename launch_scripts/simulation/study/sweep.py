@@ -55,7 +55,7 @@ class ResultStore:
             self.results[result.key] = result
 
     def add(self, result: Result) -> None:
-        """Keep a result. Raises StoreError."""
+        """Keeps a result. Raises StoreError."""
         self.results[result.key] = result
         try:
             with self.path.open("ab", buffering=0) as file:

@@ -145,7 +145,7 @@ class Referee:
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_body(self, body: Body, now_ns: int) -> None:
-        """Take in where a body is."""
+        """Takes in where a body is."""
         self._bodies.on_body(body, now_ns)
 
     def on_fleet(self, fleet: Fleet) -> list[Broken]:
@@ -250,7 +250,7 @@ class BodyReferee:
         self._swept_ns = 0
 
     def on_body(self, body: Body, now_ns: int) -> None:
-        """Take in a report; one that is no news, or that no agent would avoid, changes nothing."""
+        """Takes in a report; one that is no news, or that no agent would avoid, changes nothing."""
         key = body.id, body.incarnation
         record = self._records.get(key)
         if record is None:
@@ -299,7 +299,7 @@ class BodyReferee:
                 )
 
     def _sweep(self, now_ns: int) -> None:
-        """Forget what ended long ago."""
+        """Forgets what ended long ago."""
         self._swept_ns = now_ns
         _forget(self._covers, lambda cover: now_ns - cover.end_ns > _REMEMBER_NS)
         for key in [key for key, record in self._records.items() if now_ns - record.until_ns > _REMEMBER_NS]:

@@ -77,7 +77,7 @@ class Rovers:
         return rover
 
     def note_body(self, body: Body) -> None:
-        """Take in where the process that leads has moved a rover: one that takes over goes on from there."""
+        """Takes in where the process that leads has moved a rover: one that takes over goes on from there."""
         rover = self._by_id.get(body.id)
         if rover is not None and self._passable(body.x_m, body.y_m):
             rover.x_m, rover.y_m = body.x_m, body.y_m
@@ -141,7 +141,7 @@ class Rovers:
                 rover.rests_s = rover.chance.uniform(0.5, _LONGEST_REST_S)
 
     def _turn(self, rover: Rover) -> None:
-        """Turn to where the ground is free for a cell at least; stand for a while if there is none."""
+        """Turns to where the ground is free for a cell at least; stand for a while if there is none."""
         rover.rests_s, rover.turns = TURN_S, True
         far_m = self._terrain.grid.resolution_m + self._speed(rover) * 0.2
         for _ in range(_TRIES):

@@ -20,7 +20,7 @@ class Message(Bounded, frozen=True, kw_only=True, tag_field="schema"):
     """Base of all messages. Unknown fields are ignored, so that a newer sender can be understood."""
 
     def check(self) -> None:
-        """Raise ValueError where a decoded message breaks a rule of its type. Called by the codec.
+        """Raises ValueError where a decoded message breaks a rule of its type. Called by the codec.
 
         Most types check themselves when they are made, as `Bounded` does. Those which are made by the thousand
         from fields that were checked already do it here.

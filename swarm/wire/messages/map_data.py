@@ -66,7 +66,7 @@ _FEW = 100
 def check_lengths(
     count: int, cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes, untils_ns: bytes = b""
 ) -> None:
-    """Raise ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
+    """Raises ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
     check_column("cells", cells, 2, count)
     check_column("kinds", kinds, 1, count)
     check_column("paces", paces, 4, count)
@@ -76,7 +76,7 @@ def check_lengths(
 
 
 def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
-    """Raise ValueError with the rule that the columns of one set break. It has one or more statements."""
+    """Raises ValueError with the rule that the columns of one set break. It has one or more statements."""
     if max(kinds) > LAST_KIND:
         raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
     if len(kinds) > _FEW and numpy_loaded():
