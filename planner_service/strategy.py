@@ -38,7 +38,7 @@ class OnMove(Enum):
 
 
 class FullGrowth(Enum):
-    """When a strategy with windows asks for the exact tree, besides where a window cannot be grown."""
+    """Condition for a full search of a strategy with windows, beside windows that cannot be searched."""
 
     WHEN_FORCED = "when forced"
     """Section 3.3.2, the passive strategy: only when a vehicle whose route has run out asks."""
@@ -149,7 +149,8 @@ HYSTERESIS = 0.7
 
 
 class Auto:
-    """Which stage `auto` is in: a function of the times observed alone, so that a model decides alike everywhere.
+    """Returns which stage `auto` is in: a function of the times observed alone, so that a model decides alike
+    everywhere.
 
     stage  what to do now; `row` alone changes it
     """

@@ -43,7 +43,7 @@ class ClassPlanners:
         return iter(list(self._by_class.items()))
 
     def fault(self, name: str) -> str | None:
-        """Why nothing can be asked for a class; None if something can."""
+        """Reason why nothing can be asked for a class; None if something can."""
         if name == GROUND:
             return None
         if name in self._known:
@@ -57,7 +57,7 @@ class ClassPlanners:
         return self._by_class.get(name)
 
     def begun_ns(self, name: str) -> int:
-        """When the planner of a class was made, which tells it from one that was dropped; 0 of "ground"."""
+        """Time when the planner of a class was made, which tells it from one that was dropped; 0 of "ground"."""
         return self._begun_ns.get(name, 0)
 
     def used(self, name: str, now_ns: int) -> Planner:

@@ -72,7 +72,7 @@ POSE_SILENCE_NS = 2_000_000_000
 
 
 class Newest:
-    """Which messages of each stream are news: those numbered above the last that was.
+    """Detection of new messages in each stream: those numbered above the last new one.
 
     Once there has been no news for `silence_ns`, any other number is: so no single message outweighs all that
     follow it, and a sender whose clock was set back is heard. A message that comes so late as to be taken for news
@@ -99,7 +99,8 @@ class Newest:
 
 
 class Leases:
-    """When each key was last heard of. `expired` forgets keys that have been silent for longer than the lease."""
+    """Time when each key was last heard of. `expired` forgets keys that have been silent for longer than the
+    lease."""
 
     def __init__(self, lease_ns: int) -> None:
         self._lease_ns = lease_ns

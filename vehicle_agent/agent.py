@@ -386,7 +386,7 @@ class Agent:
             self.assignment.target_jumped(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
-        """Which planners live: target -> incarnation."""
+        """Returns which planners live: target -> incarnation."""
         before, self._planners = self._planners, dict(alive)
         for vehicle in self.vehicles.values():
             target = vehicle.target

@@ -49,7 +49,7 @@ class LocalMap:
     own_prior: NDArray[np.float32] | None = None
 
     def lethal(self, cells: NDArray[np.int64], paces: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Which of these cells are lethal to the vehicles' class, if these are their paces for "ground"."""
+        """Returns which of these cells are lethal to the vehicles' class, if these are their paces for "ground"."""
         if self.own_prior is None:
             return cells[np.isinf(paces)]
         found = np.isinf(paces) & np.isfinite(self.prior.reshape(-1)[cells])
@@ -57,7 +57,7 @@ class LocalMap:
 
 
 def meet(boxes: NDArray[np.int64], windows: Sequence[Window]) -> NDArray[np.bool_]:
-    """Which boxes any window meets.
+    """Returns which boxes any window meets.
 
     boxes  int64 (n, 4): the smallest row and column of each, and the greatest; one whose greatest are smaller meets
            none
@@ -204,8 +204,8 @@ class ZonesAround:
             self.ways_out = self._find_ways_out(shut)
 
     def free(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which cells are in no zone for all vehicles. In one an operator's mark holds, against any view of a
-        vehicle; in a zone for one class the others go by findings."""
+        """Returns which cells are in no zone for all vehicles. In one an operator's mark holds, against any view of
+        a vehicle; in a zone for one class the others go by findings."""
         return ~np.isin(cells, self._cells)
 
     def _find_zones(self) -> None:

@@ -176,7 +176,8 @@ def _checked(chosen: object, costs_s: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-    """Which target each vehicle goes for: the cheapest pairs first, to each target an even share of the vehicles.
+    """Returns which target each vehicle goes for: the cheapest pairs first, to each target an even share of the
+    vehicles.
 
     If each took the cheapest, all would end up in one herd (docs/method.md): those which chase one target stand
     together when it is caught, and have the same cheapest target again.
@@ -208,7 +209,7 @@ def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | N
 
 
 def need_first(costs_s: Costs, current: Sequence[int], pursuers: int) -> NDArray[np.int64]:
-    """Which vehicles the targets need as pursuers.
+    """Returns which vehicles the targets need as pursuers.
 
     Each target gets `pursuers` of them, or as many as there are for each where vehicles are fewer, one at least;
     the sum of their costs is the least. If not all needed vehicles have a path, as many targets as possible get

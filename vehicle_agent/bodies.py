@@ -1,4 +1,4 @@
-"""Which cells are closed by bodies: whatever reports where it is, with a lease, and speaks no right of way. Pure.
+"""Cells closed by bodies: obstacles that report their position, with a lease, and reserve no cells. Pure.
 
 A report closes the cells that its disc touches, and those that it touches within `REACTION_S` if it keeps its
 speed and heading. Until the next report it may have continued as stated, so the closed area grows with its age. A

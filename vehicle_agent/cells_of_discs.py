@@ -1,4 +1,4 @@
-"""Which cells a disc touches that is moved along a straight line. Pure."""
+"""Cells touched by a disc that moves along a straight line. Pure."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class RightOfWaySync:
         """Plot without a warden -> when that is said again."""
         self._reserve_due_ns = 0
         self._told_silent_ns: int | None = None
-        """When it was last said that our seats are silent; None while they are not."""
+        """Time when it was last said that our seats are silent; None while they are not."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="agent")

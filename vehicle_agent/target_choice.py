@@ -187,7 +187,7 @@ class Assignment:
         self._stagger_ns = int(stagger * self._reassign_ns)
         self._due_ns = 0
         self._asked_ns = 0
-        """When it was asked last."""
+        """Time when it was asked last."""
         self._open: AskCosts | None = None
         self._costs_s: dict[str, NDArray[np.float32]] = {}
         """Target -> the costs that its planner answered to the open request."""

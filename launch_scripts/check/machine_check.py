@@ -141,7 +141,7 @@ def _nearest(runs: Path) -> Path:
 
 
 def _unwritable(runs: Path) -> str | None:
-    """Why no run can be left in a folder of runs; None if one can."""
+    """Reason why no run can be left in a folder of runs; None if one can."""
     folder = _nearest(runs)
     if not folder.is_dir():
         return f"{folder} is not a folder; choose another --runs"

@@ -1,4 +1,4 @@
-"""Which running swarm a command asks."""
+"""Selection of the running swarm that a command queries."""
 
 from __future__ import annotations
 

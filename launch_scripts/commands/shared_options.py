@@ -132,7 +132,7 @@ class Meeting(Tls):
 
 @dataclass(frozen=True)
 class SomeProcesses:
-    """Which part of a swarm a launcher starts, and of which run.
+    """Part of a swarm that a launcher starts, and its run.
 
     only       Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.
     rank       Of planners and the targets process, start those of this rank: 0 leads, 1 is the first standby, and

@@ -129,7 +129,7 @@ def print_status(status: Status, console: Console) -> None:
 
 
 def _wire_versions(status: Status) -> str | None:
-    """Which processes speak an older wire version than others, in words; None where all speak one."""
+    """Returns which processes speak an older wire version than others, in words; None where all speak one."""
     newest = max(info.wire_version for info in status.members)
     older = [info for info in status.members if info.wire_version < newest]
     if not older:

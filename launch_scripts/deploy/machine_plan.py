@@ -1,4 +1,4 @@
-"""Which process runs on which machine: the plan that units and containers are written from, and how it is shown.
+"""Assignment of processes to machines: the plan that units and containers are written from, and how it is shown.
 
 Processes of one job are placed apart, consecutive agents together, load by cores (`place`).
 """

@@ -94,7 +94,7 @@ class Running:
     due_s: float | None = None
     restarts: int = 0
     refused_s: list[float] = field(default_factory=list)
-    """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
+    """Time when it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
     begins_when: Callable[[], bool] | None = None
     """Condition of its first start; None once it has been started, or without a condition."""

@@ -302,7 +302,7 @@ class UpOptions:
 
     @property
     def ranks_of_added(self) -> list[int]:
-        """Which planners of a target that is added while the swarm runs are started here: as those of the
+        """Returns which planners of a target that is added while the swarm runs are started here: as those of the
         scenario's first target, so that each starts on one machine, and those of one target apart."""
         ids = [split_rank(spec.id) for spec in self.table if spec.role == "planner"]
         return [rank for target, rank in ids if target == self.scenario.target_ids[0]]

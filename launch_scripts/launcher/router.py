@@ -87,7 +87,7 @@ class Admission:
         self._network = network
         self._admitting = with_revocations(network)
         self._failure = ""
-        """Why the file of revoked names could not be read at the last look."""
+        """Reason why the file of revoked names could not be read at the last look."""
         self.bus = open_bus(self._admitting, mode="router")
 
     def reopened(self) -> ZenohBus | None:

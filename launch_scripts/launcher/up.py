@@ -125,7 +125,7 @@ class _Run:
         self._run_dir = run_dir
         self._run_id = run_id
         self._joined_ns = started_ns
-        """When the run began that this is a part of; None if it begins here."""
+        """Time when the run began that this is a part of; None if it begins here."""
         self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
         """Orders in force, once the swarm is watched."""
@@ -141,7 +141,7 @@ class _Run:
         self._routed = False
         """True if a route was served."""
         self._up_at_s: float | None = None
-        """When the swarm was whole, on the run's clock."""
+        """Time when the swarm was whole, on the run's clock."""
         self._web_port = 0
         self._known: Recorder | OwnPart | None = None
         self._take_over: TakeOver | None = None

@@ -297,7 +297,7 @@ class Sinks:
 
 
 class RateLimit:
-    """When each of several things is done next, each at its own pace.
+    """Due times of several actions, each at its own rate.
 
     every_s  name -> seconds from one time to the next
     """

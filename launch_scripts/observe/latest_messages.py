@@ -115,7 +115,7 @@ class VehicleColumns:
         return len(self.ids)
 
     def chasing(self, target: str) -> NDArray[np.intp]:
-        """Which of them go for a target."""
+        """Returns which of them go for a target."""
         if target not in self.target_ids:
             return np.empty(0, np.intp)
         return np.flatnonzero(self.targets == self.target_ids.index(target))
@@ -185,9 +185,9 @@ class LatestState(Counts):
         self.book = OrderBook()
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        """When the first and the last message were heard; None before."""
+        """Time when the first and the last message were heard; None before."""
         self.moved_ns = 0
-        """When a vehicle or a target was last heard of. Later messages are those of a run that ends."""
+        """Time when a vehicle or a target was last heard of. Later messages are those of a run that ends."""
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
@@ -261,7 +261,7 @@ class LatestState(Counts):
 
     @property
     def began_ns(self) -> int | None:
-        """When the run began; None before the first message of one whose beginning is not known."""
+        """Time when the run began; None before the first message of one whose beginning is not known."""
         return self.first_ns if self.plan.started_ns is None else self.plan.started_ns
 
     # --- processes ------------------------------------------------------------------------------------------------

@@ -51,7 +51,7 @@ class RunFigures:
         self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
         self._sample_due_ns = 0
         self._sampled: tuple[int, RunState] | None = None
-        """When the last sample was taken or shown, and of which state."""
+        """Time when the last sample was taken or shown, and of which state."""
 
     def heard(self, message: Message, now_ns: int) -> None:
         """Takes in one message."""
@@ -131,7 +131,7 @@ class Recorder(RunFigures):
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
         super().__init__(scenario, grid, started_ns)
         self.ready_ns: int | None = None
-        """When all processes of the scenario were alive and the first vehicle had begun a route."""
+        """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Positions and times of captures; `Observed` counts them."""
         self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + 64)

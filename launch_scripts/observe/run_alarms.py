@@ -176,7 +176,7 @@ def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
 
 
 def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
-    """When a process has said last what it counts."""
+    """Time when a process has said last what it counts."""
     stats = latest.newest_stats(role, id)
     return otherwise_ns if stats is None else stats.stamp_ns
 

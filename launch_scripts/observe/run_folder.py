@@ -208,7 +208,7 @@ class DiskWatch:
         self._folder = folder
         self._due_s = 0.0
         self._said_s: float | None = None
-        """When it was last said that there is no space; None while there is."""
+        """Time when it was last said that there is no space; None while there is."""
 
     def check_room(self, now_s: float) -> str | None:
         """A sentence for the user; None if there is nothing new to say. Call it often."""

@@ -267,8 +267,8 @@ def frame_names(ids: Iterable[str]) -> dict[str, str]:
 
 
 def instants_of(changes: Iterable[int], first_ns: int, last_ns: int, most: int) -> list[int]:
-    """When to tell what changes at these times: at or soon after each change, at most once a second, at most `most`
-    times, and never after the end."""
+    """Time when to tell what changes at these times: at or soon after each change, at most once a second, at most
+    `most` times, and never after the end."""
     period_ns = max(NS_PER_S, -(-(last_ns - first_ns) // max(most - 1, 1)))
     told_ns = {
         first_ns + -(-(min(max(each, first_ns), last_ns) - first_ns) // period_ns) * period_ns for each in changes

@@ -357,7 +357,7 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
 
 
 def headline(report: Mapping[str, Any], run: str | None) -> list[str]:
-    """Which run it was and how long, in a few words each."""
+    """Returns which run it was and how long, in a few words each."""
     seconds, scale, startup_s = (report[name] for name in ("seconds", "time_scale", "startup_s"))
     known = {
         f"scenario {report['scenario']}": True,

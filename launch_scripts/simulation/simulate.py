@@ -45,7 +45,7 @@ class EventLog:
         self.deliveries = 0
         self._out = out
         self.cut: str | None = None
-        """Why the log has no end; None if it is whole."""
+        """Reason why the log has no end; None if it is whole."""
 
     def delivery(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
         self.deliveries += 1

@@ -1,4 +1,4 @@
-"""When a planner searches for its target, and what it answers meanwhile. Pure: time is an argument."""
+"""Beginning and end of a search for the target, and the replies meanwhile. Pure: time is an argument."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, TILE_ARE
 
 
 class CompactionPlan:
-    """Which authors are dead, and which tiles may have something to compact. Core: time is an argument.
+    """Dead authors, and tiles that may need compaction. Core: time is an argument.
 
     after_ns   an author of which nothing was heard for so long counts as dead. If it lives after all, it hears the
                compacted sets, and states everything again under a higher epoch

@@ -399,7 +399,7 @@ KEEPER_STORE = ExternalCalls(
 
 
 class Keeper:
-    """Which sets wait for the disk, and which are on it.
+    """Sets that wait for the disk, and sets that are on it.
 
     committed  the sets on the disk: the keeper's digest names these only, and so acknowledges them
     """

@@ -97,7 +97,7 @@ def digest_rows(numbers: Iterable[tuple[int, int, int]]) -> NDArray[np.void]:
 
 
 def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which of `rows` are newer than the row of the same tile in `base`, or have none there: bool (rows,).
+    """Returns which of `rows` are newer than the row of the same tile in `base`, or have none there: bool (rows,).
 
     base  in order of tile
     """

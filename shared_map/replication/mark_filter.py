@@ -1,4 +1,4 @@
-"""Which marks of others a replica takes in: by author (the policy of groups) and by tile (its interest).
+"""Filter of other authors' marks: by author (the policy of groups) and by tile (its interest).
 
 An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. Access control can
 therefore enforce the policy; and no set is requested of a digest, which names only authors, that would be refused.
@@ -62,7 +62,7 @@ def _names(listed: Sequence[str], group: str) -> bool:
 
 
 class MarkFilter:
-    """Which sets a replica takes in, by author and by tile. Either limit may be absent. Zones of operators concern
+    """Filter of sets by author and by tile. Either limit may be absent. Zones of operators concern
     every group.
 
     groups   whose statements count, by the id of their author and by what the set says; None: everybody's

@@ -70,7 +70,7 @@ def standing(mark_set: MarkSet, now_ns: int) -> Statements:
 
 
 def next_expiry_ns(mark_set: MarkSet, after_ns: int) -> int | None:
-    """When the first statement of a set to expire after `after_ns` does; None if none does."""
+    """Returns the time of the first expiry of a mark after `after_ns`; None if there is none."""
     if not mark_set.untils_ns:
         return None
     untils_ns = column(mark_set.untils_ns, "<i8")
@@ -149,7 +149,7 @@ def _content(of: MarkSet) -> tuple[bytes, bytes, bytes, bytes, bytes, str]:
 
 
 def fault(of: MarkSet, grid: GridSpec) -> str | None:
-    """Why a set cannot be part of a map on this grid; None if it can."""
+    """Reason why a set cannot be part of a map on this grid; None if it can."""
     class_number, tile = grid.class_of_tile(of.tile)
     if tile == grid.tiles or class_number > MOST_CLASSES:
         return f"tile {of.tile} is none of {grid.tiles} for all vehicles or for one of {MOST_CLASSES} classes"

@@ -173,7 +173,7 @@ def _winners(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
 
 
 def _last_of_each(places: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Which of these, in order, are the last of their value."""
+    """Returns which of these, in order, are the last of their value."""
     last = np.ones(len(places), bool)
     last[:-1] = places[1:] != places[:-1]
     return last

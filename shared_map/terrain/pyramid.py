@@ -56,7 +56,8 @@ def level_of(terrain: Terrain, most_cells: int) -> Level:
 
 
 def any_in_blocks(cells: Bools, side: int) -> Bools:
-    """Which blocks of `side` x `side` cells contain any of these cells: bool, at the resolution of the level."""
+    """Returns which blocks of `side` x `side` cells contain any of these cells: bool, at the resolution of the
+    level."""
     if side == 1:
         return cells
     rows, cols = cells.shape

@@ -92,7 +92,8 @@ class Swarm:
 
     @property
     def ended(self) -> SwarmError | None:
-        """Why nothing can be said any more: it is closed, or another run is in the namespace. None while it can."""
+        """Reason why nothing can be said any more: it is closed, or another run is in the namespace. None while it
+        can."""
         return self._session.ended
 
     @property

@@ -77,7 +77,7 @@ class OwnMarks:
         return [each for tile, each in self._sets.items() if not request.tiles or tile in request.tiles]
 
     def digest(self) -> Digest:
-        """Which sets there are, by which others notice what they lack."""
+        """Digest of the sets, by which others find those that they lack."""
         self._digests += 1
         rows = b"".join(
             struct.pack("<IQQ", tile, each.epoch, each.seq) for tile, each in sorted(self._sets.items())

@@ -74,7 +74,7 @@ class Session:
         self.connected = True
         """True if the link to the router is up, as far as is known."""
         self.ended: SwarmError | None = None
-        """Why nothing can be said any more: closed, or the run is another one."""
+        """Reason why nothing can be said any more: closed, or the run is another one."""
         self._clock = clock
         self._ahead_ns = ahead_ns if abs(ahead_ns) > _SAME_CLOCK_NS else 0
         self._parts: list[Part] = []

@@ -1,4 +1,4 @@
-"""Which agent processes a scenario has, and which vehicles each of them hosts."""
+"""Agent processes of a scenario, and the vehicles that each of them hosts."""
 
 from __future__ import annotations
 

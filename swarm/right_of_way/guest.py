@@ -161,7 +161,7 @@ class Guest:
         self._host.hear_token(peer, up=up)
 
     def unled(self, now_ns: int) -> list[str]:
-        """Why it waits: plots of which no warden is heard."""
+        """Reason why it waits: plots of which no warden is heard."""
         return list(self._host.unled(now_ns).values())
 
     def tick(self, now_ns: int) -> list[GuestAction]:

@@ -1,4 +1,4 @@
-"""Which cells the vehicles of one host hold: what wardens granted, once it is on file with a majority."""
+"""Cells that the vehicles of one host hold: grants of wardens that are on file with a majority."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ class Holdings:
         return list(self._views[plot].seen) if plot in self._views else []
 
     def heard_ns(self, plot: int) -> int:
-        """When a plot's warden was heard last; 0 if none was."""
+        """Time when a plot's warden was heard last; 0 if none was."""
         return self._views[plot].heard_ns if plot in self._views else 0
 
     # --- what wardens say -----------------------------------------------------------------------------------

@@ -112,7 +112,7 @@ class Host:
         return True
 
     def unled(self, now_ns: int) -> dict[int, str]:
-        """Why vehicles of ours wait: plot -> that no warden of it is heard."""
+        """Reason why vehicles of ours wait: plot -> that no warden of it is heard."""
         plots = self.holdings.plots
         self._led_ns = {plot: self._led_ns.get(plot, now_ns) for plot in plots}
         found = {}

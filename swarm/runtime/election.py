@@ -69,9 +69,9 @@ class Leadership:
         self._awake_ns = 0
         """The clock, at the last tick."""
         self._ticked_ns: int | None = None
-        """When that was, on the caller's clock."""
+        """Time when that was, on the caller's clock."""
         self._led_ns = 0
-        """When a leader was last heard; at first, when this began to listen."""
+        """Time when a leader was last heard; at first, when this began to listen."""
         self._better_since_ns: int | None = None
         """Since when this has been ready while a worse one leads; None if it is not so."""
         self._others: dict[tuple[int, int], _Other] = {}

@@ -117,7 +117,7 @@ class Member:
         self._post = post
         self._stats_due_ns = 0
         self._rate_ns, self._rate_of = 0, 0
-        """When the rate of messages was measured last, and how many there had been."""
+        """Time when the rate of messages was measured last, and how many there had been."""
         self._dropped = 0
         """Ticks that had been dropped when that was looked at last."""
         self.counters.gauge(RESTARTS, float(info.restarts))

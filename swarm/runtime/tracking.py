@@ -1,4 +1,4 @@
-"""Which tracker owns a target. Pure: time is an argument.
+"""Ownership of a target by one of its trackers. Pure: time is an argument.
 
 Every receiver of poses decides by this rule alone, from the poses that it has heard:
 
@@ -81,10 +81,10 @@ class Tracking:
         self.pose: TargetPose | None = None
         """The newest that counts, with its cell: where the target was last."""
         self.heard_ns = 0
-        """When that arrived."""
+        """Time when that arrived."""
         self._grid = grid
         self._until_ns = 0
-        """When the last lease ends."""
+        """Time when the last lease ends."""
         self._lives: dict[tuple[str | None, int], _Life] = {}
         """Includes ended lives, so that late poses are recognised."""
 

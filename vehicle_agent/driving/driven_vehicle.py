@@ -24,7 +24,8 @@ PREFETCH_CELLS = 8
 
 
 class Reason(enum.Enum):
-    """Why a vehicle requests a route. The last three are re-route requests: its own route does not lead it on."""
+    """Reason why a vehicle requests a route. The last three are re-route requests: its own route does not lead it
+    on."""
 
     ASSIGNED = "assigned"
     CONTINUED = "continued"
@@ -105,7 +106,7 @@ class Vehicle:
         self.asked: str | None = None
         self.searching = False
         self._need: Reason | None = None
-        """Why it needs a route; None if it needs none."""
+        """Reason why it needs a route; None if it needs none."""
         self._retry_ns = _RETRY_NS
         """Doubles with each unanswered request, until a route comes."""
         self._ask_due_ns = 0
@@ -178,7 +179,7 @@ class Vehicle:
     # --- routes ---------------------------------------------------------------------------------------------
 
     def route_request(self, now_ns: int) -> Reason | None:
-        """Why it asks its target's planner for a route, if it needs one and the time for it has come."""
+        """Reason why it asks its target's planner for a route, if it needs one and the time for it has come."""
         if self.target is None or self.in_reach or self.planner_gone:
             return None
         if self._need is None and self.state is not VehicleState.STRANDED:

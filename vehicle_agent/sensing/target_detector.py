@@ -1,4 +1,4 @@
-"""Which targets an agent's vehicles see, and where targets are that only vehicles see."""
+"""Targets in view of an agent's vehicles, and positions of targets that only vehicles see."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class Upload:
         self._said: codec.MissionCount | codec.MissionItem = codec.MissionCount(len(items))
         """The next message, or the last one."""
         self._due_ns: int | None = None
-        """When it is said (again); None: at once."""
+        """Time when it is said (again); None: at once."""
         self._tries = self._asked = 0
 
     def on_mission_message(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
@@ -250,7 +250,7 @@ class Setpoints(_Guide):
     stream ends (PX4 leaves offboard by its own fail-safe), or the vehicle gets a setpoint where it is."""
 
     _began_ns: int | None = None
-    """When the stream began; None while there is none."""
+    """Time when the stream began; None while there is none."""
     _due_ns = 0
     _goal: Point | None = None
     _holds_left = 0

@@ -27,7 +27,7 @@ _GID: Any = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
 
 
 class Distribution(StrEnum):
-    """Which ROS 2 the peers have: it decides about the hashes of types, which are part of every key."""
+    """ROS 2 distribution of the peers: it determines the hashes of types, which are part of every key."""
 
     HUMBLE = "humble"
     JAZZY = "jazzy"

@@ -12,7 +12,7 @@ from launch_scripts.gateways.ros2.rmw import Qos
 
 
 class Direction(StrEnum):
-    """Which way a topic goes."""
+    """Direction of a topic."""
 
     OUT = "to ROS"
     IN = "from ROS"

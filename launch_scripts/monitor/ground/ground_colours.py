@@ -360,7 +360,7 @@ class TargetPictures:
         return self._mesh.place_cells(cells, 0.15 * self._mesh.scale_m), radii
 
     def territories(self, order: Sequence[str]) -> Bytes:
-        """Which target each place is nearest to in cost, in the colours that targets have in the plots."""
+        """Returns which target each place is nearest to in cost, in the colours that targets have in the plots."""
         samples = self._samples
         costs = {id: samples.spread(each, self._rows, self._cols) for id, each in samples.costs_s.items()}
         nearest = nearest_target(costs, order)

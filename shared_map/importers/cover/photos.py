@@ -93,7 +93,7 @@ def _band(placed: Placed, index: int, row0: int, row1: int) -> NDArray[Any]:
 
 
 def _frame(placed: Placed, row0: int, row1: int) -> Bools:
-    """Which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
+    """Returns which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
     inside = np.zeros((row1 - row0, placed.grid.cols), np.uint8)
     if placed.target is None:
         return np.ones(inside.shape, np.bool_)
@@ -153,7 +153,7 @@ def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | No
 
 
 def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
-    """Which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
+    """Returns which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
     from rasterio.enums import ColorInterp
 
     meanings = list(dataset.colorinterp)

@@ -23,7 +23,7 @@ from swarm.config.input_files import FileKind, check_bytes, size
 from swarm.errors import SwarmError, TerrainError
 
 MOST_FEATURES = 500_000
-"""Which touch the terrain."""
+"""Number of those that touch the terrain."""
 MOST_VERTICES = 20_000_000
 _MAGIC = {b"SQLite format 3\0": "GPKG", b"\0\0\x27\x0a": "ESRI Shapefile"}
 """First bytes -> GDAL's driver; a GeoJSON begins with a brace. GDAL knows 80 formats, some of which

@@ -230,7 +230,7 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
 
 
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
-    """Which sets a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
+    """Sets that a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
 
     whole  false: only tiles that changed lately, published between the whole digests
