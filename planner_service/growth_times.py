@@ -83,7 +83,7 @@ class GrowthTimes:
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
-        """Of the last `_TICKS` ticks or so; its value when the row was chosen."""
+        """Moves in the last `_TICKS` ticks or so; the value when the row was chosen."""
         self._ticks = 0
         self._choose()
 

@@ -2,7 +2,7 @@
 
     python -m planner_service.kernel_build [KERNEL ...]
 
-is one builder, of these kernels in this order, or of all. Any number of them, started by whomever, share the work:
+is one builder, of these kernels in this order, or of all. Any number of them share the work:
 each claims a kernel by a lock on a file beside numba's, compiles it and writes it there, where planners find it. A
 builder that dies leaves its claim.
 """

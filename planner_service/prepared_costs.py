@@ -38,7 +38,7 @@ PREPARED_COSTS = ExternalCalls(
 
 
 _DIGEST_BYTES = 16
-"""As in names of cached terrains: no two arrays of one machine have the same by chance."""
+"""Same length as in names of cached terrains: no two arrays of one machine have the same by chance."""
 Kept = Callable[[], str | None]
 
 

@@ -43,7 +43,7 @@ class FullGrowth(Enum):
     WHEN_FORCED = "when forced"
     """Section 3.3.2, the passive strategy: only when a vehicle whose route has run out asks."""
     WITHIN_BUDGET = "within the budget"
-    """As often as `planner.cpu_budget` allows."""
+    """Full searches at the rate which `planner.cpu_budget` allows."""
 
 
 class WidestWindow(Enum):

@@ -262,7 +262,7 @@ class _Matching:
         self.filled = np.zeros(targets, np.int64)
         self._costs = costs
         self._free = costs.copy()
-        """As `_costs`, inf for vehicles that have an owner: they keep one, if not the same."""
+        """Same as `_costs`, inf for vehicles that have an owner: they keep one, if not the same."""
         self._swap = np.where(np.eye(targets, dtype=bool), 0.0, np.inf)
         """[a, b]: what it costs more to have the vehicle `_swapped` chase a instead of its owner b, and one more,
         so that of equal paths that of fewest exchanges is the shortest; 0 where a is b."""

@@ -259,7 +259,7 @@ class Bodies:
     @property
     def is_deaf(self) -> bool:
         """Returns True if there may be bodies without a received report: the process has just started, or its last
-        tick was so long ago that messages meanwhile may be unread. Nobody drives then."""
+        tick was so long ago that messages meanwhile may be unread. No vehicle drives then."""
         return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
 
     def listen_anew(self, now_ns: int) -> None:

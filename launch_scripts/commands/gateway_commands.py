@@ -171,7 +171,7 @@ class Vehicle:
 def mavlink(
     link: Annotated[str, typer.Argument(metavar="LINK")], where: Where, drives: Drives, vehicle: Vehicle
 ) -> None:
-    """Let a PX4 or ArduPilot vehicle take part in a running swarm, until Ctrl-C.
+    """Join a PX4 or ArduPilot vehicle to a running swarm, until Ctrl-C.
 
     The swarm's vehicles avoid it. With --target it follows the swarm's routes to that target. It is armed, and its
     mode is set, with --arm only. One process for each vehicle; docs/mavlink.md has the rest.

@@ -49,7 +49,7 @@ def pause(where: Where, as_json: AsJson = False) -> int:
 
 @command(app, ORDER)
 def resume(where: Where, as_json: AsJson = False) -> int:
-    """Let all go on after a pause.
+    """Resume all vehicles and targets after a pause.
 
     swarm resume
     """
@@ -180,7 +180,7 @@ def remove(id: Id, where: Where, as_json: AsJson = False) -> int:
 
 
 def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
-    """Let vehicles stand in the middle of their cells until they are let go. Others drive around them.
+    """Stop vehicles in the middle of their cells until `swarm vehicle go`. Others drive around them.
 
     swarm vehicle stop a0-03 a0-04
     """
@@ -188,7 +188,7 @@ def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
 
 
 def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
-    """Let stopped vehicles go.
+    """Start stopped vehicles again.
 
     swarm vehicle go a0-03
     """

@@ -87,7 +87,7 @@ def ask_status(where: Where) -> Status:
 
 
 def status_of(observer: OutsideObserver, now_ns: int) -> Status:
-    """Returns the state received up to now. Somebody has answered."""
+    """Returns the state received up to now. At least one process has replied."""
     assert observer.latest is not None
     members, strangers = observer.members()
     return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
@@ -254,7 +254,7 @@ def _rounded(value: Any) -> Any:
 
 @contextmanager
 def _keys() -> Iterator[None]:
-    """Lets single keys be read, where there is a keyboard."""
+    """Reads single keys, if there is a keyboard."""
     if not sys.stdin.isatty():
         yield
         return

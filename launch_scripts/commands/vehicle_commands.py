@@ -73,7 +73,7 @@ def remove(
     where: Where,
     as_json: AsJson = False,
 ) -> int:
-    """Let vehicles leave the map. Returns once their cells are free for others.
+    """Remove vehicles from the map. Returns once their cells are free for others.
 
     An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
 

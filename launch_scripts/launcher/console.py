@@ -94,7 +94,7 @@ class Terminal:
         """Prints, if that is possible: a full disk ends no run. See `OutlivingOutput` for a reader that has
         left."""
         try:
-            self._console.print(what, soft_wrap=True)  # whoever copies a line gets it whole
+            self._console.print(what, soft_wrap=True)  # a copied line is whole
             self._console.file.flush()
         except OSError as error:
             log.warning("cannot write the output: %s", error.strerror or error)

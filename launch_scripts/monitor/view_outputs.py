@@ -286,7 +286,7 @@ class Sinks:
                 stream.flush(timeout_sec=within_s * 0.8)
 
     def _let_play(self) -> None:
-        """Lets the recording be opened at its beginning and play: the live view follows its end."""
+        """Makes viewers open the recording at its beginning and play it: the live view follows its end."""
         if (panel := self._blueprint.time_panel) is not None:
             panel.play_state = "playing"
         for stream in reversed(self.streams):
@@ -307,7 +307,7 @@ class RateLimit:
         self.all_due()
 
     def all_due(self) -> None:
-        """Lets each thing be due, whenever it was done last."""
+        """Makes every action due, whenever it was done last."""
         self._next_ns = dict.fromkeys(self._every_ns, 0)
 
     def due(self, name: str, now_ns: int, slower: int = 1) -> bool:

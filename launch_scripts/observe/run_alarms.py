@@ -36,7 +36,7 @@ _SERIOUS: Mapping[str, str] = {
 KINDS: Mapping[str, str] = {
     **_SERIOUS,
     "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
-    "target-lost": "target lost",  # nobody tracks it; routes lead to where it was; after 30 s it is searched for
+    "target-lost": "target lost",  # no tracker publishes it; routes lead to where it was; after 30 s it is searched for
     "behind": "behind",  # a process skips ticks: the machine is too slow for what it does
     "restarted": "restarted",  # a process was started again after it had ended
 }

@@ -32,7 +32,7 @@ from swarm.wire.versions import are_neighbours
 TRACK_S = 0.5
 """Places are sampled so often."""
 ROUTES_S = 2.0
-"""Of the routes that a vehicle begins within this time, the newest is kept."""
+"""The newest route that a vehicle begins within this time is kept."""
 HEARD: Mapping[Topic, float] = {STATS: 0.0, STATUS: 0.0, POSE: 0.0, LEAD: 0.5, ORDERS: 0.5, FLEET: 0.4}
 """The topics of a `LatestState`, and how often the newest of each key is taken, in seconds; 0 for all that comes.
 Places are sampled every 0.5 s, and each sample must find newer ones: else all vehicles seem to stand at times."""

@@ -8,7 +8,7 @@
     no wait without a reason          of ten seconds while everything works
     vehicles are routed again         within five seconds of the last fault
     marks reach everybody             what an agent said four seconds before the end, every process holds
-    replicas are equal                once nobody says anything new
+    replicas are equal                once no process publishes anything new
 """
 
 from __future__ import annotations

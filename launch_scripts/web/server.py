@@ -124,7 +124,7 @@ class Server(socketserver.ThreadingTCPServer):
                 _cut(connection)
 
     def keep(self, connection: socket.socket) -> None:
-        """Lets a connection last."""
+        """Keeps a connection open."""
         with self._lock:
             if connection in self._open:
                 self._open[connection] = math.inf

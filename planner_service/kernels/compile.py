@@ -67,7 +67,7 @@ class _FolderCacheImpl(caching.CompileResultCacheImpl):
     """True if other compiled functions call this one, so that compiling them takes its bitcode."""
 
     def rebuild(self, target_context, payload):
-        """As numba's. If no other function links to it, only the machine code is read: parsing the bitcode beside
+        """Like numba's. If no other function links to it, only the machine code is read: parsing the bitcode beside
         it, and listing its definitions, takes more than half of loading a kernel."""
         if self.linked:
             return super().rebuild(target_context, payload)

@@ -76,7 +76,7 @@ LINKING, SUMMING, CHANGED, NOTED, NEARBY, CHECKING = range(6)
 """Work queues, rows of `Schedule.sets`: tiles whose pieces are to be linked to successors; whose totals are to be
 added up; whose totals have changed; have, and are so noted; about which something has changed; which are to be
 checked."""
-DEARER, ALTERED = np.uint8(1), np.uint8(2)
+COSTLIER, ALTERED = np.uint8(1), np.uint8(2)
 """Kinds of change in a tile: cells got more expensive, or lost their path; or any other change, perhaps that
 too."""
 FINEST = 2.0**-46
@@ -470,11 +470,11 @@ def request_around(tiles, t, what):
 @kernel(GRID, TREE, TILES, SCRATCH, "i8[::1]", "u1[::1]")
 def relabel_tiles(grid, tree, tiles, scratch, which, changed):
     """Labels these tiles again, whose parents or cell costs have changed, and schedules a check of them. Tiles
-    about them are checked, too, unless cells only got more expensive (`changed` is `DEARER`, uint8 (n,)): that
+    about them are checked, too, unless cells only got more expensive (`changed` is `COSTLIER`, uint8 (n,)): that
     lowers no offer, and a piece that leads there sees its totals rise."""
     wanted = tiles.wanted
     for i in range(which.size):
         t = which[i]
         relabel_tile(t, grid, tree, tiles, scratch)
-        request_around(tiles, t, RELINK_INTO if changed[t] == DEARER else CHECK | RELINK_INTO)
+        request_around(tiles, t, RELINK_INTO if changed[t] == COSTLIER else CHECK | RELINK_INTO)
         wanted[t] |= CHECK | RELINK

@@ -33,7 +33,7 @@ from planner_service.kernels.partition import (
     CHECKED_CUT_OFF,
     CHECKING,
     CUT_OFF,
-    DEARER,
+    COSTLIER,
     FINEST,
     LINKING,
     NEARBY,
@@ -398,14 +398,14 @@ def cut_parents(grid, tree, across, cells, before, changed):
     """Cells that became lethal, and those whose step they forbid, lose their parent.
 
     cells, before  padded cells whose cost changed, and their cell cost before, s
-    changed        uint8 (n,), DEARER or ALTERED for tiles of cells that step into one of these, or are one
+    changed        uint8 (n,), COSTLIER or ALTERED for tiles of cells that step into one of these, or are one
     """
     cell_cost, offsets, stride, _, corners = grid
     parent = tree.parent
     for j in range(cells.size):
         x = cells[j]
         t, _ = tile_of(x, stride, across)
-        what = DEARER if cell_cost[x] > before[j] else ALTERED
+        what = COSTLIER if cell_cost[x] > before[j] else ALTERED
         changed[t] |= what
         lethal = not cell_cost[x] < INF and before[j] < INF
         if lethal:

@@ -180,7 +180,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
     buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
-             circular queue, a power of two; count * width exceeds the dearest step by two widths
+             circular queue, a power of two; count * width exceeds the costliest step by two widths
     scratch  as `make_scratch` returns it
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
 

@@ -11,7 +11,7 @@ of the first digit in which its index differs from what is served, so that bucke
 wide as those of the level below. When the turn of a bucket comes, the least that any of its cells may offer decides
 (A. Crauser, K. Mehlhorn, U. Meyer, P. Sanders, "A parallelization of Dijkstra's shortest path algorithm", MFCS
 1998, their OUT-criterion): cells that cost no more than that are final. They are served, and the others wait on;
-but where many cells may lead into their own bucket, all of it is spread over the level below. So neither dear cells
+but where many cells may lead into their own bucket, all of it is spread over the level below. Neither expensive cells
 nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of sums.
 
 Arrays, beside those of `layout` and `climbs`:

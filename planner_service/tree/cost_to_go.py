@@ -174,7 +174,7 @@ class CostToGoTree:
         return window.cells
 
     def repair(self, changes: Changes) -> int:
-        """Brings the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned
+        """Brings the tree up to date after the map changed. Returns cells visited, or -1 if the change is so large
         that a full search costs less: then it must be searched before any other use."""
         if changes.cells.size == 0:
             return 0

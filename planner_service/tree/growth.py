@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from planner_service.tree.cost_grid import CostGrid
 
 MOST_BUCKETS = 1 << 8
-"""As narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
+"""Buckets are as narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
 _NARROW = 0.98
 """Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 FINE = float(1 << 20)

@@ -200,7 +200,7 @@ class PieceTree:
         """Costs are those driven at all times."""
 
     def _relabel(self, changed: NDArray[np.uint8]) -> None:
-        """Labels again the changed tiles: uint8 (n,), `partition.DEARER` or more."""
+        """Labels again the changed tiles: uint8 (n,), `partition.COSTLIER` or more."""
         partition.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
 
     def _schedule(self, turn: NDArray[np.float64]) -> Schedule:

@@ -82,7 +82,7 @@ def wind_of(speed_mps: float, from_deg: float, airspeed_mps: float) -> Wind:
 ENTRIES = 512
 """Entries of the table on each side of level: the rise is resolved to this part of the steepest."""
 _STEEPEST = 4.0
-"""As a grade: 76 degrees. Steeper steps cost as this one, so limits beyond it do not count."""
+"""Grade of 76 degrees. Steeper steps cost as this one, so limits beyond it do not count."""
 _HALF, _ROUND = np.float32(ENTRIES), np.float32(0.5)
 _WAYS = np.zeros((3, 3), np.int64)
 """Direction 0..7 of a step by its rows and columns, each less one."""

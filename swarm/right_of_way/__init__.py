@@ -14,7 +14,7 @@ and chance are arguments.
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
 1. Begin with a life whose number is greater than all that anybody knows, and have it on file before the first
-   word. First ask all agents (`KnownRequest`), until so many members of every plot have replied that one of them
+   word. First ask all agents (`KnownRequest`), until enough members of every plot have replied that one of them
    has its newest usable table.
 2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
    Cells that it omits are released.

@@ -211,7 +211,7 @@ class Removal:
 
     @property
     def settled(self) -> bool:
-        """True if so many agents have replied that no plot can be missing."""
+        """True if enough agents have replied that no plot can be missing."""
         return self._host.informed
 
     @property

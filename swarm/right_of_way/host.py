@@ -61,7 +61,7 @@ class Host:
 
     @property
     def informed(self) -> bool:
-        """True if we know every plot in which cells are granted to us: of each plot so many members have replied
+        """True if we know every plot in which cells are granted to us: of each plot enough members have replied
         that one of them has the newest usable table."""
         if self._told_by.issuperset(self.plots.agents):
             return True

@@ -12,7 +12,7 @@ from swarm.errors import ConfigError
 from swarm.wire.access import Authenticator
 
 _SECRET_BYTES = 32
-"""As many bits as the hash that makes the codes."""
+"""Same number of bits as the hash that makes the codes."""
 
 
 def authenticator_of(network: NetworkConfig, run_id: str) -> Authenticator | None:

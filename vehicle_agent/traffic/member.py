@@ -90,7 +90,7 @@ class Member:
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
         self._told: list[Table] = []
-        """As warden: published tables, the oldest first, from the newest one that is on file on."""
+        """Tables published as warden, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
         """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
@@ -170,7 +170,7 @@ class Member:
             self._take_charge(now_ns)
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """As warden: takes acknowledgements, and grants by the tables that are on file now."""
+        """Takes acknowledgements as warden, and grants by the tables that are on file now."""
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq)

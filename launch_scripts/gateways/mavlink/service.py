@@ -117,7 +117,7 @@ class Shell:
             raise failure
 
     def stop(self) -> None:
-        """Lets the vehicle stop, as far as that is ours. The connection's end takes it away."""
+        """Stops the vehicle, if we have authority. The connection's end takes it away."""
         last = self._adapter.stop(self._now_ns())
         for _ in range(_LAST_WORDS):
             for action in last:

@@ -174,7 +174,7 @@ class Gateway:
         """Vehicles have come or gone since /tf_static was put."""
         self._pose = ros_messages.packed_pose(self._messages)
         self._transforms: dict[str | None, PackedPlaces] = {}
-        """Of each group, since its vehicles changed last."""
+        """Transforms of each group, since its vehicles changed last."""
         self._fresh: list[Window] = []
         """Windows that have changed since markers were put last."""
         self._changed: list[Window] = []

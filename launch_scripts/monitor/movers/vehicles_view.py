@@ -239,7 +239,7 @@ class VehiclesView:
 def vehicle_details(
     vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most important comes
+    """Text such as `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most important comes
     first: a viewer may cut off the end.
 
     who  vehicle -> what is said of whose it is

@@ -131,7 +131,7 @@ def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
-    """As `swarm simulate SCENARIO --seed N`."""
+    """Runs `swarm simulate SCENARIO --seed N`."""
     assert trial.scenario is not None
     simulation = Simulation(msgspec.structs.replace(trial.scenario, seed=trial.seed, seconds=trial.seconds))
     try:
@@ -148,7 +148,7 @@ def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
 
 
 def _with_faults(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
-    """As `swarm simulate SCENARIO --seeds N:N+1`."""
+    """Runs `swarm simulate SCENARIO --seeds N:N+1`."""
     verdict, report = try_seed(trial.world, trial.seed, trial.seconds, trial.scenario)
     told: dict[str, Any] = msgspec.to_builtins(verdict)
     del told["broken"], told["wall_s"]

@@ -31,7 +31,7 @@ _AGAIN_NS = NS_PER_S // 2
 
 
 class PoseThrottle:
-    """Of the poses of each tick, passes those of targets that have entered another cell, have moved by a quarter of
+    """Passes, of the poses of each tick, those of targets that have entered another cell, have moved by a quarter of
     one, were captured, or were published last more than half a second ago.
 
     Every agent receives the poses of all targets: at ten per second they were a fifth of all deliveries, though a

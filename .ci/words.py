@@ -1,0 +1,84 @@
+"""Checks the English of the product: `python .ci/words.py`, exit code 1 with a sentence per fault.
+
+- A docstring begins with a noun phrase or a verb in the third person: no word of `FIRST` begins one.
+- No word of `BANNED` occurs in a docstring, a comment or a page: the vocabulary has a term for each.
+
+`budget.toml` holds in `[words]` how many faults each tree may still have. A row only falls.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import sys
+import tokenize
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FIRST = re.compile(
+    r"(What|Who|Whose|Whom|Whoever|Where|When|Why|Which|Whether|How|Of|So|As|That|Nobody|Somebody|Lets?)\b"
+)
+"""How many, How long and the like begin a question, too."""
+BANNED = re.compile(
+    r"\b(nobody|somebody|whoever|whomever|so many|anew|mends?|mended|dear|dearer|dearest|hand(s|ed)? out)\b", re.I
+)
+_CODE = re.compile(r"```.*?```|`[^`]*`|^ *[a-z_, ]+ {2,}", re.S | re.M)
+"""Code, and the names that begin the rows of a docstring."""
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yields the line and the text of each docstring, those of constants and fields included."""
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, str)
+        ):
+            yield node.lineno, node.value.value
+
+
+def comments(source: str) -> Iterator[tuple[int, str]]:
+    """Yields the line and the text of each comment."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+
+
+def faults_of(path: Path) -> Iterator[str]:
+    """Yields a sentence per fault of a Python file or a page."""
+    text = path.read_text(encoding="utf-8")
+    where = path.relative_to(ROOT)
+    if path.suffix == ".md":
+        texts = [(number, line) for number, line in enumerate(_CODE.sub("`", text).splitlines(), 1)]
+    else:
+        first = list(docstrings(ast.parse(text)))
+        for line, each in first:
+            if found := FIRST.match(each.strip()):
+                yield f'{where}:{line}: a docstring begins with "{found[0]}": begin with a noun phrase or a verb'
+        texts = [*first, *comments(text)]
+    for line, each in texts:
+        for found in BANNED.finditer(_CODE.sub("`", each)):
+            yield f'{where}:{line}: "{found[0]}": the style page has a plain term for it'
+
+
+def main() -> int:
+    """Prints the faults of each tree with more than its row allows; returns the exit code."""
+    rows = tomllib.loads((ROOT / "budget.toml").read_text(encoding="utf-8"))["words"]
+    over = False
+    for tree, most in rows.items():
+        paths = [path for path in sorted((ROOT / tree).rglob("*")) if path.suffix in (".py", ".md")]
+        faults = [each for path in paths for each in faults_of(path)]
+        if "--show" in sys.argv:
+            print(f"{tree:20}{len(faults):6}")
+        if len(faults) > most:
+            over = True
+            print("\n".join(faults), file=sys.stderr)
+            print(f"{tree}: {len(faults)} faults, of which budget.toml allows {most}", file=sys.stderr)
+    return over
+
+
+if __name__ == "__main__":
+    sys.exit(main())
