@@ -33,7 +33,7 @@ class Role:
     simulated   whether simulations and replays have it: a router and a monitor decide nothing
     any_id      whether a run may have more of it than its scenario says
     lasting     whether what it writes must outlive its container: a keeper's store, recordings, and what an agent
-                has promised of right of way (decision 25). All else is made again
+                has promised of right of way (docs/design/right-of-way.md). All else is made again
     takes_over  how its next life follows one that still runs: "beside" it (each answer is complete, and of two the
                 younger life's counts), or after it; one that "waits" starts immediately, and waits for a file that
                 the life before has locked

@@ -25,6 +25,7 @@ from shared_map.importers.cover.cover_codes import TABLES
 from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
+_DESIGN = Path(__file__).parents[1] / "design"
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
     "LATCHED": "reliable, transient local, last 1",
@@ -65,6 +66,14 @@ def ros2() -> str:
     return filled("ros2", outgoing=TABLE, incoming=incoming, qos=_QOS, settings=settings)
 
 
+def design() -> str:
+    """Returns the index of the design pages: a row per page, whose title states the choice."""
+    pages = {path.name: path.read_text(encoding="utf-8") for path in sorted(_DESIGN.glob("*.md"))}
+    pages.pop("index.md", None)
+    titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in pages.items()}
+    return filled("design", titles=titles)
+
+
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
     scenario_page.PATH: scenario_page.document,
@@ -73,6 +82,7 @@ PAGES: dict[Path, Callable[[], str]] = {
     _REFERENCE / "land-cover.md": land_cover,
     _REFERENCE / "ways.md": ways,
     _REFERENCE / "ros2.md": ros2,
+    _DESIGN / "index.md": design,
 }
 """File -> what makes its text, without the line end at its end."""
 

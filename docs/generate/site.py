@@ -1,4 +1,4 @@
-"""What MkDocs is told beyond mkdocs.yml: the pages of the Python API, the decisions, the listings of docstrings.
+"""Hooks of MkDocs beyond mkdocs.yml: the pages of the Python API, the design pages, the listings of docstrings.
 
 MkDocs loads this file twice: as a hook, and as an extension of griffe, which reads the docstrings.
 """
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("planner_service", "shared_map", "swarm", "vehicle_agent")
 _NUMPY = re.compile(r"^ *(Parameters|Returns|Raises)\n *-+$", re.MULTILINE)
 """What the public API of a package looks like, for readers of NumPy's documentation."""
-_API, _DECISIONS = "Python API", "Decisions"
+_API, _DESIGN = "Python API", "Design"
 
 
 _ROW = re.compile(r"(?P<names>[A-Za-z_][\w.`]*(?:, [A-Za-z_][\w.`]*)*) {2,}(?P<meaning>\S.*)")
@@ -71,11 +71,11 @@ def api_page(package: str, modules: list[str]) -> str:
 
 
 def on_config(config: Any) -> Any:
-    """Puts the generated pages and the decisions where mkdocs.yml names their sections."""
-    decisions = sorted(path.name for path in (ROOT / "docs" / "decisions").glob("0*.md"))
+    """Puts the generated pages and the design pages where mkdocs.yml names their sections."""
+    design = sorted(f"design/{path.name}" for path in (ROOT / "docs" / "design").glob("*.md"))
     inside = {
         _API: [{package: _api_path(package)} for package in packages()],
-        _DECISIONS: ["decisions/index.md", *(f"decisions/{name}" for name in decisions)],
+        _DESIGN: sorted(design, key=lambda name: name != "design/index.md"),
     }
     for section in config.nav:
         for entries in section.values():

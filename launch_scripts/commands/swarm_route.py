@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _TIMEOUT_S = 5.0
 """A planner answers within 1 s, or says that it has no tree; five times that is for a busy machine, as for plans of
-ROS (decision 80)."""
+ROS (docs/design/ros2-gateway.md)."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
 """Usable share of the cores and the memory of a machine, and of one core by a process: beyond it work waits
-(decision 58)."""
+(docs/design/zenoh-topology-and-inboxes.md)."""
 LINK_SHARE = 0.5
 """Usable share of a link's capacity."""
 OVERHEAD_BYTES = 100

@@ -1,7 +1,7 @@
 """The live view: records a run, and shows it to connected viewers.
 
 - `main`: the process; `service` hears the swarm and draws it frame by frame, ten a second for those who look, else
-  five (decision 102). It queries nothing but costs of planners, and no process waits for it.
+  five (docs/design/live-view.md). It queries nothing but costs of planners, and no process waits for it.
 - `ground` lies still: the terrain, its layers with their legends, zones.
 - `movers` moves: vehicles, targets, bodies, their routes and trails, beliefs, alarms.
 - `live_layout` has the layers, their legends, and the panels beside: plots, a summary, a log.

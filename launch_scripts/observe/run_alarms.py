@@ -36,8 +36,8 @@ _SERIOUS: Mapping[str, str] = {
 KINDS: Mapping[str, str] = {
     **_SERIOUS,
     "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
-    "target-lost": "target lost",  # no tracker publishes it; routes lead to where it was; after 30 s it is searched for
-    "behind": "behind",  # a process skips ticks: the machine is too slow for what it does
+    "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
+    "behind": "behind",  # a process skips ticks: the machine is too slow for it
     "restarted": "restarted",  # a process was started again after it had ended
 }
 """The word on the wire -> what people call it. Serious is what must not be, or stops a part of the run."""

@@ -51,7 +51,8 @@ _AHEAD = np.uint64(24)
 _PART = np.uint64(64)
 """Cells of a row that are looked through at once."""
 _TURNS = 12
-"""Rounds of improvement after which a full search costs less: half as many are rare (decision 60)."""
+"""Rounds of improvement after which a full search costs less: half as many are rare
+(docs/design/incremental-trees.md)."""
 
 Walk = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
 """(children, steps, lengths, ways, many)."""

@@ -43,7 +43,7 @@ _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
 AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
-(decision 24)."""
+(docs/design/bucket-queues.md)."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 

@@ -11,8 +11,8 @@ of the first digit in which its index differs from what is served, so that bucke
 wide as those of the level below. When the turn of a bucket comes, the least that any of its cells may offer decides
 (A. Crauser, K. Mehlhorn, U. Meyer, P. Sanders, "A parallelization of Dijkstra's shortest path algorithm", MFCS
 1998, their OUT-criterion): cells that cost no more than that are final. They are served, and the others wait on;
-but where many cells may lead into their own bucket, all of it is spread over the level below. Neither expensive cells
-nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of sums.
+but where many cells may lead into their own bucket, all of it is spread over the level below. Neither expensive
+cells nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of sums.
 
 Arrays, beside those of `layout` and `climbs`:
     touched  uint32  (8 * _PIECE + 8,) padded cells whose cost has fallen
@@ -43,7 +43,7 @@ _WAYS = 4, 2, 6, 0, 3, 5, 1, 7
 """Directions of the steps into a cell from its neighbours, in the order in which these are offered something."""
 _ZERO32 = np.float32(0.0)
 _AHEAD = 8
-"""Cells of a batch between asking for one's memory and using it (decision 24)."""
+"""Cells of a batch between asking for one's memory and using it (docs/design/bucket-queues.md)."""
 _PIECE = np.uint64(1 << 6)
 """Cells that make their offers before what these touched is put into the queue."""
 WIDTH = 0.9

@@ -21,14 +21,14 @@ from swarm.wire.route_columns import LETHAL_START, OUTSIDE, SEARCHING, UNREACHAB
 OFFSET_S = 900.0
 """Places that cost less than this differ little: near ones are preferred, but not for every scrap of belief. With
 300 and 2,000 s the median search took 1,660 and 1,905 s instead of 1,510, which so few runs do not prove
-(decision 66)."""
+(docs/design/search.md)."""
 APART_BLOCKS = 3
-"""Around a place that a vehicle has been given, no other is given one (decision 66)."""
+"""Around a place that a vehicle has been given, no other is given one (docs/design/search.md)."""
 KEPT_SHARE = 0.3
-"""A place is given up when no more than this share of the belief around it is left (decision 66)."""
+"""A place is given up when no more than this share of the belief around it is left (docs/design/search.md)."""
 IDLE_S = 300.0
 """A place at which nothing is believed is given only to a vehicle that can reach no other. It is given up after so
-long: by then there may be one (decision 66)."""
+long: by then there may be one (docs/design/search.md)."""
 STEP_S = 30.0
 """Longest step of the belief; shorter if blocks are small."""
 MOST_GOALS = 4096

@@ -23,12 +23,13 @@ from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is published twice a second: one that is not published for this time, though a vehicle is at
-its position, is not there (decision 66)."""
+its position, is not there (docs/design/search.md)."""
 LOST_NS = 30 * NS_PER_S
 """A target whose tracker is lost is searched for after so long: most trackers are back by then
-(decision 66)."""
+(docs/design/search.md)."""
 LISTEN_NS = 5 * NS_PER_S
-"""A planner that has just begun listens for so long before it takes its target for never seen (decision 66)."""
+"""A planner that has just begun listens for so long before it takes its target for never seen
+(docs/design/search.md)."""
 _TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
 """Some four months, so that the age of a target that was never seen is a number."""

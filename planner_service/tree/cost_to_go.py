@@ -33,7 +33,8 @@ NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.
 
 MOST_SPREAD_SHARE = 48
 """While a tree is repaired, a fall in cost spreads over one cell in this number at most, ten times as expensive as
-evaluating it: beyond, whole branches have moved, and their trees are evaluated first (decision 60)."""
+evaluating it: beyond, whole branches have moved, and their trees are evaluated first
+(docs/design/incremental-trees.md)."""
 
 
 class CostToGoTree:

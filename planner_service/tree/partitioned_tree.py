@@ -35,11 +35,11 @@ from swarm.grid import Window
 
 MOST_LOOKS = 3.0
 """A move or a repair gives way to a full search once it has checked this multiple of the map's tiles; repairing one
-counts double (decision 61)."""
+counts double (docs/design/incremental-trees.md)."""
 
 MOST_KEPT = 1 << 9
 """Number of tiles for which the costs of their cells inside are kept: 17 MB. On 4096 x 4096 cells, a repair checks
-200 tiles in the mean, and a move 170 to 260 (decision 94)."""
+200 tiles in the mean, and a move 170 to 260 (docs/design/incremental-trees.md)."""
 
 
 class PieceTree:

@@ -17,7 +17,7 @@ from swarm.wire.route_columns import RouteBatch
 
 LOWER_SHARE = 16
 """A heuristic is lowered by visiting at most one cell in this number; beyond, the bound waits for a full search
-(decision 64)."""
+(docs/design/certified-gap.md)."""
 
 
 class LowerBounds:

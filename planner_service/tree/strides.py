@@ -21,9 +21,10 @@ network as dense as they would need holds about as many cells as there are."""
 FINE = 8
 """Strides below the least one serve this multiple of the narrowest window: there all cells are searched."""
 MOST_SHARE = 8
-"""The largest stride is at most such a share of the map's side (decision 62)."""
+"""The largest stride is at most such a share of the map's side (docs/design/windows-and-strides.md)."""
 STALE_SHARE = 16
-"""Networks are rebuilt when cells have changed in one block of the least stride in this number (decision 62)."""
+"""Networks are rebuilt when cells have changed in one block of the least stride in this number
+(docs/design/windows-and-strides.md)."""
 
 _HEADER = 32
 """Bytes: four numbers of eight."""

@@ -51,7 +51,7 @@ _DEEPEST_ZOOM = 24
 tile."""
 _MOST_CODES, _LEAST_CODES = 256, 3
 """Different values of a map of codes: as many as a byte has; and with fewer than three a height model in whole
-metres holds codes of a table by chance (decision 45)."""
+metres holds codes of a table by chance (docs/design/terrain-import.md)."""
 _LOOK_CELLS = 128
 """Side of the sample that is examined first: most height models are ruled out by 16,384 heights."""
 

@@ -29,5 +29,6 @@ groups that it may
 on the bus.
 
 Sources: Shapiro et al., Conflict-free Replicated Data Types (2011); Kulkarni et al., Logical Physical Clocks
-(2014); Demers et al., Epidemic Algorithms for Replicated Database Maintenance (1987). Decisions 9, 18 and 21.
+(2014); Demers et al., Epidemic Algorithms for Replicated Database Maintenance (1987).
+See docs/design/map-merge-law.md.
 """

@@ -17,7 +17,7 @@ _PART = 4
 
 _MAX_WAITING = 1 << 14
 """Sets of throttled processes that wait, in all. Sets without a place are requested again once a digest names them
-(decision 18)."""
+(docs/design/map-merge-law.md)."""
 
 _BURST_S = 10
 """A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""

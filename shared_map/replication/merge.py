@@ -226,7 +226,8 @@ _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
 _AREA_BITS = TILE_AREA.bit_length() - 1
 _FEW = 128
-"""Up to this number of marks, before and after together, lists are faster than arrays (decision 18)."""
+"""Up to this number of marks, before and after together, lists are faster than arrays
+(docs/design/map-merge-law.md)."""
 _NOTHING = (_CLEAR, 0.0, NO_STATEMENT)
 _NO_COLUMNS = (
     np.empty(0, np.uint32),

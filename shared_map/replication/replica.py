@@ -428,4 +428,4 @@ class MapReplica:
 _LEARN_EVERY_NS = 5 * NS_PER_S
 """New measurements change the cost map at most this often: each change is one of the whole map, and each tree is
 searched again from scratch. The change depends on held sets alone, so replicas that hold the same are equal after
-this time at the latest (decision 68)."""
+this time at the latest (docs/design/learning.md)."""

@@ -1,12 +1,11 @@
 """The bus of real processes, on one Zenoh session.
 
 Each subscription and queryable has a thread that reads its channel. The exception is a queryable whose queries are
-decoded by an inbox: those are posted on Zenoh's own thread (decision 99). Three other choices rest on measurements.
-Subscriptions have channels that drop their oldest sample when full: with a FIFO a stalled reader holds up queries
-on the same link. Replies are posted on Zenoh's own thread: a thread per query is ten times slower. Queries, tokens
-and links are rare and have no channel of Zenoh's: a thread that waits on one wakes ten times a second for nothing
-(`Arrivals`).
-"""
+decoded by an inbox: those are posted on Zenoh's own thread (docs/design/zenoh-topology-and-inboxes.md). Three other
+choices rest on measurements. Subscriptions have channels that drop their oldest sample when full: with a FIFO a
+stalled reader holds up queries on the same link. Replies are posted on Zenoh's own thread: a thread per query is
+ten times slower. Queries, tokens and links are rare and have no channel of Zenoh's: a thread that waits on one
+wakes ten times a second for nothing (`Arrivals`)."""
 
 from __future__ import annotations
 

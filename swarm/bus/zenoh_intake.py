@@ -30,9 +30,9 @@ class Arrivals:
     """Items received on one entity, in order.
 
     `recv` of a channel of Zenoh's wakes its thread ten times a second, to look for signals, and asks for the
-    interpreter's lock each time (decision 95). A thread that waits here sleeps until something comes.
-    Zenoh's own thread needs the interpreter's lock to leave an item here, which suits rare items only: frequent
-    samples belong into a channel.
+    interpreter's lock each time (docs/design/measurement.md). A thread that waits here sleeps until something
+    comes. Zenoh's own thread needs the interpreter's lock to leave an item here, which suits rare items only:
+    frequent samples belong into a channel.
 
     most  items that wait; those that come then are dropped
     """
@@ -86,9 +86,8 @@ def _keep_state() -> None:
     """Keeps what the interpreter knows of this thread of Zenoh's until the interpreter ends.
 
     Python makes a state when such a thread calls it and clears it away when the call is over, with the memory of
-    its frames, which takes longer than most calls (decision 99). A state counts who needs it, and this is one more.
-    Zenoh's threads are few and live as long as the process.
-    """
+    its frames, which takes longer than most calls (docs/design/zenoh-topology-and-inboxes.md). A state counts who
+    needs it, and this is one more. Zenoh's threads are few and live as long as the process."""
     if not hasattr(_own, "kept"):
         _own.kept = True
         ctypes.pythonapi.PyGILState_Ensure()

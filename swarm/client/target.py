@@ -19,7 +19,7 @@ class Target(Reported):
     """A target of the scenario whose walk is `external`. Made by `Swarm.target`; use it in a `with`, or `leave`.
 
     Of several trackers the one that has tracked the target for the longest owns it, and its poses count. The next
-    one takes over when its lease ends, or immediately when it leaves (decision 42).
+    one takes over when its lease ends, or immediately when it leaves (docs/design/tracker-ownership.md).
 
     id           of the target, as in the scenario
     tracker      name of this tracker; a later start under the same name takes over at once. None: each start is a

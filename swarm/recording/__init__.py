@@ -1,4 +1,5 @@
-"""Inputs and outputs of a service, recorded while it runs and replayed later (decision 57).
+"""Inputs and outputs of a service, recorded while it runs and replayed later
+(docs/design/simulation-and-replay.md).
 
 A service is deterministic but for what it reads, so a recording is enough to repeat it:
 

@@ -7,9 +7,9 @@ border. It asks the warden for cells and drives into those only that were grante
 of a host. A grant is never revoked and never runs out: a cell is free again by the word of its host alone. Only
 authority is leased.
 
-This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in decision
-25, and decision 40 says how guests come into it. All but `guest_session` and the file of lives is pure: time
-and chance are arguments.
+This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in
+docs/design/right-of-way.md, and docs/design/external-vehicles.md says how guests come into it. All but
+`guest_session` and the file of lives is pure: time and chance are arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 

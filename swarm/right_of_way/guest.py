@@ -1,5 +1,5 @@
 """External vehicles in right of way: how such a guest enters and reserves cells, and how an operator removes it
-(decision 40)."""
+(docs/design/external-vehicles.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""One host of vehicles in right of way: its lives, and the cells that its vehicles hold (decision 25, Lives)."""
+"""One host of vehicles in right of way: its lives, and the cells that its vehicles hold
+(docs/design/right-of-way.md, Lives)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ from swarm.wire.messages.processes import Beat
 from swarm.wire.topics import LEAD
 
 BEAT_NS = NS_PER_S // 10
-"""Time between two beats of a candidate: one message of some 50 bytes, ten times a second (decision 28)."""
+"""Time between two beats of a candidate: one message of some 50 bytes, ten times a second
+(docs/design/leader-and-standby.md)."""
 LEASE_NS = 6 * BEAT_NS
 """A leader that has been silent for so long is replaced."""
 SETTLED_NS = 2 * NS_PER_S

@@ -1,4 +1,5 @@
-"""The secret by which the processes of one user on one machine know each other's words (decision 32)."""
+"""The secret by which the processes of one user on one machine know each other's words
+(docs/design/security.md)."""
 
 from __future__ import annotations
 

@@ -180,8 +180,8 @@ class Trackings:
 
 
 def _is_late(seq: int, life: _Life, now_ns: int) -> bool:
-    """Same rule as in `swarm.liveness.Newest`: after a silence any other number counts as new, so that no pose outweighs all
-    later ones."""
+    """Same rule as in `swarm.liveness.Newest`: after a silence any other number counts as new, so that no pose
+    outweighs all later ones."""
     return seq == life.seq or (seq < life.seq and now_ns - life.heard_ns < POSE_SILENCE_NS)
 
 

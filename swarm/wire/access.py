@@ -4,9 +4,9 @@ A router enforces these rules, so they are complete: it denies everything that n
 passes on everybody's messages, may therefore do everything, and is named nowhere.
 
 On a topic where a false message would harm, a message counts only with a code that the processes of one run alone
-can make (decision 32). The code is a keyed BLAKE2b (RFC 7693) of the key, the query if it is a reply, and the
-payload. It travels beside the payload, as Zenoh's attachment, so a process without the secret may still read.
-"""
+can make (docs/design/security.md). The code is a keyed BLAKE2b (RFC 7693) of the key, the query if it is a reply,
+and the payload. It travels beside the payload, as Zenoh's attachment, so a process without the secret may still
+read."""
 
 from __future__ import annotations
 

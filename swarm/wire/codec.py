@@ -6,7 +6,7 @@ directions are compass points, inf is null. `packed_json` turns JSON into the Me
 that one decoder with all its checks reads both.
 
 `decode` raises nothing but ProtocolError, whatever bytes it is given, and takes a bounded amount of memory.
-Decision 5 says what each of the two libraries does and what that costs.
+docs/design/wire-format.md says what each of the two libraries does and what that costs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Versions of messages: what a build reads, what it writes, and which builds share a run (decision 87).
+"""Versions of messages: what a build reads, what it writes, and which builds share a run
+(docs/design/wire-format.md).
 
 A message keeps its version while fields are added at its end, with defaults: unknown fields are ignored, absent
 ones have their default. Any other change is a `Step` to a new version:

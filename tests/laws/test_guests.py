@@ -1,6 +1,6 @@
 """Guests in right of way: robots that come, crash, come back and leave, agents that join while the swarm runs, and
 operators who say that one is gone, under the same faults. Nobody meets anybody, and nobody is lost. Each rule that
-decision 40 needs is taken out in turn, and the law must notice.
+docs/design/external-vehicles.md needs is taken out in turn, and the law must notice.
 
 More histories: `pytest tests/laws/test_guests.py -m seeds --seeds 0:2000`.
 """

@@ -1,5 +1,5 @@
 """No message is unreadable for a live member of a run of two neighbouring versions, in whatever order all are
-started again (decision 87)."""
+started again (docs/design/wire-format.md)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Right of way: never two vehicles on one cell, and everybody moves again once all is quiet, whatever the network,
-the processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice.
+the processes and the clocks do. Each rule that docs/design/right-of-way.md needs is taken out in turn, and the law
+must notice.
 
 More histories: `pytest tests/laws/test_right_of_way.py -m seeds --seeds 0:2000`.
 """

@@ -420,7 +420,7 @@ class TrafficWorld:
         if len(self.spawns) < 3 or len(self.disks[process.agent]) > 2:
             return
         if any(replaced.issuperset(self.plots.members(plot)) for plot in range(self.plots.count)):
-            return  # decision 25: of the three files of a plot's members one at least is the first
+            return  # docs/design/right-of-way.md: of the three files of a plot's members one at least is the first
         self.twins += 1
         cut = (f"{id(process.disk)}", "")
         self.cut.add(cut)

@@ -1,5 +1,5 @@
 """The lock of the wire: every key and message as it was written last, so that no change breaks the rules of
-versions unnoticed (decision 87).
+versions unnoticed (docs/design/wire-format.md).
 
     PYTHONPATH=.:tests python -m support.wire_lock       writes it, unless a change breaks a rule
 """

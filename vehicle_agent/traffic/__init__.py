@@ -1,7 +1,7 @@
 """Right of way for those who decide it: the members and wardens of plots, and where vehicles would go next.
 
 The map is cut into plots (`swarm.right_of_way.lock_regions`). Each plot has three members, which are agents; one of
-them is its warden. The host's part is in `swarm.right_of_way`; decision 25 has the proof. Here:
+them is its warden. The host's part is in `swarm.right_of_way`; docs/design/right-of-way.md has the proof. Here:
 
 1. A host tells the warden where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
    around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.

@@ -23,7 +23,8 @@ from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S
 """For a vehicle's wish time stands still for so long: then its age grows, by a step in which wardens compare ages.
-Each vehicle's turns begin at another time, so that no tick has all wishes to make (decision 37)."""
+Each vehicle's turns begin at another time, so that no tick has all wishes to make
+(docs/design/zenoh-topology-and-inboxes.md)."""
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
 _MS = NS_PER_S // 1000

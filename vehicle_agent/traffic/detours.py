@@ -22,9 +22,9 @@ from vehicle_agent.driving.driven_vehicle import Vehicle
 _LOOK_CELLS = 200
 """Cells of the route ahead that are searched for bodies, and behind a body for where to come back."""
 _CELLS_PER_TICK = 400
-"""Expanded by all searches of a host: some 4 ms (decision 39)."""
+"""Expanded by all searches of a host: some 4 ms (docs/design/reported-obstacles.md)."""
 _MOST_CELLS = 20_000
-"""Expanded by one search: then there is no way around that is worth it (decision 39)."""
+"""Expanded by one search: then there is no way around that is worth it (docs/design/reported-obstacles.md)."""
 _AGAIN_NS = NS_PER_S
 _RARELY_NS = 16 * NS_PER_S
 """A vehicle without a way around is tried again after one second, then after twice as long, up to this."""

@@ -16,7 +16,8 @@ from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table
 from vehicle_agent.traffic.warden import Warden
 
 LEASE_NS = 3 * BEAT_NS
-"""A warden that is silent for so long may be replaced. Until then its members refuse every claim (decision 25)."""
+"""A warden that is silent for so long may be replaced. Until then its members refuse every claim
+(docs/design/right-of-way.md)."""
 _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S

@@ -1,7 +1,7 @@
 """The warden of a plot: it grants cells to vehicles, and frees them only by their host's own word.
 
 No cell is in two vehicles' grants; a grant is never revoked. The vehicle with a table that a majority has stored is
-therefore alone on its cells (see decision 25 for the proof).
+therefore alone on its cells (see docs/design/right-of-way.md for the proof).
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ SILENT_NS = NS_PER_S
 """Vehicles of a host that is silent for this time are obstacles: no vehicle waits for them or pushes them."""
 _AGE_BITS = 12
 """Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
-the older most of the time, or each lets its own wait for the other (decision 25)."""
+the older most of the time, or each lets its own wait for the other (docs/design/right-of-way.md)."""
 _TOLD_AGAIN_NS = 3 * BEAT_NS // 4
 """Interval at which an unchanged grant is repeated: somewhat less than a beat, so that a beat carries it."""
 MOST_GUESTS = 256
-"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts (decision 40)."""
+"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts
+(docs/design/external-vehicles.md)."""
 MOST_CELLS_OF_GUEST = 1024
-"""Cells of one plot that one guest holds (decision 40)."""
+"""Cells of one plot that one guest holds (docs/design/external-vehicles.md)."""
 MOST_CELLS_OF_GUESTS = 1 << 14
-"""Cells of one plot that all guests together hold: a quarter of one as large as a region (decision 40)."""
+"""Cells of one plot that all guests together hold: a quarter of one as large as a region
+(docs/design/external-vehicles.md)."""
 _NO_CELLS: Sequence[int] = []
 _NO_GRANTS: Mapping[str, list[int]] = {}
 _MOST_CELLS = 64
@@ -86,7 +88,8 @@ class _Host:
 class Warden:
     """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
 
-    fleets  agent -> its vehicles, all of the scenario's. Any other host is a guest (decision 40): its vehicles are
+    fleets  agent -> its vehicles, all of the scenario's. Any other host is a guest
+    (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
     """
 

@@ -1,4 +1,5 @@
-"""A vehicle that speaks MAVLink as a vehicle of the swarm: one process for each link (decision 76).
+"""A vehicle that speaks MAVLink as a vehicle of the swarm: one process for each link
+(docs/design/mavlink-adapter.md).
 
 Bytes of a link (`link`) become checked messages (`mavlink_codec`). The core (`adapter`) takes them, the swarm's
 routes and the time, and returns due actions: calls of the swarm's client, and messages to the vehicle. `guidance`

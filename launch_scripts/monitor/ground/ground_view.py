@@ -1,7 +1,7 @@
 """Draws what lies still: decides which tiles and zones are drawn again, and when.
 
 Zones are those of the scenario, those that its files draw, and those that operators ordered. Few entities, style
-logged once: see docs/decisions/0008-the-live-view.md.
+logged once: see docs/design/live-view.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Draws vehicles, who they are, their trails and routes, as they are due.
 
-Few entities with many instances each; of each only changes: see docs/decisions/0053-what-moves.md.
+Few entities with many instances each; of each only changes: see docs/design/live-view.md.
 """
 
 from __future__ import annotations
@@ -239,8 +239,8 @@ class VehiclesView:
 def vehicle_details(
     vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """Text such as `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most important comes
-    first: a viewer may cut off the end.
+    """Text such as `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most
+    important comes first: a viewer may cut off the end.
 
     who  vehicle -> what is said of whose it is
     """

@@ -20,10 +20,10 @@ TURN_S = 0.6
 """Time of a turn, during which its new heading is published already."""
 _LONGEST_REST_S = 8.0
 """Rests are drawn from half a second up to this. Vehicles wait for a body at rest for a second and then drive
-around it (decision 39): both are to happen, the second more often."""
+around it (docs/design/reported-obstacles.md): both are to happen, the second more often."""
 _TOLD_AGAIN_NS = NS_PER_S // 2
 """Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every body
-(decision 39), and a report that is lost must not end the lease."""
+(docs/design/reported-obstacles.md), and a report that is lost must not end the lease."""
 _LONGEST_TICK_S = 1.0
 """After a longer pause of its process a rover does not make up for the rest: a leap keeps the old place closed
 until the lease ends."""

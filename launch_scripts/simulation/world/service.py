@@ -25,14 +25,16 @@ from swarm.wire.messages.vehicles import Body, Fleet
 from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 _MOVED_CELLS = 0.25
-"""A share of a cell, which trackers of others are asked for, too (decision 37, docs/operate/trackers.md)."""
+"""A share of a cell, which trackers of others are asked for, too (docs/design/zenoh-topology-and-inboxes.md,
+docs/operate/trackers.md)."""
 _AGAIN_NS = NS_PER_S // 2
-"""Interval at which a target at rest is published (decision 37): four times within the lease of a pose, 2 s."""
+"""Interval at which a target at rest is published (docs/design/zenoh-topology-and-inboxes.md): four times within
+the lease of a pose, 2 s."""
 
 
 class PoseThrottle:
-    """Passes, of the poses of each tick, those of targets that have entered another cell, have moved by a quarter of
-    one, were captured, or were published last more than half a second ago.
+    """Passes, of the poses of each tick, those of targets that have entered another cell, have moved by a quarter
+    of one, were captured, or were published last more than half a second ago.
 
     Every agent receives the poses of all targets: at ten per second they were a fifth of all deliveries, though a
     target needs seconds for a cell.

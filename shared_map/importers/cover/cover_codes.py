@@ -34,8 +34,8 @@ MOST_COLOURS = 1024
 LEAST_DISTINCT = 3
 """Fewer codes or colours tell nothing."""
 _LEAST_DRAWN = 0.9
-"""Share of a drawing that must have one legend's colours, margins left out (decision 45): labels, borders and scale
-bars have others."""
+"""Share of a drawing that must have one legend's colours, margins left out (docs/design/terrain-import.md): labels,
+borders and scale bars have others."""
 _HIGHEST_FACTOR = 1e12
 """The highest pace of `terrain.cover_classes`, too (`Positive`)."""
 

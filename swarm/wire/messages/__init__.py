@@ -11,7 +11,8 @@ from swarm.wire.fields import Bounded
 
 WIRE_VERSION = 8
 """The wire that this build speaks. It rises by one, once a release, where a message steps to a version that builds
-before it do not read, or where a key changes (`swarm.wire.versions`, decision 87). Two neighbours share a run."""
+before it do not read, or where a key changes (`swarm.wire.versions`, docs/design/wire-format.md). Two neighbours
+share a run."""
 _FIRST_VERSION = 8
 """Version of every message when each got a version of its own."""
 

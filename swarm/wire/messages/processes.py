@@ -41,7 +41,8 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     restarts                    how often the process was started again in this run
     classes                     the classes of vehicles beside "ground", in the order of their numbers
     wire_version                of its build. This message is read by builds of all wire versions: it never steps to
-                                another version, so that each can say which the other speaks (decision 87)
+                                another version, so that each can say which the other speaks
+                                (docs/design/wire-format.md)
     plot_cells                  side of a plot of right of way: two layouts in one run would grant a cell twice
     """
 

@@ -1,4 +1,5 @@
-"""Messages about right of way: what hosts say of their vehicles, and what wardens grant (decision 25)."""
+"""Messages about right of way: what hosts say of their vehicles, and what wardens grant
+(docs/design/right-of-way.md)."""
 
 from __future__ import annotations
 
