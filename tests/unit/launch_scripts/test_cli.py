@@ -132,3 +132,6 @@ def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(swarm: Swarm,
     assert report["run_id"] == last.resolve().name
     again = load_scenario(last / "scenario.toml")
     assert (again.name, again.seed, again.seconds) == ("synthetic", 9, 2.0)
+    (tmp_path / "s.toml").write_text('[terrain]\nsource = "missing.tif"\n')
+    assert swarm("simulate", str(tmp_path / "s.toml"), "--runs", str(tmp_path))[0] == 3
+    assert list(tmp_path.glob("*-simulated")) == [last.resolve()]
