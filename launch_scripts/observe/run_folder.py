@@ -182,11 +182,15 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space."""
+    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space.
+    An OSError names the file that the caller wants to write."""
     partial = path.with_name(path.name + ".part")
     try:
         yield partial
         partial.replace(path)
+    except OSError as error:
+        error.filename = str(path) if error.filename == str(partial) else error.filename
+        raise
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, ended, replacing, write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, ended, write_file
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
@@ -97,8 +97,7 @@ def write_report(
     from launch_scripts.report.run_page import write_page
     from launch_scripts.report.run_picture import save_picture
 
-    with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
-        save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
+    save_picture(folder / PICTURE_FILE, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
     write_page(folder)
 
 
