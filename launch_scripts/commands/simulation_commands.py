@@ -104,7 +104,7 @@ def _simulate_once(
         )
         done = Simulation(scenario, trace=log)  # before the folder: a scenario without its terrain leaves none
         folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
-        for sentence in begin_run(folder, scenario, folder.name):
+        for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")
         result = run_to_end(done)
     if as_json:
