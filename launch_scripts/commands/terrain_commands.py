@@ -102,14 +102,9 @@ def info(
     from shared_map.terrain.terrain_report import doubts_about, facts_of
 
     options = {
-        "crs": crs,
-        "resolution_m": resolution_m,
-        "height_scale": height_scale,
-        "nodata": "fill" if fill else None,
-        "cover": cover,
-        "cover_codes": cover_codes,
-        "elevation_encoding": elevation_encoding,
-    }
+        "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
+        "cover": cover, "cover_codes": cover_codes, "elevation_encoding": elevation_encoding,
+    }  # fmt: skip
     given = {key: value for key, value in options.items() if value is not None}
     if file.endswith(".toml"):
         for key in given:

@@ -211,15 +211,7 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
 
 
 def capture(target: str, cell: int) -> Note:
-    return Note(
-        role="targets",
-        id="d0",
-        stamp_ns=1,
-        kind="capture",
-        text="a captured it",
-        cell=cell,
-        target=target,
-    )
+    return Note(role="targets", id="d0", stamp_ns=1, kind="capture", text="a captured it", cell=cell, target=target)
 
 
 def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(recorder: Recorder) -> None:

@@ -14,7 +14,7 @@ from launch_scripts.commands.terrain_commands import app
 from launch_scripts.report import terrain_figure
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.load import load_scenario
-from swarm.errors import ConfigError, SwarmError
+from swarm.errors import SwarmError
 
 runner = CliRunner()
 
@@ -51,8 +51,6 @@ def test_info_tells_of_the_scenarios_own_landscape_what_it_costs_and_what_looks_
     assert 0 < facts["largest_part_share"] <= 1
     assert any("cost.max_slope_deg" in doubt for doubt in facts["doubts"])
     assert "! " in run("info", file)
-    with pytest.raises(ConfigError, match=r"--fill goes with a terrain file: .* set terrain\.nodata"):
-        run("info", file, "--fill")
 
 
 def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path: Path) -> None:
