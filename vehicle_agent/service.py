@@ -103,7 +103,7 @@ class AgentService:
         self._now_ns = 0
         self.when_over: Callable[[], None] | None = None
         self._removed: set[str] = set()
-        """Vehicles that an operator has let leave."""
+        """Vehicles that an operator has let leave in this life."""
         self._member.needs("the shared map", lambda: self._sync.joined)
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places for its vehicles", lambda: self._has_places)
@@ -116,10 +116,12 @@ class AgentService:
 
     @property
     def _has_places(self) -> bool:
-        """True if all vehicles stand somewhere that have not left. Those that are added enter as there is space."""
+        """True if each vehicle has a place or has left. Those that are added enter as there is space."""
+        host = self._right_of_way.core.host
         if self._parts.spawning is not None:
-            return self._right_of_way.core.host.informed
-        return len(self.agent.vehicles.keys() | self._removed) == len(self.agent.plan.vehicle_ids)
+            return host.informed
+        absent = set(self.agent.plan.vehicle_ids).difference(self.agent.vehicles, self._removed)
+        return not absent or host.have_left(absent)
 
     def lacks(self) -> list[str]:
         return self._member.lacks()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -108,7 +109,8 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
     from swarm.errors import BusError
 
     folders = [find_run(name, runs)] if name is not None else _newest_first(runs)
-    tried = [(folder.resolve().name, network) for folder in folders if (network := _network_of(folder)) is not None]
+    networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
+    tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
         tried.append(("", scenario.NetworkConfig()))
     # Of runs with the same router only the newest can be connected to it.
@@ -131,14 +133,16 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
 
 
 def _network_of(folder: Path) -> NetworkConfig | None:
-    """The network of a run, from its scenario as it ran; None if that cannot be read."""
+    """The network of a run, from its scenario as it ran; None if it was simulated or that cannot be read."""
     import msgspec
 
-    from launch_scripts.observe.run_folder import SCENARIO_FILE
+    from launch_scripts.observe.run_folder import SCENARIO_FILE, run_facts
     from swarm.config.input_files import FileKind, read_text
     from swarm.config.scenario import NetworkConfig
     from swarm.errors import SwarmError
 
+    if run_facts(folder).get("simulated"):
+        return None
     try:
         raw = tomllib.loads(read_text(folder / SCENARIO_FILE, FileKind.SCENARIO)).get("network", {})
         return msgspec.convert(raw, NetworkConfig)
@@ -158,4 +162,4 @@ def _newest_first(runs: Path) -> list[Path]:
     def newness(folder: Path) -> tuple[bool, float]:
         return not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
 
-    return sorted(folders, key=newness, reverse=True)[:_NEWEST]
+    return sorted(folders, key=newness, reverse=True)

@@ -87,7 +87,7 @@ def _simulate_once(
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
-    from launch_scripts.simulation.simulate import simulate as run_simulation
+    from launch_scripts.simulation.simulate import Simulation, run_to_end
     from launch_scripts.simulation.worlds import WORLDS
 
     if name in WORLDS:
@@ -104,11 +104,11 @@ def _simulate_once(
             seed=scenario.seed if seed is None else seed,
             seconds=scenario.seconds if seconds is None else seconds,
         )
-        folder = make_run_dir(runs, f"{new_run_id()}-simulated")
-        for sentence in begin_run(folder, scenario, folder.name):
+        done = Simulation(scenario, trace=log)  # before the folder: a scenario without its terrain leaves none
+        folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
+        for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")
-        result = run_simulation(scenario, trace=log, record_to=folder)
-    done = result.simulation
+        result = run_to_end(done)
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))

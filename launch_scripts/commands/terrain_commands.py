@@ -34,7 +34,7 @@ from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
 from swarm.config.write import toml_value
-from swarm.errors import writing
+from swarm.errors import ConfigError, writing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -99,20 +99,19 @@ def info(
     from shared_map.terrain.terrain import build_terrain
     from shared_map.terrain.terrain_report import doubts_about, facts_of
 
+    options = {
+        "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
+        "cover": cover, "cover_codes": cover_codes, "elevation_encoding": elevation_encoding,
+    }  # fmt: skip
+    given = {key: value for key, value in options.items() if value is not None}
     if file.endswith(".toml"):
+        for key in given:
+            option = "fill" if key == "nodata" else key.replace("_", "-")
+            raise ConfigError(f"--{option} goes with a terrain file: in the scenario {file} set terrain.{key}")
         scenario = find_scenario(file, preset)
     else:
-        raw = {
-            "source": file,
-            "crs": crs,
-            "resolution_m": resolution_m,
-            "height_scale": height_scale,
-            "nodata": "fill" if fill else "lethal",
-            "cover": cover,
-            "cover_codes": cover_codes,
-            "elevation_encoding": elevation_encoding,
-        }
-        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig), cost=cost_of_preset(preset))
+        ground = msgspec.convert({"source": file, **given}, TerrainConfig)
+        scenario = Scenario(terrain=ground, cost=cost_of_preset(preset))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
     rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}

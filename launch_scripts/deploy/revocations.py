@@ -9,7 +9,7 @@ import msgspec
 from launch_scripts.observe.run_folder import write_file
 from swarm.config.scenario import NetworkConfig
 from swarm.config.setting_types import CommonName
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, StoreError, writing
 
 FILE = "revoked"
 _MOST_BYTES = 1 << 20
@@ -50,10 +50,8 @@ def revoke(folder: Path, names: list[str]) -> Path:
     path = folder / FILE
     checked = [_checked(name, "a name to revoke") for name in names]
     every = dict.fromkeys((*revoked_in(folder), *checked))
-    try:
+    with writing(path):
         write_file(path, "".join(f"{name}\n" for name in every).encode())
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return path
 
 
@@ -61,5 +59,4 @@ def _checked(name: str, where: str) -> str:
     try:
         return msgspec.convert(name, CommonName)
     except msgspec.ValidationError as error:
-        example = "agent.all.a0~2"
-        raise ConfigError(f"{where}: {name!r} is no name in a certificate, such as {example}: {error}") from error
+        raise ConfigError(f"{where}: {name!r} is no name in a certificate, such as agent.all.a0~2") from error

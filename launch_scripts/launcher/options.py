@@ -28,7 +28,7 @@ from launch_scripts.process_table import (
     spec_of,
 )
 from launch_scripts.web import LOOPBACK
-from shared_map.importers.sources import is_terrain
+from shared_map.importers.sources import FILE_KINDS, is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, explain, nearest
@@ -73,7 +73,7 @@ def scenario_path(name: str) -> Path:
             f"cannot read scenario {name}: No such file; `swarm new {name}` writes one, built in are"
             f" {', '.join(names)}"
         )
-    if path.suffix in (".tif", ".tiff", ".hgt", ".asc", ".npz"):
+    if path.suffix in FILE_KINDS.split(", "):
         raise ConfigError(f"no terrain {name!r}: no such file")
     raise ConfigError(
         f"no scenario {quoted(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"

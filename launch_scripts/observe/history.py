@@ -72,7 +72,8 @@ class Sample:
     """The run at one instant. `states` counts vehicles per VehicleState; totals are None until published.
 
     gap_excess             the histogram of certified gaps - 1 of all routes that were begun until then
-    waiting_s, standing_s  of all vehicles together until then, as `Driven` counts them
+    waiting_s, standing_s  of all vehicles together until `driven_s`, as `Driven` counts them
+    driven_s               UNIX time of the last count of these; 0 before
     """
 
     time_s: float
@@ -88,6 +89,7 @@ class Sample:
     gap_excess: Buckets = field(default_factory=lambda: buckets_of({}))
     waiting_s: float = 0.0
     standing_s: float = 0.0
+    driven_s: float = 0.0
 
 
 def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
@@ -105,11 +107,12 @@ def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
 
 def at_once(samples: Sequence[Sample], of: Callable[[Sample], float]) -> list[float]:
     """The number of vehicles that did something at the same time, on average since the sample before, from the
-    seconds that all have spent with it."""
+    seconds that all have spent with it. A sample without a new count repeats the number before: a run which ends
+    has none."""
     counts = [0.0] * min(len(samples), 1)
     for early, late in itertools.pairwise(samples):
-        passed_s = late.time_s - early.time_s
-        counts.append(max(of(late) - of(early), 0.0) / passed_s if passed_s > 0 else 0.0)
+        passed_s = late.driven_s - early.driven_s
+        counts.append(max(of(late) - of(early), 0.0) / passed_s if passed_s > 0 else counts[-1])
     return counts
 
 

@@ -188,6 +188,8 @@ class LatestState(Counts):
         """Time when the first and the last message were heard; None before."""
         self.moved_ns = 0
         """Time when a vehicle or a target was last heard of. Later messages are those of a run that ends."""
+        self.fleet_ns: int | None = None
+        """Time when an agent last reported its vehicles; None before."""
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
@@ -223,7 +225,7 @@ class LatestState(Counts):
                     job, rank = split_rank(message.id)
                     self._ranks[message.role, job] = rank
             case Fleet():
-                self.moved_ns = max(self.moved_ns, now_ns)
+                self.moved_ns = self.fleet_ns = max(self.moved_ns, now_ns)
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
                     self._fleets[message.author, message.region] = message

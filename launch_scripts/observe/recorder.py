@@ -171,6 +171,10 @@ class Recorder(RunFigures):
         self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
     def _look(self, now_ns: int) -> None:
+        fleet_ns, driven_ns = self.observed.fleet_ns, self.driven.at_ns
+        if fleet_ns is not None and (driven_ns is None or fleet_ns - driven_ns >= _TRACK_NS):
+            # By the time of the agents: vehicles without messages, as at the end of a run, are not at rest.
+            self.driven.add(fleet_ns, self.observed.vehicles(), self.observed.groups)
         tracks_due, sample_due = self.vehicle_tracks.due(now_ns), now_ns >= self._sample_due_ns
         if tracks_due:
             self._sample_tracks(now_ns, self.observed.vehicles())
@@ -182,7 +186,6 @@ class Recorder(RunFigures):
         moving = np.isin(vehicles.states, _ON_THE_WAY)
         if len(self.routed) < self.scenario.vehicle_count:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
-        self.driven.add(now_ns, vehicles, self.observed.groups)
         keys: list[TrackKey] = [(id, 0) for id in vehicles.ids]
         self.vehicle_tracks.add(now_ns, keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
         poses = sorted(self.observed.poses.items())
@@ -192,7 +195,8 @@ class Recorder(RunFigures):
 
     def _sample(self, state: RunState) -> Sample:
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
-        return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s)
+        driven_s = (self.driven.at_ns or 0) / NS_PER_S
+        return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s, driven_s=driven_s)
 
     def report(
         self,

@@ -27,11 +27,14 @@ LAST = "LAST"
 _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
 
 
-def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True) -> list[str]:
+def begin_run(
+    folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True, simulated: bool = False
+) -> list[str]:
     """Writes `scenario.toml` and `run.json`, and makes `LAST` point here. Returns what a person should know: a run
     goes on without them, as on a full disk.
 
-    recorded  whether a report follows; else another launcher of the run makes it
+    recorded   whether a report follows; else another launcher of the run makes it
+    simulated  the run has no router: no command can ask it
     """
     began = _now()
     head = f"# Run {run_id}, {began}: every setting that it ran with. `swarm up` runs it again.\n"
@@ -41,6 +44,7 @@ def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool =
         "seed": scenario.seed,
         "began": began,
         "recorded": recorded,
+        "simulated": simulated,
         "versions": {
             "python": platform.python_version(),
             **{name: _version(package) for name, package in _PACKAGES.items()},
@@ -67,14 +71,14 @@ def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool =
 
 def ended(folder: Path) -> dict[str, Any]:
     """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
-    facts = _facts(folder)
+    facts = run_facts(folder)
     if not facts:
         return {}
     kept: dict[str, Any] = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
     return {"began": kept.pop("began", None), "ended": _now(), **kept}
 
 
-def _facts(folder: Path) -> dict[str, Any]:
+def run_facts(folder: Path) -> dict[str, Any]:
     """Returns the content of `run.json`; empty if it cannot be read."""
     try:
         facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
@@ -121,7 +125,7 @@ def find_run(name: str, runs: Path) -> Path:
 def lacks(folder: Path, file: str) -> ConfigError:
     """The error where a run's folder lacks a file that a run leaves at its end, and why it does."""
     why = "the run has not ended yet, or its launcher was killed"
-    if _facts(folder).get("recorded") is False:
+    if run_facts(folder).get("recorded") is False:
         why = "the launcher of another machine records the run, and leaves it in its own folder"
     return ConfigError(f"{folder} has no {file}: {why}")
 
@@ -182,11 +186,15 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space."""
+    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space.
+    An OSError names the file that the caller wants to write."""
     partial = path.with_name(path.name + ".part")
     try:
         yield partial
         partial.replace(path)
+    except OSError as error:
+        error.filename = str(path) if error.filename == str(partial) else error.filename
+        raise
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -41,7 +41,8 @@ class Driven:
         self._seen: list[str] = []
         self._seen_rows: NDArray[np.intp] = np.zeros(0, np.intp)
         """The rows of the vehicles of the last sample; -1 of those beyond the bound."""
-        self._at_ns: int | None = None
+        self.at_ns: int | None = None
+        """Time of the last sample."""
 
     def add(self, now_ns: int, vehicles: VehicleColumns, groups: Callable[[], Mapping[str, str]]) -> None:
         """Takes in one sample of all vehicles."""
@@ -52,13 +53,13 @@ class Driven:
         rows, states = self._seen_rows[some], vehicles.states[some]
         place_m = np.stack([vehicles.east_m[some], vehicles.south_m[some]], axis=1).astype(np.float64)
         moved_m = np.hypot(*(place_m - self._place_m[rows]).T)  # NaN of those that are new
-        passed_s = 0.0 if self._at_ns is None else max(now_ns - self._at_ns, 0) / NS_PER_S
+        passed_s = 0.0 if self.at_ns is None else max(now_ns - self.at_ns, 0) / NS_PER_S
         stands = (states == VehicleState.FOLLOWING) & (moved_m == 0)
         self.totals[0, rows] += np.nan_to_num(moved_m)
         self.totals[1, rows] += passed_s * (states == VehicleState.WAITING)
         self.totals[2, rows] += passed_s * stands
         self._place_m[rows] = place_m
-        self._at_ns = now_ns
+        self.at_ns = now_ns
 
     def _know(self, ids: list[str], groups: Mapping[str, str]) -> None:
         for id in [id for id in ids if id not in self._rows][: _MOST_VEHICLES - len(self.ids)]:

@@ -130,8 +130,8 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     if form.driver == "GPX" and any(layer.shape == "Polygon" for layer in layers):
         raise ConfigError(f"--out {path}: GPX has no areas; write .geojson, .gpkg or .kml")
     half = path.with_name(f"{path.stem}.part{path.suffix}")
-    half.unlink(missing_ok=True)
     try:
+        half.unlink(missing_ok=True)
         if not form.driver:
             _write_csv(half, layers[0], frame)
         else:
@@ -142,6 +142,8 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
         half.replace(path)
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    except StoreError as error:
+        raise StoreError(str(error).replace(half.name, path.name)) from error  # GDAL names it, too
     finally:
         with contextlib.suppress(OSError):
             half.unlink(missing_ok=True)

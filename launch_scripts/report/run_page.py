@@ -34,7 +34,7 @@ from launch_scripts.report.run_picture import (
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text
-from swarm.errors import StoreError
+from swarm.errors import StoreError, writing
 from swarm.grid import GridSpec
 
 PAGE_FILE = "report.html"
@@ -54,10 +54,8 @@ def write_page(folder: Path) -> Path:
         text = page_of(folder, report)
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, ArithmeticError, TemplateError) as error:
         raise StoreError(f"{folder / REPORT_FILE} is damaged: {type(error).__name__}: {error}") from error
-    try:
+    with writing(path):
         write_file(path, text.encode())
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return path
 
 

@@ -23,6 +23,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from launch_scripts.observe import palette
+from launch_scripts.observe.run_folder import replacing
 from swarm.errors import StoreError
 
 Report = Mapping[str, Any]
@@ -207,9 +208,10 @@ def saved(path: Path | io.BytesIO, size_in: tuple[float, float], dpi: int = 120,
         FigureCanvasAgg(figure)
         yield figure
         try:
-            figure.savefig(path, format="png", pil_kwargs={"compress_level": 4})
+            with contextlib.nullcontext(path) if isinstance(path, io.BytesIO) else replacing(path) as target:
+                figure.savefig(target, format="png", pil_kwargs={"compress_level": 4})
         except (OSError, ValueError) as error:
-            raise StoreError(f"cannot write the picture {path}: {error}") from error
+            raise StoreError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
 
 
 # --- of a study ---------------------------------------------------------------------------------------------------

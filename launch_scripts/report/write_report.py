@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import importlib.metadata
 import io
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -18,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, ended, replacing, write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, ended, write_file
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
-from swarm.errors import StoreError
+from swarm.errors import writing
 
 PICTURE_FILE = "report.png"
 
@@ -92,22 +91,13 @@ def write_report(
     if (factors != 1).any():
         contents[LEARNED_FILE] = lambda: image_bytes(learned_pixels(terrain, factors), "PNG")
     for name, content in contents.items():
-        with _sentence(folder / name):
+        with writing(folder / name):
             write_file(folder / name, content())
     from launch_scripts.report.run_page import write_page
     from launch_scripts.report.run_picture import save_picture
 
-    with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
-        save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
+    save_picture(folder / PICTURE_FILE, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
     write_page(folder)
-
-
-@contextlib.contextmanager
-def _sentence(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "group"),

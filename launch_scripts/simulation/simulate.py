@@ -247,7 +247,12 @@ def simulate(
         scenario = msgspec.structs.replace(scenario, seed=seed)
     seconds = scenario.seconds if seconds is None else seconds
     scenario = msgspec.structs.replace(scenario, seconds=seconds)
-    simulation = Simulation(scenario, faults=faults, trace=trace, record_to=record_to)
+    return run_to_end(Simulation(scenario, faults=faults, trace=trace, record_to=record_to))
+
+
+def run_to_end(simulation: Simulation) -> SimulationResult:
+    """Runs a simulation for the seconds of its scenario."""
+    seconds = simulation.scenario.seconds
     began_s = time.perf_counter()
     with collected_rarely():
         simulation.run_until(seconds)

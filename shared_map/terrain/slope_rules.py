@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shared_map.array_files import Floats
-from swarm.config.ground import CostConfig
-from swarm.config.setting_types import SlopeRule
+from swarm.config.ground import CostConfig, SlopeRule
 
 MOST_FACTOR = 100.0
 """No slope raises a pace more, unless `steep_factor` says so: costly is not lethal."""
@@ -308,4 +307,4 @@ SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
     ),
     "table": _by_direction(_table, "points of one's own: slope_table or slope_csv", "the scenario"),
 }
-"""Every rule; a new one is a row here and its name in `swarm.config.setting_types.SlopeRule`."""
+"""Every rule; a new one is a row here and its name in `swarm.config.ground.SlopeRule`."""

@@ -214,6 +214,7 @@ def connect(
     import msgspec
 
     from swarm.bus.zenoh_bus import open_bus
+    from swarm.config.explain import explain
     from swarm.config.load import check_endpoint
     from swarm.config.scenario import NetworkConfig, TlsConfig
     from swarm.runtime.inbox import Inbox
@@ -227,7 +228,7 @@ def connect(
     try:
         network = msgspec.convert(fields, NetworkConfig)
     except msgspec.ValidationError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(explain(str(error), fields, NetworkConfig)) from error
     if ca and certificate and key:
         network = msgspec.structs.replace(network, tls=TlsConfig(ca=ca, certificate=certificate, key=key))
     began_s = time.monotonic()

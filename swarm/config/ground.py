@@ -21,10 +21,13 @@ from swarm.config.setting_types import (
     Section,
     Slope,
     SlopeFactor,
-    SlopeRule,
     SpeedOnGround,
     plugin_name,
 )
+
+SlopeRule = Literal[
+    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
+]
 
 
 class WayConfig(Section, frozen=True, kw_only=True):

@@ -31,10 +31,6 @@ MOST_TARGETS = 1000
 """Limit for all entries together."""
 
 Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
-SlopeRule = Literal[
-    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
-]
-
 Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
 
 Slope = Annotated[float, Meta(gt=-90, lt=90)]

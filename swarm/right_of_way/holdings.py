@@ -204,6 +204,11 @@ class Holdings:
         """True if no vehicle of ours holds or requests a cell, and all wardens that we contacted know it."""
         return not (self.plots or self._paths or self._enters)
 
+    @property
+    def answered(self) -> bool:
+        """Returns True if a table of each plot that concerns us takes this life into account."""
+        return self.life > 0 and not self.replaced and all(self._views[plot].heard for plot in self.plots)
+
     def is_granted(self, vehicle: str) -> bool:
         """Returns True if a table in use grants cells to a vehicle, which may have left them."""
         return any(vehicle in view.seen for view in self._views.values())

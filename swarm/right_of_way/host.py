@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
@@ -88,6 +88,11 @@ class Host:
         if self.holdings.heard_ns(granted.plot) == now_ns:
             self._led_ns[granted.plot] = now_ns
         return placed
+
+    def have_left(self, vehicles: Iterable[str]) -> bool:
+        """Returns True if these vehicles left in an earlier life: each plot which concerns us has answered this
+        life, and none grants them a cell."""
+        return self.informed and self.holdings.answered and not any(map(self.holdings.is_granted, vehicles))
 
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""

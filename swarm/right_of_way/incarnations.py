@@ -82,7 +82,7 @@ class LifeFile(MemoryLives):
             draft.write_text("".join(f"{life}\n" for life in lives))
             draft.replace(self._path)
         except OSError as error:
-            raise StoreError(f"cannot write {draft}: {error.strerror}") from error
+            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
 
     def close(self) -> None:
         if self._lock >= 0:

@@ -111,7 +111,12 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     assert [each.left for each in asked] == [[one], [other]]
     assert asked[1].unknown == ["nobody"]
     assert one not in agent.vehicles
-    assert other not in agent_of_node(simulation.nodes["agent-a0"]).vehicles
+    simulation.crash("agent-a0")
+    drive(simulation, [], 5)
+    restarted = simulation.nodes["agent-a0"]
+    assert other not in agent_of_node(restarted).vehicles
+    assert restarted.service is not None
+    assert restarted.service.lacks() == []
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
     drive(simulation, [], 2)
     assert node.service is not None

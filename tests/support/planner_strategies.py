@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
-from swarm.config.ground import CostConfig
+from swarm.config.ground import CostConfig, SlopeRule
 from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import SlopeRule
 from swarm.grid import GridSpec
 
 STRATEGIES = (

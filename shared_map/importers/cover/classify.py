@@ -34,6 +34,7 @@ from shared_map.importers.cover.photo_rules import (
 )
 from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
+from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.setting_types import ClassName, Point, Polygon, Section
 from swarm.errors import TerrainError
@@ -332,7 +333,7 @@ def read_labels(path: Path, grid: GridSpec) -> Labels:
     try:
         found = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
-        raise TerrainError(f"labels {path}: {error}") from error
+        raise TerrainError(f"labels {path}: {explain(str(error), raw, _File, 'labels')}") from error
     classes = np.zeros((grid.rows, grid.cols), np.uint8)
     groups = np.full((grid.rows, grid.cols), -1, np.int32)
     count = 0

@@ -33,13 +33,6 @@ def test_the_launcher_never_imports_numba_or_rerun() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_an_unknown_scenario_gets_the_nearest_name(swarm: Swarm) -> None:
-    code, out, err = swarm("up", "jaksboro")
-    assert code == 2
-    assert all(line.startswith("loading") for line in out.splitlines())  # as it says where a second has passed
-    assert err.startswith("swarm: no scenario 'jaksboro'; did you mean 'jacksboro'?")
-
-
 def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(swarm: Swarm, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("[vehicles]\nsense_rnge_m = 3\n")
@@ -49,20 +42,6 @@ def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(swarm: Swarm,
     assert "vehicles.sense_rnge_m" in err
     assert "'sense_range_m'" in err
     assert err.count("\n") == 1
-
-
-def test_runs_where_nobody_may_write(swarm: Swarm, tmp_path: Path) -> None:
-    (tmp_path / "runs").write_text("a file in the way")
-    code, _, err = swarm("up", "synthetic", "--port", "0", "--runs", str(tmp_path / "runs"))
-    assert code == 6
-    assert err.startswith(f"swarm: cannot make a run folder in {tmp_path / 'runs'}")
-    assert "Traceback" not in err
-
-
-def test_an_endpoint_beyond_this_machine_needs_tls(swarm: Swarm) -> None:
-    code, _, err = swarm("status", "--connect", "tcp/10.1.2.3:7447")
-    assert code == 2
-    assert "use tls/10.1.2.3:7447" in err
 
 
 def test_the_tls_options_belong_together() -> None:

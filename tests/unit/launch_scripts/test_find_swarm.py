@@ -84,7 +84,11 @@ def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
     ports = free_ports(5)
     for n, port in enumerate(ports):
         make_run(tmp_path, f"r{n}", port, f"2026-11-0{n + 1}T00:00:00Z")
-    with pytest.raises(BusError, match=rf"no swarm runs here: .*r4 at tcp/127\.0\.0\.1:{ports[4]}.* and 3 more"):
+    make_run(tmp_path, "simulated", ports[0], "2026-12-01T00:00:00Z")
+    (tmp_path / "simulated" / "run.json").write_text('{"simulated": true}')
+    with pytest.raises(
+        BusError, match=rf"no swarm runs here: [^(]*\(r4 at tcp/127\.0\.0\.1:{ports[4]}.* and 3 more"
+    ):
         find_swarm(tmp_path)
     with pytest.raises(BusError, match=r"no swarm runs here: .*usual endpoint"):
         find_swarm(tmp_path / "nowhere")

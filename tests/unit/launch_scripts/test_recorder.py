@@ -94,6 +94,14 @@ def pose(target: str, east_m: float, south_m: float, seq: int, captures: int = 0
     return target_pose(target, seq=seq, stamp_ns=seq, x_m=x_m, y_m=y_m, captures=captures, jumps=captures)
 
 
+def test_vehicles_which_stop_reporting_as_a_run_ends_are_not_counted_as_waiting(recorder: Recorder) -> None:
+    for tick in range(42):
+        hear(recorder, fleet("a0.7", {"a0-00": (tick, 0.0), "a0-01": (5.0, 0.0)}, tick / 5), at_s=tick / 5)
+    hear(recorder, pose("t0", 1.0, 1.0, 1), at_s=9.1)
+    recorder.finish(int(9.2 * NS_PER_S))
+    assert recorder.series()["standing_at_once"][1:] == pytest.approx([1.0] * 10)
+
+
 def status(target: str, gap_max: float | None, following: int = 1) -> PlannerStatus:
     gaps = dict.fromkeys(("gap_mean", "gap_p95", "gap_max"), gap_max)
     return planner_status(target, stamp_ns=0, following=following, **gaps)
@@ -203,15 +211,7 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
 
 
 def capture(target: str, cell: int) -> Note:
-    return Note(
-        role="targets",
-        id="d0",
-        stamp_ns=1,
-        kind="capture",
-        text="a captured it",
-        cell=cell,
-        target=target,
-    )
+    return Note(role="targets", id="d0", stamp_ns=1, kind="capture", text="a captured it", cell=cell, target=target)
 
 
 def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(recorder: Recorder) -> None:

@@ -17,6 +17,7 @@ from support import fake_run
 
 from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_folder import write_file
 from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
@@ -161,6 +162,8 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenari
     report = make_report(recorder, terrain)
     with pytest.raises(StoreError, match=r"cannot write .*nowhere/report\.json: No such file"):
         write_report(tmp_path / "nowhere", report, recorder, terrain)
+    with pytest.raises(FileNotFoundError, match=r"nowhere/notes'$"):
+        write_file(tmp_path / "nowhere" / "notes", b"")
 
 
 def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:

@@ -258,6 +258,8 @@ def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others(tmp_pat
         write_layers(file, [layer], MapFrame(grid))
         written = shapely.from_wkb(raw.read(file)[2])
         assert shapely.area(written).sum() == pytest.approx(100 * (expected > 0).sum())
+        with pytest.raises(StoreError, match=rf"cannot write /proc/{file.name}: ((?!part).)*$"):
+            write_layers(Path("/proc", file.name), [layer], MapFrame(grid))
 
 
 def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path, swarm: Swarm) -> None:

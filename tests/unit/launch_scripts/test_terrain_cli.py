@@ -127,7 +127,7 @@ def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) 
         (("synth", "--out", "dem.xyz", "--rows", 9, "--cols", 9), "write .tif or .tiff or .npz"),
         (("synth", "--out", "/nowhere/dem.tif", "--rows", 9, "--cols", 9), "cannot write"),
         (("cost", "synthetic", "--picture", "/nowhere/cost.png"), "--picture .* cannot write there, the folder"),
-        (("cost", "synthetic", "--picture", "cost.xyz"), "--picture cost.xyz: write .png"),
+        (("rules", "--picture", "/proc/rules.png"), r"cannot write /proc/rules\.png: No such file"),
         (("cost", "synthetic", "--picture", "/tmp"), "it is a folder"),
         (("synth", "--out", "d.tif", "--photo", "photo.png", "--rows", 9, "--cols", 9), "write .tif or .tiff"),
     ],

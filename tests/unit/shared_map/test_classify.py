@@ -232,10 +232,10 @@ def test_a_labelled_point_stands_for_nine_cells(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (POINT.format("lava", 5), "Invalid enum value 'lava'"),
+        (POINT.format("lava", 5), r"labels\[0\].class: found 'lava'; allowed"),
         (POINT.format("water", 5), "one class"),
         (POINT.format("water", 9999) + POINT.format("grass", 5), "label 0 .* covers no cell"),
-        ("labels = 3", "Expected `array`"),
+        ("labels = 3", "labels: found 3, expected a list"),
         ("what", "not TOML"),
     ],
 )

@@ -22,9 +22,8 @@ from shared_map.terrain.layers import (
 from shared_map.terrain.slope_rules import slope_factor
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
-from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
+from swarm.config.ground import CostConfig, SlopeRule, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
-from swarm.config.setting_types import SlopeRule
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -116,3 +116,9 @@ def test_what_a_small_install_brings_is_zenoh_and_the_messages() -> None:
         "eclipse-zenoh", "msgpack", "msgspec",
     }  # fmt: skip
     assert project["scripts"] == {"swarm": "launch_scripts.entry:main"}
+
+
+def test_a_wheel_has_no_script_that_works_in_a_checkout_only() -> None:
+    built = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    scripts = (each for each in (ROOT / "launch_scripts").iterdir() if each.is_file() and "py" not in each.name)
+    assert sorted(built["exclude"]) == sorted(f"/launch_scripts/{each.name}" for each in scripts)
