@@ -36,17 +36,17 @@ app = typer.Typer(
     help="""A swarm of vehicles chases moving targets over real terrain.
 
 For every target a planner keeps the tree of cheapest paths to it; vehicles
-follow their routes and mark what the map did not know; all meet on Zenoh.
+follow their routes and mark hazards missing from the map; all meet on Zenoh.
 
     swarm demo                         the whole swarm, for a minute
 
     swarm new my.toml                  asks, and writes a scenario of your own
 
-    swarm check my.toml                what is wrong with it, before it runs
+    swarm check my.toml                reports all mistakes before it runs
 
     swarm up my.toml --port 0          your scenario, on free ports
 
-    swarm status                       who takes part in a running swarm
+    swarm status                       the processes of a running swarm
 
     swarm route --target t3 --row 40 --col 200
 

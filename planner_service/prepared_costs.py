@@ -136,7 +136,7 @@ def _read(path: Path, dtype: type[np.generic], size: int | None) -> NDArray[Any]
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        log.warning("%s is damaged (%s): computing it anew", path, error)
+        log.warning("%s is damaged (%s): computing it again", path, error)
         return None
     return found
 

@@ -110,7 +110,7 @@ class TargetWatch:
         if self._lost:
             self._lost = False
             lost_s = (now_ns - self._lost_since_ns) / NS_PER_S
-            self._tell("tracker-back", f"{how} again, after {lost_s:.1f} s in which nobody knew where it was")
+            self._tell("tracker-back", f"{how} again, after {lost_s:.1f} s without a known position")
 
     def _lose(self, now_ns: int) -> None:
         pose = self._tracking.pose
@@ -122,7 +122,7 @@ class TargetWatch:
             then = "it is searched for"
             why = f"no vehicle has seen it for {(now_ns - self._tracking.heard_ns) / NS_PER_S:.1f} s"
         elif self._handed_over:
-            why = f"{self._tracker} has handed it over, and nobody else tracks it"
+            why = f"{self._tracker} has handed it over, and there is no other tracker"
         else:
             why = f"{self._tracker} has been silent for longer than its lease of {pose.lease_s:g} s"
         self._tell("tracker-lost", f"{why}; {then}", pose.cell)
@@ -157,7 +157,7 @@ class TargetWatch:
         free_m = _NOISE_CELLS * self._grid.resolution_m
         if moved_m > free_m + self._fastest_m_per_s * elapsed_s:
             self._count("poses_teleported")
-            said = f"{_name(pose)} moved it by {moved_m:.0f} m in {elapsed_s:.1f} s and told no jump"
+            said = f"{_name(pose)} moved it by {moved_m:.0f} m in {elapsed_s:.1f} s without reporting a jump"
             self._name_once("pose-teleported", pose, said, pose.cell)
 
     def _count(self, name: str) -> None:

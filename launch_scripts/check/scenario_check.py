@@ -106,7 +106,7 @@ def meets(scenario: Scenario) -> Iterator[Finding]:
 def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[Finding]:
     from launch_scripts.deploy.certificates import check_signed
 
-    make = "`swarm deploy certs FOLDER --scenario FILE` makes what is missing"
+    make = "`swarm deploy certs FOLDER --scenario FILE` makes the missing ones"
     for key, name in (("ca", tls.ca), ("certificate", tls.certificate), ("key", tls.key)):
         if not Path(name).exists():
             yield failure(f"network.tls.{key}", f"no such file {name}; {make}")

@@ -172,7 +172,7 @@ def health(where: Where, url: str | None = None, live: bool = False, as_json: As
         raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
     if url is not None and replace(where, runs=Where.runs) != Where():
         raise ConfigError(
-            "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
+            "--url asks one machine without TLS; options that state how a whole swarm is reached exclude it"
         )
     answer = swarm_answer(ask_status(where)) if url is None else ask(url, live=live)
     return answer.show(as_json=as_json)

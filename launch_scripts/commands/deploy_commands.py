@@ -210,7 +210,7 @@ def size(
 
 def _show_size(found: Needs) -> None:
     machines = f"{found.machines:,} machine{'s' * (found.machines > 1)}"
-    table = columns("What this swarm needs", machines)
+    table = columns("Needs of this swarm", machines)
     for name, value in (
         ("cores, all machines", sum(found.cpu_cores.values())),
         *((f"  {role}", each) for role, each in found.cpu_cores.items()),

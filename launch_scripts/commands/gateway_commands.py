@@ -158,7 +158,7 @@ class Vehicle:
     signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
     """
 
-    panel: ClassVar[str | None] = "Who the vehicle is"
+    panel: ClassVar[str | None] = "Identity of the vehicle"
     id: str | None = None
     group: GroupName = "all"
     radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0

@@ -106,7 +106,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if found["authors_that_learned"]:
-        print(f"  what was learned of kinds of ground, by {len(words)} authors: swarm map learned {store}")
+        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm map learned {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
@@ -224,7 +224,7 @@ def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
         factor, error = "-" if each.factor == 1 else f"{each.factor:.2f}", f"{each.standard_error:.1%}"
         table.add_row(each.kind, f"{each.cells:,}", f"{each.authors}", f"{each.measured:.2f}", error, factor)
     Console(highlight=False).print(table)
-    print("factor -: not yet 4.5 standard errors from 1, so the prior stands")
+    print("factor -: not yet 4.5 standard errors from 1, so the prior holds")
 
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:

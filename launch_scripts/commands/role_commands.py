@@ -205,7 +205,7 @@ def run_role(
         if not found and scenario.network.tls is not None:
             # Denied messages are silent. A router of ours answers everybody that it admits, zenohd does not.
             log.warning(
-                "nobody answers, not even a router: does it admit the name in %s?", scenario.network.tls.certificate
+                "no reply, not even from a router: does it admit the name in %s?", scenario.network.tls.certificate
             )
         found = [info for info in found if info.run_id]
         id = id or _free_id(found)

@@ -123,11 +123,11 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
     looked = [f"{run} at {', '.join(at.connect)}" if run else at.connect[0] for run, at in newest_first]
     if name is not None:
         raise BusError(
-            f"run {name} does not run here: nobody listens ({'; '.join(looked) or 'it names no router'})"
+            f"run {name} does not run here: no process listens ({'; '.join(looked) or 'it names no router'})"
         )
     more = f" and {len(looked) - _NAMED} more" if len(looked) > _NAMED else ""
     raise BusError(
-        f"no swarm runs here: nobody listens at any router of the runs in {runs} or at the usual endpoint "
+        f"no swarm runs here: no process listens at any router of the runs in {runs} or at the usual endpoint "
         f"({'; '.join(looked[:_NAMED])}{more}); --connect names another"
     )
 

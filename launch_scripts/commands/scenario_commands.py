@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from swarm.config.scenario import Scenario
 
 app = typer.Typer()
-_HEAD = """A scenario of terrain-swarm, written by `swarm new`. Every setting that is not here has its default; what
-there is: docs/reference/scenario.md.
+_HEAD = """A scenario of terrain-swarm, written by `swarm new`. Every setting that is not here has its default; all
+settings: docs/reference/scenario.md.
 
-    swarm check {name}      what is wrong with it, before it runs
+    swarm check {name}      reports all mistakes before it runs
     swarm up {name}         run it; Ctrl-C ends it and leaves runs/LAST/
 """
 _AGENTS, _LEAST_PER_AGENT = 8, 25

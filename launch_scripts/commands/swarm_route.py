@@ -179,7 +179,7 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
             RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
             RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
             RouteStatus.NO_TARGET: "the planner does not know where its target is",
-            RouteStatus.SEARCHING: "nobody sees the target, and others are told first where to look: ask again",
+            RouteStatus.SEARCHING: "the target is unseen, and others get places to search first: ask again",
         }[found.status]
         typer.echo(f"{found.status.value}: {meaning}")
         return
@@ -188,7 +188,7 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
     if found.status is RouteStatus.SEARCHING:
         goal = answer.goal
         place = "where this leads" if goal is None else written(answer.frame, goal)
-        typer.echo(f"searching: nobody sees {reply.target}; {place} is a place to look at, in {found.cost_s:.1f} s")
+        typer.echo(f"searching: {reply.target} is unseen; {place} is a place to search, in {found.cost_s:.1f} s")
     else:
         typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
     rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
@@ -215,7 +215,7 @@ def _show_pose(reply: RouteReply | CostReply) -> None:
     if reply.pose_age_s is None:
         return
     if reply.tracker_lost:
-        where = f"{reply.target} is lost: nobody tracks it, and this is where it was {reply.pose_age_s:.1f} s ago"
+        where = f"{reply.target} is lost: it has no tracker, and this is its position {reply.pose_age_s:.1f} s ago"
         typer.secho(where, fg="yellow")
     else:
         typer.echo(f"pose {reply.pose_age_s:.1f} s old")

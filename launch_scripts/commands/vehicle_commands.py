@@ -119,7 +119,7 @@ def gone(name: str, where: Where) -> None:
     with _open(network, run.run_id) as bus:
         if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):
             raise BusError(f"the cells of {name} are not known to be free after {_WITHIN_S:g} s: say it again")
-    typer.echo(f"{name} is gone, and its cells are free")
+    typer.echo(f"{name} is removed, and its cells are free")
 
 
 def _members(network: NetworkConfig, where: Where) -> list[RunInfo]:

@@ -28,7 +28,7 @@ THIS_MACHINE = ("localhost", "127.0.0.1")
 _CA_DAYS = 3650
 """Ten years, the longest that a certificate may be asked for (`Days`): an authority that ends sooner would end what
 it has signed."""
-_NEW_AUTHORITY = "make an authority and all certificates anew, in another folder"
+_NEW_AUTHORITY = "make an authority and all certificates again, in another folder"
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
@@ -199,11 +199,13 @@ def check_signed(ca: Path, certificate: Path, key: Path) -> None:
     try:
         own.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
-        raise StoreError(f"{certificate} is not signed by the authority in {ca}; make it anew with both") from error
+        raise StoreError(
+            f"{certificate} is not signed by the authority in {ca}; make it again from both"
+        ) from error
     if secret.public_key() != own.public_key():
         raise StoreError(f"{key} is not the key of {certificate}")
     _check_today(authority, ca, _NEW_AUTHORITY)
-    _check_today(own, certificate, "make it anew with `swarm deploy certs FOLDER NAME --renew`")
+    _check_today(own, certificate, "make it again with `swarm deploy certs FOLDER NAME --renew`")
 
 
 def _check_today(certificate: x509.Certificate, path: Path, remedy: str) -> None:

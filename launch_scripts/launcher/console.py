@@ -240,7 +240,7 @@ class OutlivingOutput:
         except OSError as error:
             if error.errno not in _READER_GONE:
                 raise
-            log.info("nobody reads the output any more: %s", error.strerror or error)
+            log.info("the output has no reader any more: %s", error.strerror or error)
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)

@@ -279,7 +279,7 @@ class LocalSwarm:
                 continue
             elif running.hung_s is None:
                 running.hung_s = now_s
-                log.error("%s hangs: its loop stands still for %.0f s", running.spec.name, STILL_S)
+                log.error("%s hangs: its loop has not turned for %.0f s", running.spec.name, STILL_S)
                 running.send(signal.SIGABRT)
             elif now_s - running.hung_s > STOP_GRACE_S:
                 running.send(signal.SIGKILL)

@@ -102,7 +102,7 @@ class Admission:
         self._failure = ""
         if admitting == self._admitting:
             return None
-        log.warning("revoked are now: %s; opening the session anew", ", ".join(admitting.revoked) or "none")
+        log.warning("revoked names: %s; reopening the session", ", ".join(admitting.revoked) or "none")
         self._admitting = admitting
         self.bus.close()
         self.bus = self._open()

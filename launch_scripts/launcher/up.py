@@ -412,7 +412,7 @@ class _Run:
             self._terminal.say(str(error), "red")
             return error.exit_code
         if whole is None:
-            self._terminal.say("what was not written yet of the report is left, as asked", "yellow")
+            self._terminal.say("the rest of the report is left out, as requested", "yellow")
         if not self._options.as_json:
             for line in what_is_left(self._run_dir):
                 self._terminal.say(line)

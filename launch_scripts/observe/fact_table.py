@@ -108,7 +108,7 @@ def _word(value: str | None) -> str:
 FACTS: tuple[Fact[RunState], ...] = (
     Fact("elapsed_s", "time", seconds, "Time since the run began, start-up included."),
     Fact("vehicles_driven", "vehicles", of_all, "Vehicles that an agent drives, of all of the run.", of="driven"),
-    Fact("states", "of these", each, "What the vehicles do."),
+    Fact("states", "of these", each, "States of the vehicles."),
     Fact("classes", "classes", each, "The vehicles by class."),
     Fact("following", "assigned", count, "Vehicles that have a target."),
     Fact("captures", "captures", count, "How often targets were caught."),
@@ -124,7 +124,7 @@ FACTS: tuple[Fact[RunState], ...] = (
     ),
     Fact(
         "learned", "learned", factors,
-        "By what the prior pace of a class of ground is multiplied, as vehicles have measured (map.learning).",
+        "Learned factor on the prior pace of a terrain class, from measurements of vehicles (map.learning).",
     ),
     Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
     Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),
@@ -150,7 +150,7 @@ FACTS: tuple[Fact[RunState], ...] = (
 """Facts on show of a run. A new row appears everywhere."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
-    Fact("target", "target", _word, "Its id, and what is unusual about it.", of="title"),
+    Fact("target", "target", _word, "Its id, and exceptional states.", of="title"),
     Fact("chased_by", "following", count, "Vehicles that go for it.", of="following"),
     Fact("nearest_m", "nearest", distance, "Distance of the nearest vehicle."),
     Fact("captures", "captures", count, "How often it was caught."),
@@ -159,11 +159,11 @@ TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
         "How far above the optimum the routes to it can be at most, in the mean.", of="gap",
     ),
     Fact("re_plans", "re-plans", count, "How often its tree was grown or repaired.", of="growths"),
-    Fact("growth_ms", "tree", duration, "What growing its whole tree took."),
+    Fact("growth_ms", "tree", duration, "CPU time of the last full search."),
     Fact("routes_served", "served", count, "Routes given to it.", always=False),
     Fact("strategy", "strategy", _word, "How its tree is kept.", always=False),
     Fact("pose_age_s", "seen", seconds, "Time since its last pose.", always=False),
-    Fact("tracker", "tracker", _word, "Who tells where it is.", always=False),
+    Fact("tracker", "tracker", _word, "Tracker of the target.", always=False),
 )  # fmt: skip
 """Facts on show of each target, the most important first: a narrow panel cuts off the end."""
 

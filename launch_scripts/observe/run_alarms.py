@@ -172,7 +172,7 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
     for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
-        yield _of_process("silent", role, id, "is there, but tells nothing", _said_ns(latest, role, id, heard_ns))
+        yield _of_process("silent", role, id, "is alive, but silent", _said_ns(latest, role, id, heard_ns))
 
 
 def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:

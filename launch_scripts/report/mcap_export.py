@@ -69,7 +69,7 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     lines = lines_of(report, folder / REPORT_FILE, tracks.began_ns, tracks.captures)
     run = folder.resolve().name
     if not any(len(each.time_ns) for each in (*tracks.vehicles, *tracks.targets)):
-        raise ConfigError(f"{folder} has no tracks: nothing was heard of vehicles and targets")
+        raise ConfigError(f"{folder} has no tracks: no messages about vehicles and targets")
     (path,) = free_places(folder, [f"{run}.mcap"], out, force)
     types = types_of(Distribution.JAZZY)
     timeline = _Timeline(RosMessages(types, RosMap(tracks.grid)), tracks, ground, _colours(report))

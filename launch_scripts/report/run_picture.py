@@ -336,7 +336,7 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
     times = (
         ("growth_ms", "growth of a tree, p50", "All cheapest paths to one target"),
         ("route_query_ms", "route query, p50", "From a vehicle's question to the answer"),
-        ("mark_to_tree_ms", "mark to tree, p50", "From what a sensor sees to a tree's cost"),
+        ("mark_to_tree_ms", "mark to tree, p50", "From a sensor's view to a tree's cost"),
     )
 
     def of_facts(*names: str, tone: Callable[[Any], str] = lambda value: "") -> list[Card]:
@@ -351,7 +351,7 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
             Card(label, duration(report[name]["p50"]), f"{meaning}; p99 {duration(report[name]['p99'])}.")
             for name, label, meaning in times
         ),
-        Card("messages/s, mean", count(report["messages_per_s"]), "Of all processes, over the whole run."),
+        Card("messages/s, mean", count(report["messages_per_s"]), "Sums over all processes and the whole run."),
         *of_facts("collisions", "lethal_entries", tone=lambda value: {None: "", 0: "good"}.get(value, "bad")),
     ]
 

@@ -149,11 +149,11 @@ def _ms(value: float) -> str:
 
 
 PLOTS = (
-    Plot("states", "Vehicles", "What the vehicles were doing.",
+    Plot("states", "Vehicles", "States of the vehicles.",
          {state.name.lower(): (state.name.lower(), colour) for state, colour in palette.STATE_COLOURS.items()},
          _states),
     Plot("captures", "Captures", "Captures of all targets.", {"captures": ("captures", palette.GREEN)}, _courses),
-    Plot("marks", "Marks", "What vehicles found that the map did not know.",
+    Plot("marks", "Marks", "Hazards found by vehicles.",
          {"marks": ("marks", palette.VIOLET)}, _courses),
     Plot("gaps", "Certified gap",
          "How far above the optimum the routes that vehicles began can be at most: each comes with a proven lower "
@@ -165,7 +165,7 @@ PLOTS = (
          _courses),
     Plot("growing", "Growing a tree", "Time of the last growth of a tree, mean over targets.",
          {"growth_ms_mean": ("growth", palette.GREEN)}, _courses, tick=_ms, least=1e-3),
-    Plot("messages", "Messages per second", "Of all processes together.",
+    Plot("messages", "Messages per second", "Sum over all processes.",
          {"messages_per_s": ("messages", palette.BLUE)}, _courses),
     Plot("shares", "Routes within a gap",
          "Share of the routes that are proven to be at most so far above the optimum.",

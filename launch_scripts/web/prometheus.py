@@ -173,7 +173,7 @@ def named(wire: str) -> tuple[str, float, str]:
     while word.endswith(_TAKEN):
         word = word.rpartition("_")[0]
     word = word or "unnamed"
-    return f"{word}{ending}", worth, HELP.get(wire, f"What processes count as {word}")
+    return f"{word}{ending}", worth, HELP.get(wire, f"Sum over processes of {word}")
 
 
 def _buckets(buckets: Mapping[int, int], worth: float) -> tuple[list[tuple[str, float]], float]:

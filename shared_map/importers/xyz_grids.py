@@ -167,7 +167,7 @@ def _bad_line(
             return TerrainError(
                 f"terrain {path} is ragged: line {number} has {widths[-1]} heights, others {widths[0]}"
             )
-    return TerrainError(f"terrain {path} holds what are no numbers")
+    return TerrainError(f"terrain {path} holds text that is not a number")
 
 
 def _heights(numbers: Points) -> Floats:

@@ -141,7 +141,7 @@ def _set(each: _Set, grid: GridSpec) -> MarkSet:
     if each.tile == beyond_tile(grid):
         return _word(each)
     if each.learned:
-        raise ValueError(f"what is learned belongs to tile {beyond_tile(grid)}, not to tile {each.tile}")
+        raise ValueError(f"learned factors belong to tile {beyond_tile(grid)}, not to tile {each.tile}")
     marks = sorted(each.marks, key=lambda mark: (mark.row, mark.col))
     for mark in marks:
         if not grid.inside(mark.row, mark.col):
@@ -167,13 +167,13 @@ def _set(each: _Set, grid: GridSpec) -> MarkSet:
 def _word(each: _Set) -> MarkSet:
     said = {one.key: Measurement(one.cells, one.mean, one.variance) for one in each.learned}
     if each.marks or len(said) < len(each.learned):
-        raise ValueError(f"tile {each.tile} holds what is learned, each kind of ground once, and no marks")
+        raise ValueError(f"tile {each.tile} holds learned factors, each terrain class once, and no marks")
     made = mark_set(
         each.author, each.group, each.tile, each.epoch, each.seq, Statements(*columns_of(said, each.stamp_ns))
     )
     made.check()
     if is_zone(each.author) or measurements_in(made) != said:
-        raise ValueError("what is learned is not as an author says it")
+        raise ValueError("a learned factor is not in the form of an author")
     return made
 
 

@@ -311,7 +311,7 @@ def fetch_kept(key: str, into: Path) -> bool:
             _link(folder / name, into / name)
         os.utime(folder)
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        log.warning("the kept terrain %s is damaged (%s): making it anew", folder, error)
+        log.warning("the kept terrain %s is damaged (%s): rebuilding it", folder, error)
         shutil.rmtree(folder, ignore_errors=True)
         return False
     return True

@@ -76,7 +76,7 @@ class ZoneFacts:
             parts.append(f"left out: {', '.join(left_out)}")
         if file.mended:
             shown = ", ".join(file.mended[:5]) + (" ..." if len(file.mended) > 5 else "")
-            parts.append(f"{len(file.mended)} that cross themselves were mended: feature {shown}")
+            parts.append(f"{len(file.mended)} that cross themselves were repaired: feature {shown}")
         return "; ".join(parts)
 
     def as_json(self, cells: int) -> dict[str, Any]:

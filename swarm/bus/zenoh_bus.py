@@ -434,7 +434,7 @@ class ZenohBus:
             try:
                 for item in iter(take, None):
                     arrive(item)
-                raise BusError(f"{name} hears nothing more")
+                raise BusError(f"{name} receives no more messages")
             except (BusError, zenoh.ZError):
                 if not self.closed and entity in self._entities:
                     raise  # it has ended by itself

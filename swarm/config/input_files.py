@@ -164,7 +164,7 @@ _TOML_FAULTS = {
     "Illegal character '\\n'": "a quote is missing at the end",
     "Unterminated string": "a quote is missing at the end",
     "Cannot overwrite a value": "a key is set twice, or a value would be a table",
-    "Cannot declare": "a section stands twice: put all of its keys below one",
+    "Cannot declare": "a section occurs twice: put all of its keys below one",
     "Expected newline or end of document": "nothing may follow a value; units are in the keys' names",
     "Unclosed": "a bracket that is opened is not closed before the end of the file",
     "Expected '=' after a key": "expected KEY = VALUE or [SECTION]",

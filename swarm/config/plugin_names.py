@@ -49,7 +49,7 @@ _KINDS = (
     PluginKind(
         "sensor", "agent", get_args(Sensor), "look", "this agent's vehicles see only the cells next to them now"
     ),
-    PluginKind("walk", "targets", get_args(Walk), "choose", "the target stands still now"),
+    PluginKind("walk", "targets", get_args(Walk), "choose", "the target stays at rest now"),
     PluginKind("cost_layer", "any", (), "cost", "there is no map without it", call_s=300.0),
     PluginKind("assignment", "agent", get_args(Assigner), "assign", "this agent spreads its vehicles evenly now"),
     PluginKind("strategy", "planner", get_args(Strategy), "row", "this planner keeps exact trees now"),

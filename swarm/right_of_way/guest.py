@@ -103,7 +103,7 @@ class Guest:
         held = self.cells
         if not held or not path or path[0] != held[0]:
             where = f"cell {held[0]}" if held else "no cell"
-            raise ValueError(f"the path must begin where the vehicle stands: it holds {where}")
+            raise ValueError(f"the path must begin at the vehicle's cell: it holds {where}")
         for tail, head in pairwise(path):
             if self.plots.of(head) < 0 or not self.plots.adjacent(tail, head):
                 raise ValueError(f"cell {head} of the path is not next to cell {tail}")

@@ -409,7 +409,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                     removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
                 if not removal.known:
-                    raise ConfigError(f"no agent has ever heard of a guest {name!r}")
+                    raise ConfigError(f"no agent knows a guest {name!r}")
                 removal.begin(secrets.randbits(32))
                 begun = True
             case AskEnded() if not begun:

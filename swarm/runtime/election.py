@@ -191,7 +191,7 @@ class Candidacy:
         """States to people that another leads from now on. Without standbys there is nothing to say."""
         if not self._standbys:
             return
-        text = "leads from now on" if self.leads else "stands by from now on"
+        text = "leads from now on" if self.leads else "is a standby from now on"
         log.info("%s", text)
         member.note(now_ns, "leader", text)
 

@@ -287,7 +287,7 @@ def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_
 
     def watch() -> None:
         parent_gone()
-        log.warning("the launcher is gone: stopping")
+        log.warning("the launcher has ended: stopping")
         stop()
         threading.Event().wait(grace_s)
         os._exit(1)

@@ -193,7 +193,7 @@ FLEET = Topic(
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", vehicles.Chasers,
     "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
-    "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
+    "when a vehicle takes or leaves the target or has driven past the published cell; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
 )  # fmt: skip
 SHARED_COSTS = Topic(
@@ -234,7 +234,7 @@ KNOWN = Topic(
 )  # fmt: skip
 LEAVE = Topic(
     "leave", "leave/{agent}", vehicles.Removed,
-    "which vehicles have left, for an operator who asks an agent to let them", "asked",
+    "vehicles that have left, for an operator who asked an agent to remove them", "asked",
     access(serve="agent:agent"),
     request=vehicles.RemoveVehicles, published=False, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
@@ -257,7 +257,7 @@ POSE = Topic(
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", planning.TargetPose,
-    "where a target is that nobody tracks: for simulated sensors, not for planners", "as poses",
+    "position of an untracked target: for simulated sensors, not for planners", "as poses",
     access(put="targets", hear="agent targets"),
 )  # fmt: skip
 SIGHTED = Topic(
@@ -312,7 +312,7 @@ GIVE_ORDER = Topic(
 )  # fmt: skip
 ORDERS = Topic(
     "orders", "orders/{role}/{id}", orders.Orders,
-    "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
+    "orders in force: of keepers, and of all processes to a starting one without a keeper", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
     request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip

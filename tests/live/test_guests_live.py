@@ -159,7 +159,7 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
     assert (gone.returncode, gone.stderr) == (0, ""), gone
     unknown = swarm("vehicle", "gone", "nobody", *where)
     assert unknown.returncode == 2
-    assert "no agent has ever heard of a guest 'nobody'" in unknown.stderr
+    assert "no agent knows a guest 'nobody'" in unknown.stderr
     for options, sentence in (
         (("--group", "none"), "has no group 'none'"),
         (("--id", "a0"), "has an agent 'a0' itself"),

@@ -125,7 +125,7 @@ class Adapter:
     def hear_swarm(self, up: bool) -> None:
         """Takes in whether the swarm can be heard."""
         if up != self._swarm_up:
-            lost = "the swarm is not heard: its routes are followed no more"
+            lost = "the swarm is silent: its routes are followed no more"
             self._tells.append("the swarm is back" if up else lost)
         self._swarm_up = up
 

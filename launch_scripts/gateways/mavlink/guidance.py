@@ -82,7 +82,7 @@ def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Guide | str:
     height_m = wishes.altitude_m if flies(kind, wishes.altitude_m) else None
     if flies(kind, wishes.altitude_m):
         if height_m is None:
-            return "it flies, and nobody says how high: give --altitude M, as the swarm tells no heights"
+            return "it flies without an altitude: give --altitude M, as the swarm publishes no heights"
         if wishes.above == "terrain" and kind.make != ARDUPILOT:
             return f"{kind.name} takes no heights above terrain: give --above home"
     above = codec.ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else codec.ABOVE_HOME

@@ -283,7 +283,7 @@ class Gateway:
     def _refuse(self, who: str, why: str) -> None:
         if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
-            self._problems.append(f"{who} is not told to ROS: {why}")
+            self._problems.append(f"{who} is not published to ROS: {why}")
 
     def _channels(self, per: str, name: str) -> tuple[Channel, ...]:
         return tuple(self._channel(row.name, name) for row in self._rows.values() if row.per == per)

@@ -116,7 +116,7 @@ class _Run:
         for side, up in (("swarm", self._swarm.connected), ("ROS", self._node.connected)):
             if up != self._up[side]:
                 self._up[side] = up
-                self._say(f"the {side} router {'is back' if up else 'is gone: waiting for it'}")
+                self._say(f"the {side} router {'is back' if up else 'is disconnected: waiting for it'}")
         robots = () if self._incoming is None else self._incoming.robots
         now_ns, stamp_ns, swarm_now_ns = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
         for action in self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots):

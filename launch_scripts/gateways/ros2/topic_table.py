@@ -69,13 +69,13 @@ TABLE: tuple[TopicRow, ...] = (
     TopicRow("poses", "/swarm/poses", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
              "Poses of all vehicles, in order of their ids."),
     TopicRow("targets", "/targets", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
-             "Poses of all targets that somebody tracks, in order of their ids."),
+             "Poses of all tracked targets, in order of their ids."),
     TopicRow("target_pose", "/targets/{target}/pose", "geometry_msgs/msg/PoseStamped", Qos.DEFAULT, _OUT, 5.0,
-             "Pose of a target, while somebody tracks it."),
+             "Pose of a target, while it is tracked."),
     TopicRow("markers", "/swarm/markers", "visualization_msgs/msg/MarkerArray", Qos.LATCHED, _OUT, 1.0,
              "For RViz: routes, marked cells, zones, windows of the map that have just changed."),
     TopicRow("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Qos.DEFAULT, _OUT, 1.0,
-             "How many vehicles are in which state, targets, links, what was dropped."),
+             "Number of vehicles per state, targets, links, dropped messages."),
 )  # fmt: skip
 ROWS = {row.name: row for row in TABLE}
 FRAMES = ("tf", "tf_static")
@@ -91,7 +91,7 @@ ROBOT_TABLE: tuple[TopicRow, ...] = (
     TopicRow("robot_goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _OUT, None,
              "Where the target is that a robot without a goal follows, when its cell changes."),
     TopicRow("certificate", "/{robot}/plan_certificate", "diagnostic_msgs/msg/DiagnosticStatus", Qos.LATCHED, _OUT,
-             None, "What each plan takes and what no route is below; or why there is none."),
+             None, "Cost of each plan and its lower bound; or the reason why there is none."),
     TopicRow("get_plan", "/{robot}/get_plan", "nav_msgs/srv/GetPlan", Qos.DEFAULT, _SERVICE, None,
              "A route to a place or a target."),
 )  # fmt: skip

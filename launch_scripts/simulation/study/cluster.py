@@ -102,7 +102,7 @@ def run_trials(client: Client, trials: Iterable[Trial]) -> Iterator[tuple[Trial,
             result = None
         except FutureCancelledError as error:
             raise BusError(
-                "the scheduler of Dask is gone: results so far are kept, start again to go on"
+                "the scheduler of Dask has ended: results so far are kept, start again to go on"
             ) from error
         yield trial, result
         del future  # so that the cluster forgets it

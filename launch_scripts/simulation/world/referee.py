@@ -75,7 +75,7 @@ class BodyHit:
             return f"{self.vehicle} drove into body {self.body}, which had closed the cell for {self.said_s:.1f} s"
         if self.said_s < 0.0:
             return f"body {self.body} drove into {self.vehicle}, which was there first"
-        return f"body {self.body} met {self.vehicle}, {self.said_s:.2f} s after it first told of the cell"
+        return f"body {self.body} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
 
 
 Broken = Collision | LethalEntry | BodyHit

@@ -320,7 +320,7 @@ def outlines_of(
     for shift, box in placing.boxes(found.bounds):
         shapes = placing.place(read_features(found, box, ()), box, shift)
         for id, why in shapes.unusable.items():
-            raise TerrainError(f"{what}: feature {id} cannot be used: {why}; mend or remove it")
+            raise TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
         areas.append(shapes.shapes[shapely.get_type_id(shapes.shapes) == 3])
     parts = shapely.get_parts(shapely.union_all(np.concatenate(areas)))
     parts = parts[shapely.area(parts) > 0] if len(parts) else parts

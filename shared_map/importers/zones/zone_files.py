@@ -170,7 +170,7 @@ class _Worth:
         for id, why in placed.unusable.items():
             if zone.kind in ("forbidden", "water"):
                 of = f"{self._layer.what}: feature {id} of a {zone.kind} zone"
-                raise TerrainError(f"{of} cannot be used: {why}; mend or remove it")
+                raise TerrainError(f"{of} cannot be used: {why}; repair or remove it")
             facts.skip(why, id)
         ways = {}
         for n in sorted(set(placed.of.tolist())):

@@ -59,7 +59,7 @@ def test_a_body_that_drives_into_a_vehicle_is_at_fault() -> None:
 def test_a_vehicle_that_enters_where_a_body_has_just_come_had_no_time() -> None:
     (hit,) = judged(*on(50, 1000, 4), *on(1050, 2000, 5), *standing(900, 2000, 5.5))
     assert not hit.by_vehicle
-    assert hit.sentence == "body r1 met a, 0.15 s after it first told of the cell"
+    assert hit.sentence == "body r1 met a, 0.15 s after its first report of the cell"
 
 
 def test_a_vehicle_that_crosses_the_way_on_which_a_body_comes_is_at_fault() -> None:

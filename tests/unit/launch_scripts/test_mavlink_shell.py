@@ -118,7 +118,7 @@ def test_a_cut_from_the_swarm_ends_setpoints_until_it_is_over() -> None:
     rig.world.run(0.1)
     rig.turns(0.3)
     assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) > before
-    assert rig.told[-2:] == ["the swarm is not heard: its routes are followed no more", "the swarm is back"]
+    assert rig.told[-2:] == ["the swarm is silent: its routes are followed no more", "the swarm is back"]
 
 
 def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:

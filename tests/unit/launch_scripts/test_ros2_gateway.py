@@ -182,7 +182,7 @@ def test_a_vehicle_that_leaves_takes_its_topics_along_and_frees_its_name() -> No
     core = gateway()
     both = World({"a-1": vehicle("a-1"), "a_1": vehicle("a_1")})
     told(core, both, 0.0)
-    assert core.take_problems() == ["vehicle a_1 is not told to ROS: a-1 is called a_1, too"]
+    assert core.take_problems() == ["vehicle a_1 is not published to ROS: a-1 is called a_1, too"]
     actions = told(core, World({"a_1": vehicle("a_1")}), 0.2)
     (removed,) = [each.channels for each in actions if isinstance(each, Remove)]
     (declared,) = [each.channels for each in actions if isinstance(each, Declare)]
@@ -246,7 +246,7 @@ def test_robots_of_ros_and_more_vehicles_than_there_may_be_are_not_told(monkeypa
     assert [each.channel.topic for each in actions if isinstance(each, Put) and each.channel.row == "odom"] == [
         "/a/odom"
     ]
-    assert core.take_problems() == ["vehicle b is not told to ROS: there are 1 already"]
+    assert core.take_problems() == ["vehicle b is not published to ROS: there are 1 already"]
 
 
 def test_a_plan_is_put_when_it_is_new_and_at_most_once_a_second() -> None:

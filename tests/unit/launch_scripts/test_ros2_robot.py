@@ -148,7 +148,7 @@ def test_a_planner_is_asked_until_it_goes_by_the_goal_and_no_longer_than_anybody
     found: Any = routes._find("goal0", 7, Place(0.0, 0.0), "ground")
     assert found.target_cell == 7
     why = routes._find("goal0", 8, Place(0.0, 0.0), "ground")
-    assert why == "the planner of goal0 finds no way to the goal: nobody may stand there"
+    assert why == "the planner of goal0 finds no path to the goal: no vehicle may be there"
 
 
 # --- areas, and whose topics are robots' --------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def test_a_target_that_moves_faster_than_anything_is_followed_counted_and_said_o
         here.tick()
     assert here.watch.pose is not None
     assert here.watch.pose.cell == 0
-    assert here.sentences() == ["target t0: tracker radar moved it by 347 m in 0.1 s and told no jump"]
+    assert here.sentences() == ["target t0: tracker radar moved it by 347 m in 0.1 s without reporting a jump"]
     assert here.counted() == {"poses_teleported": 5}
 
 
@@ -156,9 +156,9 @@ def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
     ]  # fmt: skip
     assert here.sentences() == [
         "target t0: tracker radar has been silent for longer than its lease of 2 s; " + LEADS,
-        "target t0: tracker radar tracks it again, after 2.5 s in which nobody knew where it was",
-        "target t0: tracker radar has handed it over, and nobody else tracks it; " + LEADS,
-        "target t0: tracker camera tracks it again, after 0.3 s in which nobody knew where it was",
+        "target t0: tracker radar tracks it again, after 2.5 s without a known position",
+        "target t0: tracker radar has handed it over, and there is no other tracker; " + LEADS,
+        "target t0: tracker camera tracks it again, after 0.3 s without a known position",
         "target t0: tracker camera tracks it now, before that tracker radar did",
     ]
     assert here.counted() == {"trackers_lost": 2}

@@ -111,7 +111,7 @@ class PlaceRoutes:
             else:
                 if cell in (None, route.target_cell):
                     return route
-                why = f"the planner of {target} finds no way to the goal: nobody may stand there"
+                why = f"the planner of {target} finds no path to the goal: no vehicle may be there"
             if time.monotonic() >= until_s:
                 return why
             asked += 1

@@ -131,7 +131,7 @@ class Robot:
     def _leave(self) -> None:
         self._end_goal()
         if self._vehicle is not None:
-            log.info("robot %s of ROS is no vehicle any more: nothing is heard on %s", self.id, self.topic)
+            log.info("robot %s of ROS is no vehicle any more: no messages on %s", self.id, self.topic)
             self._vehicle.leave()
             self._vehicle = None
 
