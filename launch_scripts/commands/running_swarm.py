@@ -141,11 +141,9 @@ def _network_of(folder: Path) -> NetworkConfig | None:
     from swarm.config.scenario import NetworkConfig
     from swarm.errors import SwarmError
 
-    if run_facts(folder).get("simulated"):
-        return None
     try:
         raw = tomllib.loads(read_text(folder / SCENARIO_FILE, FileKind.SCENARIO)).get("network", {})
-        return msgspec.convert(raw, NetworkConfig)
+        return None if run_facts(folder).get("simulated") else msgspec.convert(raw, NetworkConfig)
     except (OSError, ValueError, SwarmError, msgspec.ValidationError):
         return None
 

@@ -83,6 +83,7 @@ def _simulate_once(
     """Runs a scenario without faults, prints its report and leaves a run's folder in `runs`."""
     import msgspec
 
+    from launch_scripts.check.scenario_check import check_places
     from launch_scripts.launcher.console import Terminal
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
@@ -104,7 +105,9 @@ def _simulate_once(
             seed=scenario.seed if seed is None else seed,
             seconds=scenario.seconds if seconds is None else seconds,
         )
-        done = Simulation(scenario, trace=log)  # before the folder: a scenario without its terrain leaves none
+        # Before the folder is made: a scenario without its terrain or without places for its vehicles leaves none.
+        done = Simulation(scenario, trace=log)
+        check_places(scenario, done.terrain, done.truth)
         folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")

@@ -164,7 +164,8 @@ def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Pa
 
 
 def _unwritable(path: Path, out: Path, error: OSError) -> StoreError:
-    return StoreError(f"cannot write {path}: {error.filename or out}: {error.strerror or error}")
+    where = "" if error.filename == str(path) else f"{error.filename or out}: "
+    return StoreError(f"cannot write {path}: {where}{error.strerror or error}")
 
 
 def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:

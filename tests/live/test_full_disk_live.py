@@ -29,7 +29,7 @@ def test_where_nothing_more_can_be_written_the_swarm_goes_on_and_says_so(tmp_pat
     (run_dir,) = folders_of_runs(tmp_path / "runs")
     assert told.returncode == 6, told.stdout + told.stderr
     assert told.stderr == ""
-    assert "8/8 processes, 0 restarts" in told.stdout
+    assert "processes 6 of 6, restarts 0" in told.stdout
     recording = run_dir / "run.rrd"
     assert f"monitor-0: the recording {recording} has ended: File too large" in told.stdout
     lines = [" ".join(line.split()) for line in told.stdout.splitlines()]
