@@ -8,8 +8,7 @@ import msgspec
 import pytest
 from support.makers import target_pose
 
-from planner_service.planner_actions import Tell
-from planner_service.target_watch import TargetWatch
+from planner_service.target_watch import TargetWatch, Tell
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
@@ -37,7 +36,7 @@ class Watch:
         cell = GRID.cell(row, col)
         told = {"tracker": tracker, "incarnation": START_NS, "seq": self.seq, "stamp_ns": self.now_ns}
         pose = target_pose("t0", cell, GRID, **told)
-        self.watch.watch_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
+        self.watch.on_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
@@ -180,7 +179,7 @@ def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> 
 
 def test_a_standby_counts_nothing() -> None:
     here = Watch()
-    here.watch.counts = False
+    here.watch.leads = False
     here.hear(cell=GRID.cells)
     assert here.counted() == {}
 
