@@ -104,7 +104,7 @@ class TargetWatch:
             self._found("a vehicle sees it", now_ns)
 
     def drain(self, now_ns: int) -> list[Tell]:
-        """What people should know, since the last call."""
+        """Returns the sentences for operators that are new, none on a standby."""
         if not self._lost and self._tracking.lost(now_ns):
             self._lose(now_ns)
         told, self._to_tell = self._to_tell, []
