@@ -1,7 +1,7 @@
 """Cost map to tree to route: one process per target.
 
-What a planner promises: every route that it gives leads over passable cells of the map as it knows it, and states a
-proven lower bound of what any route costs. How it keeps to that, step by step:
+Every route of a planner leads over passable cells of the map as the planner knows it. It states a proven lower
+bound of the cost of any route. The planner ensures this in six steps:
 
 1. *Map.* Marks come in by replication; the cost map says which windows have changed (`service`, `planner`).
 2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
@@ -11,10 +11,26 @@ proven lower bound of what any route costs. How it keeps to that, step by step:
    that takes too long for the thread that answers, a worker grows the whole tree. `target_tree.Decision` is what
    was decided, by the row of the strategy (`strategy`) and by what growths have taken (`growth_times`).
 5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
-   with the map, and the last window adds its rim (`tree.certificates`, docs/certificates.md).
-6. *Push.* Followers whose route passes a change, or begins in what was grown, are pushed another one if it is news.
+   with the map, and the last window adds its rim (`tree.route_bounds`, docs/certificates.md).
+6. *Push.* A follower is pushed another route if its route passes a change or begins in a grown part, and the
+   other differs.
 
-What a planner is doing, and what changes that:
+The walk from a pose to a pushed route. `PlannerService.tick` calls steps 1, 4 and 10; each other step is called by
+an earlier one. Values are returned; no step calls back. The bus and the codec precede step 1.
+
+1. `service.py`: `_take_collected` takes the poses since the last tick from the bus.
+2. `target_watch.py`: `TargetWatch.on_pose` stores the pose if it counts, and reports oddities.
+3. `swarm/runtime/tracking.py`: `Tracking.judge` decides if the pose's tracker owns the target.
+4. `planner.py`: `Planner.tick` compares the target's cell and the map's version with those of the tree.
+5. `target_tree.py`: `TargetTree.update` repairs the tree and decides by the strategy how to reach the new cell.
+6. `tree/cost_to_go.py`: `CostToGoTree.move` grows a window with the kernels. A large exact tree uses
+   `tree/partitioned_tree.py` instead.
+7. `followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects those to push now.
+8. `tree/route_bounds.py`: `read_routes` reads their new routes with proven bounds.
+9. `pulled_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
+10. `service.py`: `_perform` publishes each `PushedRoute`.
+
+The states of a planner:
 
 ============  ==============================================  =====================================================
 state         what it answers                                 what ends it

@@ -33,7 +33,6 @@ from swarm.wire.messages.planning import (
     PushedRoute,
     RouteReply,
     RouteRequest,
-    TargetPose,
 )
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
@@ -61,22 +60,23 @@ SEARCH_COUNTS = ("searches", "search_places")
 class Planner:
     """Keeps the tree of one target, and answers from it.
 
-    Poses and map changes are taken in once per tick, however many there were; at most one full growth is under
-    way, and what changes meanwhile is made up for when it is adopted. Before the first tree all routes are
+    Each tick applies the newest pose and all map changes at once. At most one full growth is under way. Changes
+    that arrive meanwhile are applied when it is adopted. Before the first tree all routes are
     NO_TARGET. The cost map belongs to the caller, which applies marks to it between calls.
 
+    watch           position of the target, kept by the caller. The planners of all classes share it
     stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
     shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
-    time_scale      seconds on the terrain per second: by it a target is taken for teleported
     vehicle_class   whose routes these are: what the cost map is for
+    began_ns        when it was made: the age of a pose which arrived earlier is counted from then
     target_search   for the time in which nobody sees the target. All classes share it
     """
 
     def __init__(
         self,
-        target: str,
+        watch: TargetWatch,
         incarnation: int,
         config: PlannerConfig,
         tree: TargetTree,
@@ -88,11 +88,11 @@ class Planner:
         newest_mark_ns: Callable[[], int | None] = lambda: None,
         shelf: StrideShelf | None = None,
         leads: bool = True,
-        time_scale: float = 1.0,
         target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
+        began_ns: int = 0,
     ) -> None:
-        self.target = target
+        self.target = watch.target
         self.vehicle_class = vehicle_class
         self.leads = leads
         self.tree = tree
@@ -105,11 +105,9 @@ class Planner:
         self._newest_mark_ns = newest_mark_ns
         self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
-        self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        self.followers = Followers(watch.target, self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
-        # Where the target is; the tick takes it in.
-        self._watch = TargetWatch(target, self._grid, counters, time_scale)
-        self._watch.counts = leads
+        self._watch, self._began_ns = watch, began_ns
         # (target cell, map version) that the tree was last told.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
@@ -146,7 +144,7 @@ class Planner:
     def lead(self, leads: bool) -> None:
         """Takes over, or leave it to another. A planner that takes over does not know which routes followers have:
         it pushes one to each."""
-        self.leads = self._watch.counts = leads
+        self.leads = leads
         if leads:
             self.followers.forget_routes()
 
@@ -154,19 +152,6 @@ class Planner:
         """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
         self._push_ns = int(push_s * NS_PER_S)
         self.tree.times.set_budget(cpu_budget)
-
-    def is_lost(self, now_ns: int) -> bool:
-        """True if the target was tracked once and is not tracked now."""
-        return self._watch.lost(now_ns)
-
-    def on_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Notes where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
-        if pose.target == self.target:
-            self._watch.watch_pose(pose, now_ns)
-
-    def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
-        """Notes where the target is, by the best sighting of it: sightings are ordered before they come here."""
-        self._watch.on_sighting(pose, now_ns)
 
     def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
         """Notes which vehicles of an agent chase this target, and from where."""
@@ -199,9 +184,7 @@ class Planner:
         if self.tree.ready and self.tree.wants_strides:
             actions.append(FindStrides(self.tree.stride_job(self._shelf)))
         self.followers.drop_silent(now_ns)
-        told = self._watch.drain(now_ns)
         if self.leads:
-            actions.extend(told)
             actions.extend(self._pushes(now_ns))
             if self.target_search is not None and self.vehicle_class == GROUND:
                 believed = self.target_search.belief_message(self.target, self._incarnation, now_ns)
@@ -466,7 +449,7 @@ class Planner:
             "incarnation": self._incarnation,
             "map_version": max(self.tree.map_version, 0),
             "tree_age_ms": self._age_ms(now_ns),
-            "pose_age_s": self._watch.age_s(now_ns),
+            "pose_age_s": self._watch.age_s(now_ns, self._began_ns),
             "tracker_lost": self._watch.lost(now_ns),
         }
 

@@ -129,14 +129,5 @@ class FindStrides:
     search: StrideSearch
 
 
-@dataclass(frozen=True, slots=True)
-class Tell:
-    """A sentence for people who watch the run; `cell` is where, if anywhere."""
-
-    kind: str
-    text: str
-    cell: int | None = None
-
-
-Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Believed | Tell
+Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Believed
 """What a planner wants done: a growth run, networks of strides found, a message published."""

@@ -10,11 +10,12 @@ from functools import partial
 import msgspec
 
 from planner_service.planner import Answer, Planner
-from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal, Tell
+from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
+from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
@@ -98,14 +99,13 @@ class PlannerService:
         self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         # Where the target is.
+        self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._presence = Presence(_PRESENCE_NS, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
         self._listens = False
         """Whether vehicles tell where they are and what they see."""
-        self._pose: TargetPose | None = None
-        """The newest that a tracker told, for the planner of a class that is made later."""
         # The planners, one of each class that somebody asks for.
         self._faults: list[str] = []
         """What the strategy's plug-in did wrong and nobody has been told yet."""
@@ -147,11 +147,11 @@ class PlannerService:
             stopwatch=self._stopwatch or (lambda: 0),
         )
 
-    def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree) -> Planner:
+    def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree, began_ns: int = 0) -> Planner:
         """The planner of a class. Stamps of marks and what other processes share are told to that of "ground"."""
         scenario, is_ground = self._scenario, name == GROUND
         return Planner(
-            self._target,
+            self._watch,
             self._incarnation,
             scenario.planner,
             tree,
@@ -162,21 +162,17 @@ class PlannerService:
             newest_mark_ns=self._replica.take_newest_stamp_ns if is_ground else lambda: None,
             shelf=self._prepared if is_ground else None,
             leads=False,
-            time_scale=scenario.time_scale,
             target_search=self._search,
             vehicle_class=name,
+            began_ns=began_ns,
         )
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
         cost_map = self._maps.of[name]
-        planner = self._new_planner(name, cost_map, self._new_tree(cost_map))
+        planner = self._new_planner(name, cost_map, self._new_tree(cost_map), now_ns)
         planner.lead(self._planner.leads)
         self._pace(planner)
-        if self._pose is not None:
-            planner.on_pose(self._pose, now_ns)
-        for seen in self._sightings.best(now_ns).values():
-            planner.on_sighting(pose_of(seen), now_ns)
         log.info("target %s: a tree for the class %s", self._target, name)
         return planner
 
@@ -241,6 +237,9 @@ class PlannerService:
         self._take_fleet(now_ns)
         self._obey()
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
+        for told in self._watch.drain(now_ns):
+            log.info("%s: %s", told.kind, told.text)
+            self._member.note(now_ns, told.kind, told.text, told.cell)
         self._planners.drop_unused(now_ns)
         for _, planner in self._planners:
             self._perform(planner, planner.tick(now_ns), now_ns)
@@ -259,9 +258,7 @@ class PlannerService:
     def _take_collected(self, now_ns: int) -> None:
         for heard in self._bus.collected(POSE):
             assert isinstance(heard.message, TargetPose)
-            self._pose = heard.message
-            for _, planner in self._planners:
-                planner.on_pose(heard.message, now_ns)
+            self._watch.on_pose(heard.message, now_ns)
         for heard in self._bus.collected(CHASERS):
             assert isinstance(heard.message, Chasers)
             name = heard.message.vehicle_class
@@ -282,8 +279,7 @@ class PlannerService:
             return  # a tracker knows better
         seen = self._sightings.best(now_ns)
         for each in seen.values():
-            for _, planner in self._planners:
-                planner.on_sighting(pose_of(each), now_ns)
+            self._watch.on_sighting(pose_of(each), now_ns)
         if not seen and 0 <= sighted.cell < self._cost_map.grid.cells:
             self._search.remember(sighted, now_ns)
 
@@ -300,7 +296,7 @@ class PlannerService:
     def _take_fleet(self, now_ns: int) -> None:
         """Takes in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
         if self._search.tracked:
-            self._listen(self._planner.is_lost(now_ns))
+            self._listen(self._watch.lost(now_ns))
         if not self._listens:
             return
         for heard in self._bus.collected(FLEET):
@@ -396,6 +392,7 @@ class PlannerService:
         """Serves the target, or leave that to another. A query which comes meanwhile is answered all the same."""
         if leads == self._planner.leads:
             return
+        self._watch.leads = leads
         for _, planner in self._planners:
             planner.lead(leads)
         for topic in (ROUTE, COST):
@@ -419,7 +416,7 @@ class PlannerService:
                     self._worker.submit(self._tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
                 case FindStrides(search):
                     self._stride_searches[self._tag(_STRIDES, name)] = search
-                case PlannerStatus() | Tell() if name != GROUND:
+                case PlannerStatus() if name != GROUND:
                     pass  # the planner of "ground" has told the same of the target
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
@@ -427,6 +424,3 @@ class PlannerService:
                     self._tell_status(status)
                 case Believed() as believed:
                     self._bus.publish(BELIEVED, believed, target=self._target)
-                case Tell(kind, text, cell):
-                    log.info("%s: %s", kind, text)
-                    self._member.note(now_ns, kind, text, cell)

@@ -1,10 +1,10 @@
-"""Where a planner's target is, by whom, since when, and what is odd about those who tell. Pure."""
+"""The position of a target as its planner believes it, and the oddities of its trackers. Pure."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from planner_service.planner_actions import Tell
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
@@ -23,19 +23,29 @@ _MOST_NAMED = 256
 """Trackers: names cost a stranger nothing."""
 
 
-class TargetWatch:
-    """What a planner knows of where its target is.
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """A sentence for people who watch the run; `cell` is where, if anywhere."""
 
-    Each oddity of a tracker is counted every time, and told once: one sentence for people.
+    kind: str
+    text: str
+    cell: int | None = None
+
+
+class TargetWatch:
+    """The position of one target, as its planners of all classes believe it.
+
+    Each oddity of a tracker is counted every time, and reported once in a sentence for operators.
 
     time_scale  seconds on the terrain per second
-
-    counts      whether oddities are counted: a standby leaves that to the planner that leads
+    leads       false for a standby, which neither counts nor reports: the leader does
     """
 
-    def __init__(self, target: str, grid: GridSpec, counters: Counters, time_scale: float = 1.0) -> None:
+    def __init__(
+        self, target: str, grid: GridSpec, counters: Counters, time_scale: float = 1.0, leads: bool = True
+    ) -> None:
         self.target = target
-        self.counts = True
+        self.leads = leads
         self._grid = grid
         self._counters = counters
         self._fastest_m_per_s = FASTEST_M_PER_S * time_scale
@@ -58,17 +68,19 @@ class TargetWatch:
         """Where the target was last; None before the first pose."""
         return self._tracking.pose
 
-    def age_s(self, now_ns: int) -> float | None:
-        """Time since that was heard."""
+    def age_s(self, now_ns: int, began_ns: int = 0) -> float | None:
+        """Time since that pose arrived, or since `began_ns` if it arrived earlier."""
         age_ns = self._tracking.age_ns(now_ns)
-        return None if age_ns is None else age_ns / NS_PER_S
+        return None if age_ns is None else min(age_ns, now_ns - began_ns) / NS_PER_S
 
     def lost(self, now_ns: int) -> bool:
         """Whether nobody tracks the target now."""
         return self._tracking.lost(now_ns)
 
-    def watch_pose(self, pose: TargetPose, now_ns: int) -> None:
+    def on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """A tracker tells a pose of the target."""
+        if pose.target != self.target:
+            return
         before, heard_ns = self._tracking.pose, self._tracking.heard_ns
         verdict = self._tracking.judge(pose, now_ns)
         if verdict is Verdict.COUNTS:
@@ -92,11 +104,11 @@ class TargetWatch:
             self._found("a vehicle sees it", now_ns)
 
     def drain(self, now_ns: int) -> list[Tell]:
-        """What people should know, since the last call."""
+        """Returns the sentences for operators that are new, none on a standby."""
         if not self._lost and self._tracking.lost(now_ns):
             self._lose(now_ns)
         told, self._to_tell = self._to_tell, []
-        return told
+        return told if self.leads else []
 
     def _owned_by(self, pose: TargetPose, now_ns: int) -> None:
         tracker, before = _name(pose), self._tracker
@@ -161,7 +173,7 @@ class TargetWatch:
             self._name_once("pose-teleported", pose, said, pose.cell)
 
     def _count(self, name: str) -> None:
-        if self.counts:
+        if self.leads:
             self._counters.count(name)
 
     def _name_once(self, kind: str, pose: TargetPose, text: str, cell: int | None = None) -> None:

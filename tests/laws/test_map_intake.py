@@ -17,6 +17,7 @@ from planner_service.followers import LONGEST_WAIT_NS
 from planner_service.planner import Planner
 from planner_service.search.target_search import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree
+from planner_service.target_watch import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -39,7 +40,8 @@ class Watched:
         self.grid = self.map.grid
         config = PlannerConfig(strategy=STRATEGIES[seed // 3 % len(STRATEGIES)])  # type: ignore[arg-type]
         tree = TargetTree(self.grid, config)
-        self.planner = Planner("t0", 7, config, tree, self.map, Counters())
+        self.watch = TargetWatch("t0", self.grid, Counters())
+        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters())
         self.now_ns = self.seq = 0
         self.at: int | None = None
         """Where the target is."""
@@ -59,7 +61,7 @@ class Watched:
         self.at = cell
         self.seq += 1
         told = target_pose("t0", cell, tracker="radar", seq=self.seq)
-        self.planner.on_pose(told, self.now_ns)
+        self.watch.on_pose(told, self.now_ns)
 
     def mark(self) -> None:
         cells = self.rng.integers(0, self.grid.cells, int(self.rng.integers(1, 3)))
@@ -134,12 +136,13 @@ class Searched(Watched):
             tracked=False, sense_range_m=4.0, capture_range_m=1.0, slowness=2.0, jumps=False, seed=str(seed)
         )
         search = TargetSearch(hidden, tree.cost_grid, 1.0)
-        self.planner = Planner("t0", 7, config, tree, self.map, Counters(), target_search=search)
+        self.watch = TargetWatch("t0", grid, Counters())
+        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=search)
         if seed % 2:  # seen once; else never
             cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
             x_m, y_m = grid.centre_m(cell)
             seen = TargetPose(target="t0", incarnation=1, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
-            self.planner.on_sighting(seen, 0)
+            self.watch.on_sighting(seen, 0)
             east_m, south_m = np.array([x_m - grid.west_m]), np.array([grid.north_m - y_m])
             search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
         while not search.active:

@@ -126,7 +126,7 @@ def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
         service: Any = node.service
         match service:
             case PlannerService() if service._target == "x":
-                found[node.name] = service._planner._watch._tracking
+                found[node.name] = service._watch._tracking
             case AgentService():
                 found[node.name] = service.agent._trackings.of("x")
             case TargetsService():

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Planner
-from planner_service.planner_actions import Action, GrownTree, GrowTree, Tell
+from planner_service.planner_actions import Action, GrownTree, GrowTree
 from planner_service.target_tree import TargetTree, Update
+from planner_service.target_watch import TargetWatch, Tell
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -137,8 +138,9 @@ class World:
         self.tree = ScriptedTree()
         self.counters = Counters()
         self.newest_mark_ns: int | None = None
+        self.watch = TargetWatch("t0", GRID, self.counters)
         self.planner = Planner(
-            "t0",
+            self.watch,
             7,
             PlannerConfig(),
             self.tree,
@@ -157,7 +159,7 @@ class World:
 
     def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
         cell = GRID.cell(row, col)
-        self.planner.on_pose(pose(cell, seq, incarnation), self.now_ns)
+        self.watch.on_pose(pose(cell, seq, incarnation), self.now_ns)
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -169,8 +171,8 @@ class World:
         self.now_ns += TICK
         actions = self.planner.tick(self.now_ns)
         self.told.extend(action for action in actions if isinstance(action, PlannerStatus))
-        self.notes.extend(action for action in actions if isinstance(action, Tell))
-        return [action for action in actions if not isinstance(action, PlannerStatus | Tell)]
+        self.notes.extend(self.watch.drain(self.now_ns))
+        return [action for action in actions if not isinstance(action, PlannerStatus)]
 
     def ask(self, *cells: int, **fields: Any) -> RouteReply:
         request = RouteRequest(cells=list(cells), **fields)

@@ -72,7 +72,7 @@ def test_no_single_pose_misleads_a_planner_for_longer_than_the_lease(ready: Worl
 
 
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
-    world.planner.on_pose(pose(5, target="t1"), world.now_ns)
+    world.watch.on_pose(pose(5, target="t1"), world.now_ns)
     assert world.tick() == []
     assert world.planner.status(0).target_cell is None
 

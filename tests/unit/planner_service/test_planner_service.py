@@ -15,6 +15,7 @@ from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s
 from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree
+from planner_service.target_watch import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
@@ -223,8 +224,9 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
         pace[row] = 0.1
         pace[row + 1, 199 if row % 4 == 0 else 0] = 0.1
     tree = TargetTree(GridSpec(200, 200, RES), PlannerConfig())
-    planner = Planner("t", 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
-    planner.on_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
+    watch = TargetWatch("t", tree.cost_grid.grid, Counters())
+    planner = Planner(watch, 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
+    watch.on_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
     planner.tick(0)
     whole = planner.answer(RouteRequest(cells=[198 * 200]), 0)
     assert isinstance(whole, RouteReply)
@@ -242,12 +244,13 @@ def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
     pace = flat()
     tree = TargetTree(GRID, PlannerConfig())
     counters = Counters()
-    planner = Planner("t", 1, PlannerConfig(push_s=100.0), tree, CostMap(terrain_of_pace(pace, RES)), counters)
+    watch = TargetWatch("t", GRID, counters)
+    planner = Planner(watch, 1, PlannerConfig(push_s=100.0), tree, CostMap(terrain_of_pace(pace, RES)), counters)
 
     def stand(col: int, seq: int, now_ns: int) -> None:
         cell = GRID.cell(20, col)
         pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
-        planner.on_pose(pose, now_ns)
+        watch.on_pose(pose, now_ns)
         planner.tick(now_ns)
 
     stand(20, 1, 0)

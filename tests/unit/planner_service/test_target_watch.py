@@ -8,8 +8,7 @@ import msgspec
 import pytest
 from support.makers import target_pose
 
-from planner_service.planner_actions import Tell
-from planner_service.target_watch import TargetWatch
+from planner_service.target_watch import TargetWatch, Tell
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
@@ -37,7 +36,7 @@ class Watch:
         cell = GRID.cell(row, col)
         told = {"tracker": tracker, "incarnation": START_NS, "seq": self.seq, "stamp_ns": self.now_ns}
         pose = target_pose("t0", cell, GRID, **told)
-        self.watch.watch_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
+        self.watch.on_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
@@ -178,11 +177,19 @@ def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> 
     assert here.told[-1].kind == "tracker-back"
 
 
-def test_a_standby_counts_nothing() -> None:
+def test_a_standby_counts_and_reports_nothing() -> None:
     here = Watch()
-    here.watch.counts = False
+    here.watch.leads = False
     here.hear(cell=GRID.cells)
-    assert here.counted() == {}
+    here.tick()
+    assert (here.counted(), here.told) == ({}, [])
+
+
+def test_the_age_of_a_pose_counts_from_the_beginning_of_the_planner_which_gives_it() -> None:
+    here = Watch()
+    here.hear()
+    now_ns = here.now_ns + NS_PER_S
+    assert [here.watch.age_s(now_ns, began_ns) for began_ns in (0, now_ns - TICK_NS)] == [1.0, 0.1]
 
 
 def test_however_many_trackers_a_liar_makes_up_few_are_named() -> None:
