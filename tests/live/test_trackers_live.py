@@ -101,7 +101,7 @@ def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_ove
         assert status_of_x(live)["target_cell"] == 20 * 128 + 90
         second.kill()
         eventually(lambda: bool(status_of_x(live)["tracker_lost"]), 20, "the loss")
-        assert "x is lost: no tracker publishes it, and this is its position" in route_to_x(live)
+        assert "x is lost: it has no tracker, and this is its position" in route_to_x(live)
         eventually(lambda: live.said("outdated") and live.said("lost targets: x"), 20, "the live line")
         third = outside.start("radar", 50, 61)
         eventually(lambda: not status_of_x(live)["tracker_lost"], 20, "the return")
