@@ -7,9 +7,9 @@ bound of the cost of any route. The planner ensures this in six steps:
 2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
 3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
-   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.partition*` on large maps). Where
-   that takes too long for the thread that answers, a worker grows the whole tree. `target_tree.Decision` is what
-   was decided, by the row of the strategy (`strategy`) and by what growths have taken (`growth_times`).
+   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.partition*` on large maps). If
+   that takes too long for the thread that answers, a worker searches the whole tree. `target_tree.Decision` is the
+   decision, by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
 5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
    with the map, and the last window adds its rim (`tree.route_bounds`, docs/certificates.md).
 6. *Push.* A follower is pushed another route if its route passes a change or begins in a grown part, and the
@@ -35,14 +35,13 @@ The states of a planner:
 ============  ==============================================  =====================================================
 state         what it answers                                 what ends it
 ============  ==============================================  =====================================================
-without tree  NO_TARGET; a query waits for a second at most   the first growth: current
-current       routes to where the target is                   a move that takes too long here: behind; a map that
+without tree  NO_TARGET; a query waits for a second at most   the first search: current
+current       routes to the target                            a move that takes too long here: behind; a map that
                                                               has changed while no tree can lead to the target:
                                                               without tree; a tracker lost for 30 s, or a target
-                                                              that vehicles do not see where it was: searching
-behind        routes to where the tree led; a worker grows    its tree is adopted, and what has happened since is
-                                                              made up for: current
-searching     routes to places where to look, SEARCHING       a sighting or a pose: current
+                                                              unseen by vehicles at its position: searching
+behind        routes to the previous root; a worker searches  its tree is adopted and brought up to date: current
+searching     routes to places to search, SEARCHING            a sighting or a pose: current
 standby       as above, but it pushes nothing                 the leader falls silent: it leads, and pushes a route
                                                               to every follower
 ============  ==============================================  =====================================================

@@ -2,8 +2,8 @@
 
 To repair a tree costs about the same however many cells have changed. With hundreds of vehicles that see something
 new in every tick, somewhere, a planner that repaired in every tick did little else. A change that no follower's
-route passes is nothing to push; so it waits, but not long. So does any change once repairs have had their share of
-`planner.cpu_budget` (`Planner`); no route that is given passes one all the same.
+route passes is nothing to push; so it waits, but not long. Any change is applied, too, once repairs have had their
+share of `planner.cpu_budget` (`Planner`); no served route passes a waiting one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Follower:
     route      what it was given last; None if nothing was, by this incarnation of the planner
     bounds     a first row and column before which that route and the cells next to it do not lie, and first ones
                behind them
-    walked     the cells of that route; None until somebody asks for them
+    walked     the cells of that route; None until they are needed
     row        in the table of all bounds
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
@@ -76,9 +76,9 @@ MOST_PUSHES = 256
 class Followers:
     """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
 
-    Registered by a request that names them, or by their agent's word that they chase this target; dropped when that
-    agent names them no more, when nothing was heard of them for the lease, and, beyond the capacity, in the order
-    in which they were registered. A vehicle that is dropped so is registered again by its agent's next word.
+    Registered by a request that names them, or by their agent's message that they chase this target; dropped when
+    that agent names them no more, after a lease without messages, and, beyond the capacity, in the order in which
+    they were registered. A vehicle that is dropped so is registered again by its agent's next word.
     """
 
     def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
@@ -89,7 +89,7 @@ class Followers:
         self._by_id: dict[str, Follower] = {}
         self._rows: tuple[list[Follower], NDArray[np.int64]] | None = None
         """All followers and their bounds, int64 (n, 4): a route changes every few seconds, and whose route a change
-        concerns is asked in every tick. None once somebody has come or gone."""
+        concerns is asked in every tick. None once a follower has joined or left."""
         self._told: dict[str, _Told] = {}
         """Agent's name as an author -> its newest message, for the lease."""
 
@@ -104,11 +104,11 @@ class Followers:
 
     @property
     def cells(self) -> NDArray[np.int64]:
-        """Where they all are."""
+        """Cells of all followers."""
         return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
 
     def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
-        """Which vehicles of an agent chase the target, and from where. Ignored if older than the last."""
+        """Sets the vehicles of an agent that chase the target, and their cells. Ignored if older than the last."""
         before = self._told.get(chasers.author)
         if before is not None and chasers.stamp_ns < before.stamp_ns:
             return
@@ -156,7 +156,8 @@ class Followers:
         return row - (nw + n + ne) - 1, col - (sw + w + nw) - 1, row + se + s + sw + 2, col + ne + e + se + 2
 
     def forget_routes(self) -> None:
-        """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
+        """Forgets all given routes after another planner has given some: the next route is new to every
+        follower."""
         for follower in self._by_id.values():
             follower.route, follower.stale, follower.push_ns = None, True, 0
             self._lies(follower, _NOWHERE_BOUNDS)
@@ -179,7 +180,7 @@ class Followers:
             del self._told[author]
 
     def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
-        """Whether the route of a follower that may be pushed another now passes one of these windows."""
+        """Returns True if the route of a follower that may be pushed another now passes one of these windows."""
         return any(now_ns >= each.push_ns and self._crosses(each, window) for each, window in self._near(changed))
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
@@ -201,7 +202,7 @@ class Followers:
         return due
 
     def is_news(self, follower: Follower, route: RouteOutline) -> bool:
-        """Whether a route says anything that the follower does not know: other steps, or that there is no way."""
+        """Returns True if a route is new to the follower: other steps, or no path."""
         old = follower.route
         if old is None or old.status is not route.status:
             return True
@@ -226,14 +227,14 @@ class Followers:
         return len(route.directions) if at == cell else None
 
     def _crosses(self, follower: Follower, window: Window) -> bool:
-        """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside
-        it."""
+        """Returns True if the route passes through a window or next to it: a diagonal step depends on the cells
+        beside it."""
         rows, cols = np.divmod(np.array(follower.cells(self._grid), np.int64), self._grid.cols)
         inside = (rows >= window.row0 - 1) & (rows <= window.row1)
         return bool((inside & (cols >= window.col0 - 1) & (cols <= window.col1)).any())
 
     def _near(self, windows: Sequence[Window]) -> Iterator[tuple[Follower, Window]]:
-        """Of which followers the bounds of the route meet which windows."""
+        """Returns pairs of followers and windows that the bounds of the route meet."""
         if not windows or not self._by_id:
             return
         if self._rows is None:
@@ -254,22 +255,22 @@ LONGEST_WAIT_NS = NS_PER_S
 
 
 class MapIntake:
-    """Which changes of one map the tree of one target does not know, and whether they may wait."""
+    """Changes of one map that the tree of one target does not know, and whether they may wait."""
 
     def __init__(self, cost_map: CostMap, followers: Followers) -> None:
         self._cost_map = cost_map
         self._followers = followers
         self._taken_ns: int | None = None
-        """When there were any the last time; None before."""
+        """Time of the last ones; None before."""
 
     def take(self, now_ns: int) -> list[Window]:
-        """What has changed since the last call, for the tree to take in now."""
+        """Returns the changes since the last call, for the tree to apply now."""
         if self._cost_map.dirty:
             self._taken_ns = now_ns
         return self._cost_map.take_dirty()
 
     def is_due(self, now_ns: int, wait_ns: int) -> bool:
-        """Whether changes that wait are to be taken in now: because the tree was told of others so long ago, or
+        """Returns True if waiting changes are to be applied now: because the last update was so long ago, or
         because they lie on the route of a follower that may be pushed another."""
         wait_ns = min(wait_ns, LONGEST_WAIT_NS)
         if self._taken_ns is None or not 0 <= now_ns - self._taken_ns < wait_ns:
@@ -277,8 +278,8 @@ class MapIntake:
         return self._followers.any_due_in(self._cost_map.dirty, now_ns)
 
     def concerns(self, routes: RouteBatch) -> bool:
-        """Whether changes that wait lie on one of these routes or next to it, or may make a way where there is
-        none."""
+        """Returns True if waiting changes lie on one of these routes or next to it, or may open a path where there
+        is none."""
         windows = self._cost_map.dirty
         if not windows:
             return False

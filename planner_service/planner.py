@@ -71,7 +71,7 @@ class Planner:
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     vehicle_class   whose routes these are: what the cost map is for
     began_ns        when it was made: the age of a pose which arrived earlier is counted from then
-    target_search   for the time in which nobody sees the target. All classes share it
+    target_search   while the target is unseen. All classes share it
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Planner:
         self.followers = Followers(watch.target, self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
         self._watch, self._began_ns = watch, began_ns
-        # (target cell, map version) that the tree was last told.
+        # (target cell, map version) of the tree's last update.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
         self._growing_since_ns: int | None = None
@@ -166,7 +166,7 @@ class Planner:
     ) -> Answer:
         """Answers from the tree as it is. Never waits for a growth that is under way.
 
-        send  called with what is returned as soon as that is known: who asked does not wait for what is counted
+        send  called with the reply as soon as it is known: the asker does not wait for statistics
         """
         if isinstance(request, CostRequest):
             answer: Answer = self._costs(request, now_ns)
@@ -227,17 +227,17 @@ class Planner:
 
     @property
     def must_wait(self) -> bool:
-        """Whether there is nothing to answer from now, and will be once the growth under way is adopted."""
+        """Returns True if there is no tree to answer from now, but will be once the search under way is adopted."""
         return not self.tree.ready and self._growing_since_ns is not None
 
     @property
     def begins(self) -> bool:
-        """Whether it is about to take in the map for the first time, or where its target is."""
+        """Returns True if it waits for its first map, or for the target's position."""
         return not self.tree.ready and (self.tree.map_version < 0 or self._watch.pose is not None)
 
     @property
     def knows_map(self) -> bool:
-        """Whether routes go by the map as it is now."""
+        """Returns True if routes follow the current map."""
         return self._told is None or self._told[1] == self._cost_map.version
 
     # --- the tree -----------------------------------------------------------------------------------------------
@@ -260,18 +260,18 @@ class Planner:
 
     @property
     def _under_way(self) -> TargetSearch | None:
-        """The search for the target, while nobody sees it."""
+        """The search for the target, while it is unseen."""
         return self.target_search if self.target_search is not None and self.target_search.active else None
 
     def _search(self, now_ns: int) -> None:
-        """Search for the target while nobody sees it."""
+        """Searches for the target while it is unseen."""
         search, pose, grid = self.target_search, self._watch.pose, self._grid
         if search is None:
             return
         if self.tree.map_version < 0 and not search.tracked:
             self._learn_map(now_ns)
         if self.vehicle_class != GROUND:
-            return  # that class has told the search all of this
+            return  # that class has given the search all of this
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
         age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
         search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
@@ -284,7 +284,7 @@ class Planner:
         self.tree.update(self._cost_map.pace_s_per_m, -1, self._take_dirty(now_ns), self._cost_map.version)
 
     def _may_not_wait(self, now_ns: int) -> bool:
-        """Whether changes of the map are to be taken in although the target stands."""
+        """Returns True if changes of the map are to be applied although the target is at rest."""
         if not self.tree.ready:
             return True
         return now_ns >= self._rests_until_ns and self._intake.is_due(now_ns, self._push_ns)
@@ -384,7 +384,7 @@ class Planner:
         return self._known(lambda: self.tree.routes(cells, max_cells), now_ns)
 
     def _known(self, find: Callable[[], RouteBatch], now_ns: int) -> RouteBatch:
-        """Routes by what the tree knows of the map. None passes what has changed since, as far as it is known here.
+        """Routes by what the tree knows of the map. No route passes a later change, as far as it is known here.
 
         Every route that is given to anybody comes through here.
         """
@@ -410,8 +410,8 @@ class Planner:
         return [cell for cell, is_good in zip(cells, good.tolist(), strict=True) if not is_good]
 
     def _force(self, cells: list[int], now_ns: int) -> bool:
-        """Cover cells, once each between two changes of the tree: asking again costs nothing. Whether the tree has
-        changed."""
+        """Cover cells, once each between two changes of the tree: asking again costs nothing. Returns True if the
+        tree has changed."""
         fresh = sorted({cell for cell in cells if 0 <= cell < self._grid.cells} - self._forced)
         if not fresh:
             return False
@@ -443,7 +443,7 @@ class Planner:
         return CostReply(cost_to_go_s=pack_column(costs_s, "<f4"), **self._reply_fields(now_ns))
 
     def _fields(self, now_ns: int) -> dict[str, Any]:
-        """What replies and the status say of the tree and of the target."""
+        """Returns the fields about tree and target in replies and the status."""
         return {
             "target": self.target,
             "incarnation": self._incarnation,
@@ -467,7 +467,8 @@ class Planner:
     def _age_ms(self, now_ns: int) -> float:
         return math.inf if self._exact_ns is None else (now_ns - self._exact_ns) / 1e6
 
-    # --- what is told unasked -----------------------------------------------------------------------------------
+    # --- published without a query
+    # -----------------------------------------------------------------------------------
 
     def _pushes(self, now_ns: int) -> list[Action]:
         """Newer routes for followers which a change concerns and which have not had one for a while."""

@@ -1,4 +1,4 @@
-"""What a planner wants done by the process around it, and the full growth that a worker brings back."""
+"""Actions of a planner for the process around it, and the full search that a worker brings back."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class GrownTree:
     pieces: PieceTree | None = None
 
     def tree_on(self, cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
-        """The tree on the map as it is now: to be repaired by what has changed since the snapshot."""
+        """Returns the tree on the current map: to be repaired by the changes since the snapshot."""
         if self.pieces is not None:
             same = self.pieces if in_pieces else in_cells(self.pieces)
             same.cost_grid = cost_grid
@@ -56,7 +56,7 @@ class GrownTree:
 
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
-    """Whether a tree can lead to a cell: it is one of the grid, and not lethal."""
+    """Returns True if a tree can lead to a cell: it is one of the grid, and not lethal."""
     return cost_grid.grid.inside(*divmod(cell, cost_grid.grid.cols)) and cost_grid.passable(cell)
 
 
@@ -91,8 +91,8 @@ def growth_job(
 def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
     """Driven cost over optimum of what the earlier tree offered cells of the grid, on the snapshot of `grown`.
 
-    Cells without a way in either tree are left out. An offer may be better than the exact tree's by what float32
-    takes for equal, and is then 1; what is less than 1 is better than the exact tree proves that any can be: a bug.
+    Cells without a way in either tree are left out. An offer may be better than the exact tree's by a difference
+    that float32 takes for equal, and is then 1; a value below 1 contradicts the exact tree: a bug.
     """
     offered = grown.offered
     assert offered is not None
@@ -130,4 +130,4 @@ class FindStrides:
 
 
 Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Believed
-"""What a planner wants done: a growth run, networks of strides found, a message published."""
+"""Action of a planner: a search to run, networks of strides found, a message to publish."""

@@ -27,7 +27,7 @@ class Pulled:
 
 
 def pulls(config: PlannerConfig, climb: Climb | None) -> bool:
-    """Whether a planner pulls its routes."""
+    """Returns True if a planner serves any-angle routes."""
     return config.routes == "pulled" and may_be_pulled(climb)
 
 
@@ -37,13 +37,13 @@ class Puller:
     pace          (rows, cols) float32, s/m; inf is lethal. It is read at each call
     resolution_m  side of a cell
     config        which corners a segment may pass: where a diagonal step may
-    climb         of what flies: what a segment costs for what it climbs, and for the wind; None of what drives
+    climb         for flying classes: the price of a segment's climb and of the wind; None for ground classes
     """
 
     def __init__(
         self, pace: Floats, resolution_m: float, config: PlannerConfig, climb: Climb | None = None
     ) -> None:
-        # Compiled only for those who pull: nobody else waits for it at a first start.
+        # Compiled only for planners of any-angle routes: no other process waits for it at a first start.
         from planner_service.kernels.compile import load
         from planner_service.kernels.layout import step_offsets
         from planner_service.kernels.pull_routes import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
@@ -63,12 +63,12 @@ class Puller:
         """Routes as in `RouteBatch`, read-only or not -> those pulled, and (3, n) float64: the integral of the pace
         along each one, and along the route that it was, s; its length, m.
 
-        The integral is inf of a route that meets what is shut by now: each of its steps is a segment then. A route
-        that, pulled, would come to a cell twice is not pulled either: whoever is pushed the same route in that cell
-        would drive the loop again.
+        The integral is inf for a route that meets closed cells by now: each of its steps is a segment then. A route
+        is not pulled either if that would bring it to a cell twice: a vehicle that is pushed the same route in that
+        cell would drive the loop again.
         """
         many, steps = starts.size, directions.size
-        # What came over the wire, or was put together of single routes, is read-only, which the kernel refuses.
+        # Arrays from the wire, or put together of single routes, are read-only, which the kernel refuses.
         given = tuple(np.require(each, requirements=("C", "W")) for each in (starts, directions, ends))
         stays = np.zeros(many, np.bool_)
         longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
@@ -120,7 +120,7 @@ class Puller:
 
 
 def _flight(climb: Climb) -> tuple[Floats, Floats, Floats, tuple[float, float]]:
-    """What the kernel knows of a flight. Raises ValueError of what drives."""
+    """Returns the kernel's arguments for a flight. Raises ValueError for ground classes."""
     if climb.wind is None:
         raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
     # Copies, for kernels take only what may be written.

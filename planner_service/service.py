@@ -98,17 +98,17 @@ class PlannerService:
         self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
         self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        # Where the target is.
+        # Position of the target.
         self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._presence = Presence(_PRESENCE_NS, filter)
-        """Who looks where; nothing is heard of it for a target that has a tracker."""
+        """Positions of vehicles that may see the target; empty for a target that has a tracker."""
         self._listens = False
-        """Whether vehicles tell where they are and what they see."""
-        # The planners, one of each class that somebody asks for.
+        """True if it subscribes to positions and views of vehicles."""
+        # The planners, one of each class with queries.
         self._faults: list[str] = []
-        """What the strategy's plug-in did wrong and nobody has been told yet."""
+        """Faults of the strategy's plug-in that are not reported yet."""
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
         tree = self._new_tree(self._cost_map)
@@ -123,7 +123,7 @@ class PlannerService:
         self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._removed = False
-        """Whether its target was removed: then it serves nobody."""
+        """True if its target was removed: then it serves no queries."""
         self._now_ns = 0
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
@@ -148,7 +148,7 @@ class PlannerService:
         )
 
     def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree, began_ns: int = 0) -> Planner:
-        """The planner of a class. Stamps of marks and what other processes share are told to that of "ground"."""
+        """The planner of a class. Timestamps of marks and data shared by other processes go to that of "ground"."""
         scenario, is_ground = self._scenario, name == GROUND
         return Planner(
             self._watch,
@@ -168,7 +168,7 @@ class PlannerService:
         )
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
-        """The planner of a class that somebody asks for."""
+        """Makes the planner of a class at its first query."""
         cost_map = self._maps.of[name]
         planner = self._new_planner(name, cost_map, self._new_tree(cost_map), now_ns)
         planner.lead(self._planner.leads)
@@ -178,7 +178,7 @@ class PlannerService:
 
     @property
     def _served_by_search(self) -> bool:
-        """Whether there need not be a tree: the target is looked for, or was removed."""
+        """Returns True if there need not be a tree: the target is searched for, or was removed."""
         return self._untracked or self._removed
 
     def lacks(self) -> list[str]:
@@ -208,7 +208,7 @@ class PlannerService:
             case WorkDone(tag=tag, result=StrideSearch() as search):
                 self._on_strides(tag, search)
             case _ if not self._member.on_member_event(event):
-                # Each takes what is its own.
+                # Each takes its own.
                 handlers = (
                     self._sync.on_map_event,
                     self._candidacy.on_election_event,
@@ -284,7 +284,7 @@ class PlannerService:
             self._search.remember(sighted, now_ns)
 
     def _tag(self, work: str, name: str) -> str:
-        """What a piece of work for the planner of a class is called."""
+        """Returns the tag of a job for the planner of a class."""
         return f"{work}/{name}/{self._planners.begun_ns(name)}"
 
     def _asked_by(self, tag: str) -> Planner | None:
@@ -294,7 +294,7 @@ class PlannerService:
         return self._planners.held(name) if tag == self._tag(work, name) else None
 
     def _take_fleet(self, now_ns: int) -> None:
-        """Takes in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
+        """Takes the positions of vehicles, which may see a target without a living tracker."""
         if self._search.tracked:
             self._listen(self._watch.lost(now_ns))
         if not self._listens:
@@ -318,9 +318,9 @@ class PlannerService:
             self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
-        """Answers what was asked. Where there will be something to answer from soon, wait for that, but not long.
+        """Answers a query. If there will be a tree to answer from soon, it waits for that, but not long.
 
-        What is asked for one class never waits for the tree of another.
+        A query for one class never waits for the tree of another.
         """
         waiting: deque[tuple[int, Asked]] = deque()
         while self._held:
@@ -349,7 +349,7 @@ class PlannerService:
         asked.end()
 
     def _obey(self) -> None:
-        """Goes by what is ordered."""
+        """Applies orders."""
         book, scenario = self._obedience.book, self._scenario
         if book.version == self._obeyed_version:
             return
@@ -403,7 +403,7 @@ class PlannerService:
         self._candidacy.tell(self._member, now_ns)
 
     def _tell_status(self, status: PlannerStatus) -> None:
-        """That of "ground", with the vehicles of all classes."""
+        """Publishes the status of "ground", with the vehicles of all classes."""
         following = sum(len(planner.followers) for _, planner in self._planners)
         told = msgspec.structs.replace(status, following=following)
         self._bus.publish(STATUS, told, target=self._target)
@@ -417,7 +417,7 @@ class PlannerService:
                 case FindStrides(search):
                     self._stride_searches[self._tag(_STRIDES, name)] = search
                 case PlannerStatus() if name != GROUND:
-                    pass  # the planner of "ground" has told the same of the target
+                    pass  # the planner of "ground" has published the same about the target
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:

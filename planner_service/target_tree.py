@@ -54,7 +54,7 @@ class Update:
     repair_ns: int = 0
 
     def after(self, repaired: Update) -> Update:
-        """This, and the repair before it."""
+        """The same change with the repair before it."""
         if self.kind == "none":
             return replace(repaired, wants_full=self.wants_full)
         if self.kind in ("full", "exact"):

@@ -58,14 +58,14 @@ class TargetWatch:
         self._refused: dict[str | int, int] = {}
         """Tracker, or incarnation of one without a name -> its poses that were refused."""
         self._named: set[tuple[str, str | int]] = set()
-        """(kind of oddity, tracker), told before."""
+        """(kind of oddity, tracker), reported before."""
         self._to_tell: list[Tell] = []
         for name in COUNTS:
             counters.count(name, 0)
 
     @property
     def pose(self) -> TargetPose | None:
-        """Where the target was last; None before the first pose."""
+        """Last position of the target; None before the first pose."""
         return self._tracking.pose
 
     def age_s(self, now_ns: int, began_ns: int = 0) -> float | None:
@@ -74,7 +74,7 @@ class TargetWatch:
         return None if age_ns is None else min(age_ns, now_ns - began_ns) / NS_PER_S
 
     def lost(self, now_ns: int) -> bool:
-        """Whether nobody tracks the target now."""
+        """Returns True if no tracker publishes the target now."""
         return self._tracking.lost(now_ns)
 
     def on_pose(self, pose: TargetPose, now_ns: int) -> None:

@@ -205,7 +205,7 @@ def located(reason: str) -> tuple[str, list[str | int]]:
 
 
 def nearest(word: str, allowed: Sequence[str]) -> str:
-    """ "; did you mean 'x'?" with the most similar of the allowed words, nothing if none is."""
+    """Returns "; did you mean 'x'?" with the most similar of the allowed words; empty if none is similar."""
     close = difflib.get_close_matches(word, allowed, n=1)
     if not close and len(word) >= 3:
         close = [each for each in allowed if each.startswith(word)][:1]

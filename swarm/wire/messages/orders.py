@@ -226,7 +226,7 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
 
 
 class Obeyed(Message, frozen=True, kw_only=True, tag=schema_of("obeyed")):
-    """This process obeys."""
+    """Acknowledgement of a process that it obeys."""
 
     role: Id
     id: Id
