@@ -6,5 +6,5 @@
 
 A page is a template in `templates/`, which holds its prose; declarations fill its tables. A key, message, command
 or option which the code has is on its page, with the words of its docstring. `site` is what MkDocs loads: pages of
-the Python API, and the decisions.
+the Python API, and the design pages.
 """
