@@ -22,12 +22,12 @@ from launch_scripts.commands import (
 )
 
 FAMILIES = {
-    "terrain": ("terrain_commands", "Look at terrains, and find routes.", PREPARE),
-    "plugins": ("plugin_commands", "Your own sensors, walks, and so on.", PREPARE),
-    "map": ("map_commands", "Look at shared maps and the keeper's store.", LEFT),
-    "zone": ("zone_commands", "Close areas while the swarm runs.", ORDER),
-    "vehicle": ("vehicle_commands", "Add, remove and stop vehicles.", ORDER),
-    "deploy": ("deploy_commands", "A plan, certificates and configurations for several machines.", ADMIN),
+    "terrain": ("terrain_commands", "Inspect and convert terrain; reach maps.", PREPARE),
+    "plugins": ("plugin_commands", "List and test plug-ins.", PREPARE),
+    "map": ("map_commands", "Inspect, export and import marks of a store.", LEFT),
+    "zone": ("zone_commands", "Close areas of a running swarm.", ORDER),
+    "vehicle": ("vehicle_commands", "Add, remove and stop vehicles of a running swarm.", ORDER),
+    "deploy": ("deploy_commands", "Plan several machines: archives, certificates, router.", ADMIN),
 }
 """Sub-command with sub-commands of its own -> (module, imported when one is called; help; panel)."""
 

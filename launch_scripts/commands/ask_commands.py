@@ -50,7 +50,7 @@ def route(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Ask a planner for the cheapest route from a place to its target; or find one on a terrain, without a swarm.
+    """Find the cheapest route to a target of a running swarm, or on a terrain file.
 
     swarm route --target t3 --row 40 --col 200
 
@@ -64,11 +64,11 @@ def route(
     row            Row of the start, counted from the north.
     col            Column of the start, counted from the west.
     steps          Most steps to show; 1 is the next, 0 is all.
-    cost           Only the cost, or that there is no way.
+    cost           Print only the cost, or that no path exists.
     terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
     start          LAT,LON, xy:X,Y in metres or cell:ROW,COL; instead of --row and --col.
-    end            With --terrain: where to, as --from.
-    vehicle_class  Which class of the swarm's vehicles drives there.
+    end            With --terrain: the destination, in the same forms as --from.
+    vehicle_class  Class of the vehicle.
     out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
     """
     from launch_scripts.commands import terrain_routes
@@ -105,7 +105,7 @@ def route(
 
 @command(app, ASK)
 def status(where: Where, as_json: AsJson = False) -> None:
-    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
+    """Show a running swarm: metrics, processes, targets and alarms.
 
     Without --connect it asks the newest run of this machine that runs, whatever its ports.
 
@@ -131,16 +131,16 @@ def top(
     once: bool = False,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
-    """Watch a running swarm: processes, vehicles and targets, once a second; `q` or Ctrl-C ends it.
+    """Watch a running swarm, once a second; `q` or Ctrl-C ends it.
 
-    Processes on other machines are shown, too: each tells what it takes up. CPU of 100 % is one core; late/s counts
-    ticks that came late or not at all, of a role the worst.
+    Processes on other machines are shown, too, from their own reports. CPU of 100 % is one core; late/s counts
+    ticks that came late or not at all, for a role its worst process.
 
     swarm top --each
 
     swarm top --json --once | jq .processes[0]
 
-    each     A line for each process, not only for each role.
+    each     Print a line for each process, not only for each role.
     once     Show it once and end.
     as_json  Print one JSON object a second, or one with --once.
     """
@@ -151,7 +151,7 @@ def top(
 
 @command(app, ASK)
 def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
-    """Report whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if no process replies. For probes.
+    """Check if a swarm is ready: exit code 0 if it is, 1 if not, 4 without a reply.
 
     With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
     there in a fraction of a second. Otherwise it asks the whole swarm over its router, for two seconds.
@@ -207,7 +207,7 @@ def metrics(
     dashboard: bool = False,
     alerts: bool = False,
 ) -> None:
-    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
+    """Serve the metrics of a running swarm to Prometheus, until Ctrl-C.
 
     swarm metrics --port 9464
 
@@ -217,7 +217,7 @@ def metrics(
 
     `swarm up --metrics-port 9464` does the same for as long as the run lasts.
 
-    port       Where it listens; 0 picks one.
+    port       Port to listen at; 0 picks one.
     dashboard  Print a dashboard for Grafana, as JSON, and exit.
     alerts     Print rules for alerts of Prometheus, as YAML, and exit.
     """

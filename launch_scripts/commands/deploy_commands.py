@@ -68,13 +68,14 @@ def plan(
     namespace: Namespace = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which process runs on which machine, and make an archive for each: service, scenario, certificates.
+    """Assign processes to machines, and make an archive for each.
 
     swarm deploy plan my.toml --hosts hosts.toml --out kits
 
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
-    Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
+    An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
+    standbys, run on machines of their own. A second plan into
     the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
     archives of machines that it does not have.
 
@@ -237,7 +238,7 @@ def certs(
     days: Days = 365,
     renew: bool = False,
 ) -> None:
-    """Make certificates for mutual TLS, signed by the folder's own authority, which is made if missing.
+    """Make certificates for mutual TLS, and their authority if it is missing.
 
     swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
 
@@ -281,7 +282,7 @@ def certs(
 
 @command(app)
 def revoke(folder: Path, names: list[str]) -> None:
-    """Deny everything to holders of certificates with these names. A running router notices within a second.
+    """Revoke certificates by name. A running router notices within a second.
 
     swarm deploy revoke certs agent.all.a0
 
@@ -290,7 +291,7 @@ def revoke(folder: Path, names: list[str]) -> None:
     makes the next certificate of a name.
 
     folder  Folder with the certificate of a router.
-    names   Names as they stand in the certificates: agent.all.a0~2.
+    names   Names as in the certificates: agent.all.a0~2.
     """
     path = revocations.revoke(folder, names)
     print(f"revoked, as {path} says: {', '.join(names)}")
@@ -307,7 +308,7 @@ def zenohd(
     plugins: Path | None = None,
     volume: str = "memory",
 ) -> None:
-    """Write a configuration for zenohd as the router of a swarm, with its marks in zenohd's own storages.
+    """Write a configuration for zenohd as the router of a swarm.
 
     swarm deploy zenohd router.json5 --listen tcp/127.0.0.1:7447 --plugins /usr/lib/zenoh
 

@@ -50,8 +50,9 @@ def ros2(
     topics: Annotated[bool, typer.Option("--list")] = False,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
-    """Show a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C: map, transforms, odometry, plans, targets, markers.
-    ROS need not be installed here.
+    """Publish a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C.
+
+    It publishes map, transforms, odometry, plans, targets and markers. ROS need not be installed here.
 
     swarm ros2 --ros tcp/127.0.0.1:7447
 
@@ -60,7 +61,7 @@ def ros2(
     swarm ros2 --list
 
     settings  A .toml file: topics, rates, names, both sides.
-    vehicles  Ids of vehicles that ROS hears of, with * and ?; may be given several times.
+    vehicles  Ids of published vehicles, with * and ?; may be given several times.
     topics    Print the forwarded topics, and exit.
     as_json   With --list: as JSON.
     """

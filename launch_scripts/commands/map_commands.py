@@ -59,7 +59,7 @@ def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[Ma
 
 @command(app)
 def inspect(store: Store, as_json: AsJson = False) -> None:
-    """Show what a store holds, by author.
+    """Show the marks in a store, by author.
 
     swarm map inspect runs/LAST/map.sqlite
     """
@@ -114,8 +114,10 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
 
 @command(app)
 def export(store: Store, out: Path) -> None:
-    """Write the marks of a store: all of them, with learned factors, as JSON, which can be imported; the winners as
-    pixels or polygons.
+    """Export the marks of a store.
+
+    JSON holds all marks and learned factors, and can be imported. Other formats hold the winning marks as pixels or
+    polygons.
 
     swarm map export runs/LAST/map.sqlite marks.json
 
@@ -153,7 +155,7 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
 
 @command(app, name="import")
 def import_(file: Path, store: Path) -> None:
-    """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile.
+    """Import exported marks into a store, which no keeper uses.
 
     swarm map import marks.json my.sqlite
 
@@ -173,8 +175,9 @@ def learned(
     store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what vehicles have learned of kinds of ground (map.learning): driven over prior pace, and by what the
-    prior is multiplied.
+    """Show the learned factors of terrain classes.
+
+    A row has driven over prior pace, and the factor on the prior (map.learning).
 
     swarm map learned
 

@@ -40,7 +40,7 @@ Vehicles = Annotated[
 def pause(where: Where, as_json: AsJson = False) -> int:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
-    Vehicles drive to the middle of the cell that they are entering and stand there. Planners go on planning.
+    Vehicles drive to the middle of the cell that they are entering and stop there. Planners go on planning.
 
     swarm pause
     """
@@ -66,7 +66,7 @@ def group(
     as_scenario: bool = False,
     as_json: AsJson = False,
 ) -> int:
-    """Say which targets the vehicles of a group may chase.
+    """Set the targets that the vehicles of a group may chase.
 
     swarm group red targets t1 t2
 
@@ -96,7 +96,9 @@ def set_(
     as_scenario: bool = False,
     as_json: AsJson = False,
 ) -> int:
-    """Change a setting while the swarm runs: time_scale, vehicles.reassign_s, planner.cpu_budget, planner.push_s.
+    """Change a setting of a running swarm.
+
+    Keys: time_scale, vehicles.reassign_s, planner.cpu_budget, planner.push_s.
 
     swarm set time_scale 5
 
@@ -104,7 +106,7 @@ def set_(
 
     key          A key of the scenario, such as time_scale.
     value        Its new value.
-    as_scenario  The value that the scenario says.
+    as_scenario  The value in the scenario.
     """
     from swarm.config.explain import choice
     from swarm.errors import ConfigError
@@ -163,7 +165,7 @@ def add(
 
 @command(target_app)
 def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> int:
-    """Put a target somewhere else; it goes on from there.
+    """Move a target to another cell; it goes on from there.
 
     swarm target move t3 --at cell:40,200
     """

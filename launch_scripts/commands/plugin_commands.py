@@ -18,7 +18,7 @@ app = family_app("List plug-ins, and check one of your own.")
 
 @command(app, name="list")
 def list_plugins() -> None:
-    """Print every name that a scenario may use, by kind: those built in, and those of installed packages.
+    """List plug-ins by kind: built-in ones, and those of installed packages.
 
     swarm plugins list
     """
@@ -41,7 +41,7 @@ def check(
     folder: Path = Path(),
     seeds: Annotated[int, typer.Option(min=1, max=1000)] = 4,
 ) -> int:
-    """Ask a plug-in as a run would, and print which promises of its kind it breaks. It runs the plug-in's code.
+    """Test a plug-in against the contract of its kind. This runs its code.
 
     swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
 
@@ -49,7 +49,7 @@ def check(
     name     Name as in a scenario: module:Name, or that of an installed plug-in.
     options  Its options, as a JSON object.
     folder   Folder of its module, if it is not installed.
-    seeds    In how many sets of worlds it is asked.
+    seeds    Number of sets of test worlds.
     """
     from launch_scripts.check.plugin_check import check_plugin
 

@@ -40,7 +40,7 @@ def compare(
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
-    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
+    """Compare runs: settings, versions, machines and metrics.
 
     Endpoints of a run are left out: free ports differ each time.
 
@@ -106,9 +106,9 @@ def _left(name: str, runs: Path) -> LeftRun:
 
 @command(app, LEFT)
 def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
-    """Write a run's page again: report.html, one file that opens anywhere without a network.
+    """Write the report of a run again: report.html, one file for any browser.
 
-    It has the run's figures and what they mean, its map, plots over time, tables per target, group and vehicle, the
+    It has the run's metrics and their meaning, its map, plots over time, tables per target, group and vehicle, the
     scenario as it ran, machine and versions. Every run writes it at its end.
 
     swarm report LAST
@@ -134,11 +134,11 @@ def export(
     mcap: bool = False,
     runs: Runs = Path("runs"),
 ) -> None:
-    """Write what a run has left for a GIS, a spreadsheet or Foxglove.
+    """Export a run for a GIS, a spreadsheet or Foxglove.
 
     Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
-    their certified gaps, and marks as areas that say the same. GeoJSON and the columns lat and lon of CSV are in
-    WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
+    their certified gaps, and marks as areas of equal kind and pace. GeoJSON and the columns lat and lon of CSV are
+    in WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
 
     swarm export LAST
 
@@ -178,8 +178,7 @@ def replay(
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> int:
-    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
-    differ.
+    """Replay recorded inputs of a run, and report the first output that differs.
 
     swarm demo --record-inputs, then swarm replay
 

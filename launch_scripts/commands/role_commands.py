@@ -76,29 +76,29 @@ class Joins:
 
 @command(app, ROLE)
 def router(place: Place, listen: str | None = None, id: str = "0") -> None:
-    """Pass everybody's messages on: the process that all others connect to. --connect names another router.
+    """Run the Zenoh router of a swarm. `--connect` links it to another router.
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
 
     swarm router my.toml --listen tcp/127.0.0.1:7447
 
-    listen  Where to listen, such as tls/0.0.0.0:7447.
-    id      Its name, where several routers pass on for each other.
+    listen  Endpoint to listen at, such as tls/0.0.0.0:7447.
+    id      Router id. Needed only with several linked routers.
     """
     run_role("router", id, place, listen=listen)
 
 
 @command(app, ROLE)
 def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str = "0") -> None:
-    """Keep the shared map's marks in a store that survives every crash.
+    """Store the marks of the shared map on disk.
 
-    Also gives the terrain to machines that lack its files. Several keepers agree with each other:
+    It also serves the terrain to machines without its files. Several keepers hold the same marks:
 
     swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
 
     store    The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.
     rebuild  Move a damaged store aside and fill a new one from the swarm.
-    id       Its name, where several keepers keep the same map.
+    id       Keeper id, for several keepers of one map.
     """
     run_role("keeper", id, part, store_path=store, rebuild=rebuild)
 
@@ -107,7 +107,7 @@ def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str
 def planner(
     target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, rank: Rank = 0
 ) -> None:
-    """Plan for one target, or stand by to do so.
+    """Run the planner of one target, or a standby of it.
 
     swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
 
@@ -123,14 +123,14 @@ def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_
 
     swarm agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
 
-    id  The agent, such as a0: it hosts that part of the vehicles.
+    id  Agent id, such as a0, which selects its part of the vehicles.
     """
     run_role("agent", id, part)
 
 
 @command(app, ROLE)
 def targets(part: Part, rank: Rank = 0) -> None:
-    """Move the simulated targets and referee the run, or stand by to do so.
+    """Move the simulated targets and count collisions, or stand by.
 
     swarm targets jacksboro --rank 1
 
@@ -141,7 +141,7 @@ def targets(part: Part, rank: Rank = 0) -> None:
 
 @command(app, ROLE)
 def monitor(part: Part) -> None:
-    """Show and record the run.
+    """Record a run and serve its live view.
 
     swarm monitor jacksboro --connect tcp/127.0.0.1:7447
     """

@@ -15,7 +15,7 @@ app = typer.Typer()
 
 @command(app, RUN)
 def demo(run: RunOptions) -> int:
-    """Run the whole swarm on real mountains: 99 rovers, a drone, 10 targets, 19 processes.
+    """Run the built-in example: 99 rovers and a drone chase 10 targets.
 
     The same as `swarm up demo`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.html, report.json, report.png and a log file per process.
@@ -27,7 +27,7 @@ def demo(run: RunOptions) -> int:
 
 @command(app, RUN)
 def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> int:
-    """Run a scenario: all of its processes on this machine, or some of them.
+    """Run a scenario: all of its processes on this machine, or some.
 
     swarm up jacksboro --seconds 20 --port 0
 

@@ -85,9 +85,9 @@ _ASKED = {
 
 @command(app, PREPARE)
 def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices) -> None:
-    """Write a scenario of your own, with a comment for every key. On a terminal it asks for missing choices.
+    """Write a scenario, with a comment for every key.
 
-    An existing file is never written over.
+    On a terminal it asks for missing choices. An existing file is never overwritten.
 
     swarm new my.toml
 
@@ -198,10 +198,10 @@ def _from(path: Path, name: str | None) -> str:
 def check(
     scenario: ScenarioArgument, runs: Runs = Path("runs"), port: PortOption = None, as_json: AsJson = False
 ) -> int:
-    """Say all that is wrong with a scenario, before any process of it is started.
+    """Check a scenario before a run: files, terrain, ports and this machine.
 
-    Keys and values, files, the terrain and the places on it, certificates, ports, plug-ins, and whether this
-    machine is large enough. Exit code 1 if it cannot run so. Runs the modules of its plug-ins.
+    It checks keys and values, files, the terrain and the locations on it, certificates, ports, plug-ins, and
+    whether this machine is large enough. Exit code 1 if the scenario cannot run. Runs the modules of its plug-ins.
 
     swarm check my.toml
 
@@ -326,7 +326,7 @@ def _summary(path: Path, found: list[Finding], facts: dict[str, Any]) -> str:
 
 @command(app, PREPARE)
 def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
-    """Check this machine and this installation: is it fit for a swarm, and which steps are missing?
+    """Check if this machine and installation can run a swarm.
 
     Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
     disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.

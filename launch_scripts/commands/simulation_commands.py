@@ -46,7 +46,9 @@ def simulate(
     trace: Path | None = None,
     as_json: AsJson = False,
 ) -> int:
-    """Run the same swarm in one process, on a memory bus and a manual clock, and leave the same folder.
+    """Simulate a scenario in one process, faster than real time.
+
+    It runs the shipped services on a memory bus and a manual clock, and leaves the same folder as `swarm up`.
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
@@ -198,7 +200,7 @@ def sweep(
     out: Path | None = None,
     as_json: AsJson = False,
 ) -> int:
-    """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
+    """Run a study: scenarios x settings x seeds, on many processes or machines.
 
     Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: a second start,
     also with other seeds or settings, runs only the missing trials. Exit code 1 if a law broke in any trial. It
@@ -209,7 +211,7 @@ def sweep(
     swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
 
     study      A .toml file with scenarios, settings and seeds, or a built-in name.
-    scheduler  A cluster of Dask that is there, such as tcp://127.0.0.1:8786.
+    scheduler  An existing cluster of Dask, such as tcp://127.0.0.1:8786.
     workers    Processes of this machine; as many as it has cores if not given.
     out        Folder of the results; sweeps/NAME of the study if not given.
     """

@@ -76,7 +76,7 @@ def info(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Describe the content of a terrain file or a scenario, and the steps that brought it onto a metric grid.
+    """Describe a terrain file or the terrain of a scenario.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
     these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
@@ -90,7 +90,7 @@ def info(
     swarm terrain info dem.tif --cover worldcover.tif
 
     file                A terrain file, a scenario, or jacksboro.
-    height_scale        Metres per unit of height, where the file does not say it.
+    height_scale        Metres per unit of height, if the file does not state it.
     fill                Fill voids from their surroundings instead of forbidding them.
     cover               A raster of land-cover codes on the same ground.
     cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
@@ -163,7 +163,7 @@ def cost(
 
     scenario       A scenario file, the name of a built-in one, or a terrain file.
     out            Write seconds per metre as GeoTIFF; lethal is -1.
-    vehicle_class  For which of the scenario's classes of vehicles.
+    vehicle_class  Vehicle class of the scenario.
     """
     from shared_map.terrain.terrain import build_terrain
     from shared_map.vehicle_class_grounds import class_terrains
@@ -200,8 +200,8 @@ def rules(
 ) -> None:
     """List the rules by which slope becomes pace, and the presets of vehicle classes.
 
-    A rule is chosen by cost.slope_rule, a class of vehicles by cost.preset,
-    whose settings stand for those that the scenario does not give.
+    cost.slope_rule selects a rule, cost.preset a class of vehicles, whose settings
+    replace those that the scenario does not give.
 
     swarm terrain rules --picture rules.png
     swarm terrain rules mine.toml
@@ -236,7 +236,7 @@ def synth(
     photo: Path | None = None,
     picture: Picture = None,
 ) -> None:
-    """Make a synthetic landscape: mountains, valleys, rivers, forest, roads. A seed makes the same again.
+    """Make a synthetic landscape: mountains, rivers, forest, roads.
 
     swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
@@ -290,12 +290,12 @@ def reach(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as areas.
+    """Compute the driving time to a location from everywhere, as GeoTIFF or areas.
 
-    With --from: the corridor of near-optimal ways between two places. Each of
-    its cells has the time of a good way that passes it, which can be driven
-    and may take a little longer than the best that does; areas tell the
-    seconds lost against the best way of all.
+    With --from: the corridor of near-optimal paths between two locations. Each of
+    its cells has the time of a good path that passes it, which can be driven
+    and may take a little longer than the best one there; areas state the
+    seconds lost against the best path of all.
 
     swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
@@ -303,9 +303,9 @@ def reach(
 
     terrain  A terrain file, a scenario file or a built-in scenario.
     to       Destination: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
-    start    Only where good ways from there lead: a corridor.
-    slack    With --from: a way may take this share longer than the best.
-    out      Write .tif: seconds, -1 where there is no way; .geojson, .gpkg, .kml or .csv: areas.
+    start    Start of a corridor: only cells on near-optimal paths from there.
+    slack    With --from: a path may take this share longer than the best.
+    out      Write .tif: seconds, -1 without a path; .geojson, .gpkg, .kml or .csv: areas.
     every_s  Distance between areas, in seconds.
     """
     from launch_scripts.commands import terrain_routes
@@ -341,13 +341,13 @@ def classify(
     crs: Crs = None,
     resolution_m: Metres = None,
 ) -> None:
-    """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
+    """Classify a photo: water, forest, rock, grass, soil, road, built, snow.
 
     swarm terrain classify dem.tif photo.tif --labels labels.toml --picture classes.png
 
-    Without --labels by rules. With labels the classes are learnt from them,
-    and two tables show what the labelled cells were taken for: by the rules,
-    and by a model that had not seen the polygon it was asked about.
+    Without --labels it uses rules. With labels the classes are learnt from them,
+    and two tables show the predictions for the labelled cells: by the rules,
+    and by a model that was trained without the polygon of the cell.
     A file of labels, in metres east and south of the north-west corner:
 
     [\\[labels]]

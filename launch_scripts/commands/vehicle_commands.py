@@ -50,10 +50,10 @@ def add(
     id: str = "",
     at: Annotated[str | None, typer.Option(metavar="PLACE")] = None,
 ) -> None:
-    """Drive more vehicles in a running swarm, until all have left or this is stopped.
+    """Start an agent with extra vehicles. Runs until they have left, or until Ctrl-C.
 
-    They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If this is
-    killed they stay where they are; the same command finds them again.
+    They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
+    process is killed they stay where they are; the same command finds them again.
 
     swarm vehicle add my.toml --group all --count 5 --at 36.41,-84.29
 
@@ -105,10 +105,10 @@ def remove(
 
 @command(app)
 def gone(name: str, where: Where) -> None:
-    """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
+    """Release the cells of vehicles of a dead process. Use only if they are gone.
 
-    Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
-    Between machines it takes the guest's own certificate.
+    Only a person can know that: a robot whose program has died is still in its cell. Never use it for such a robot.
+    Between machines the command needs the guest's own certificate.
 
     swarm vehicle gone extra
 

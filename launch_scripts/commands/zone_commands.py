@@ -49,7 +49,7 @@ def add(
     vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Close an area, or set its pace. Returns once all maps and trees go by it.
+    """Close an area, or set its pace. Returns once all maps and trees include it.
 
     swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
 
@@ -63,12 +63,12 @@ def add(
                    north-west corner of the terrain.
     polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
     file           A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.
-    layer          Which layer, of a file that has several.
-    crs            Coordinate system, where the file names none: EPSG:32632, or local.
+    layer          Layer of a file that has several.
+    crs            Coordinate system, if the file names none: EPSG:32632, or local.
     kind           lethal, or pace:X for X seconds per metre.
     until          Duration: 90s, 10m, 2h. Until it is removed, if not given.
-    name           Its name; an existing zone of that name is replaced.
-    vehicle_class  For vehicles of this class of the scenario only.
+    name           Zone name. Replaces a zone of the same name.
+    vehicle_class  Vehicle class; if not given, all vehicles.
     """
     fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(until)}
     fields["vehicle_class"] = vehicle_class
@@ -108,7 +108,7 @@ def add(
 
 @command(app)
 def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, as_json: AsJson = False) -> int:
-    """Open a zone again.
+    """Remove a zone.
 
     swarm zone remove bridge
 
@@ -120,7 +120,7 @@ def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, a
 
 @command(app, name="list")
 def list_zones(where: Where, as_json: AsJson = False) -> None:
-    """Print the zones that stand.
+    """List active zones.
 
     swarm zone list
     """
