@@ -92,7 +92,7 @@ def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
         find_swarm(tmp_path)
     with pytest.raises(BusError, match=r"no swarm runs here: .*usual endpoint"):
         find_swarm(tmp_path / "nowhere")
-    with pytest.raises(BusError, match=rf"run r1 does not run here: nobody listens \(r1 at .*:{ports[1]}\)"):
+    with pytest.raises(BusError, match=rf"run r1 does not run here: no process listens \(r1 at .*:{ports[1]}\)"):
         find_swarm(tmp_path, "r1")
     with pytest.raises(ConfigError, match="there is no run 'r9'"):
         find_swarm(tmp_path, "r9")

@@ -183,7 +183,7 @@ def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
 @pytest.mark.parametrize(
     ("wishes", "vehicle", "why"),
     [
-        (MISSION, Autopilot(PX4, COPTER), "it flies, and nobody says how high: give --altitude M"),
+        (MISSION, Autopilot(PX4, COPTER), "it flies without an altitude: give --altitude M"),
         (Wishes("t0", altitude_m=9.0, above="terrain"), Autopilot(PX4, COPTER), "takes no heights above terrain"),
         (Wishes("t0", "guided", altitude_m=9.0), Autopilot(ARDUPILOT, PLANE), "ArduPilot has no guided mode here"),
         (GUIDED, Autopilot(0, 0), "has no guided mode here; give --drive mission"),

@@ -105,7 +105,7 @@ def test_of_a_search_the_place_to_look_at_is_told_and_where_the_target_was_last(
     assert (known["searching"], "last_seen" in known) == (False, False)
     for route, place in ((whole, "cell:8,13"), (cut, "where this leads")):
         show(told(route))
-        assert f"nobody sees t3; {place}" in capsys.readouterr().out
+        assert f"t3 is unseen; {place}" in capsys.readouterr().out
 
 
 def test_the_frame_is_that_of_most_processes() -> None:

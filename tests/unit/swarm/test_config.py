@@ -82,7 +82,7 @@ def refusal(text: str) -> str:
         ("seed = True", ["line 1, column 8: no value that TOML knows", "true and false in small letters"]),
         ('name = "a', ["line 1", "a quote is missing at the end, found 'name = \"a'"]),
         ('name = "a\nseed = 1', ["line 1, column 10: a quote is missing at the end"]),
-        ("[map]\n[map]", ["line 2", "a section stands twice", "found '[map]'"]),
+        ("[map]\n[map]", ["line 2", "a section occurs twice", "found '[map]'"]),
         ("seconds = 5 m", ["line 1, column 13: nothing may follow a value; units are in the keys' names"]),
         ("[network]\nlisten = ['a'\n\n", ["line 2: a bracket that is opened is not closed"]),
         ("seed 1", ["line 1, column 6: expected KEY = VALUE or [SECTION], found 'seed 1'"]),
