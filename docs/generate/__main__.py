@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +34,10 @@ _QOS = {
     "TRANSFORMS": "reliable, volatile, last 100",
 }
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
+_OPTION = re.compile(r"^\* `--.*", re.MULTILINE)
+_OPTIONS = re.compile(r"(?:^\* `--.*\n)+", re.MULTILINE)
+_SHARED = 9
+"""An option with one text in this number of commands is explained once."""
 _OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `(?:-h, )?--help`.*\n", re.MULTILINE)
 
 
@@ -46,7 +51,22 @@ def command_line() -> str:
     text = get_docs_for_click(obj=root, ctx=typer.Context(root, info_name="swarm"), name="swarm")
     text = _OF_EVERY_COMMAND.sub("", text.partition("\n")[2])
     text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
-    return filled("cli", commands=text.strip())
+    shared, text = _shared_once(text.strip())
+    return filled("cli", commands=text, shared=shared)
+
+
+def _shared_once(text: str) -> tuple[list[str], str]:
+    """Returns the rows of options that many commands share, and the page with names in place of these rows."""
+    times = Counter(_OPTION.findall(text))
+    shared = sorted(row for row, many in times.items() if many >= _SHARED)
+
+    def named(block: re.Match[str]) -> str:
+        rows = block[0].splitlines()
+        names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
+        link = [f"* [shared](#shared-options): {', '.join(f'`{name}`' for name in names)}"] if names else []
+        return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
+
+    return shared, _OPTIONS.sub(named, text)
 
 
 def land_cover() -> str:
