@@ -80,7 +80,7 @@ def test_what_a_driver_says_wrong_is_one_sentence() -> None:
     guest, _ = entered()
     with pytest.raises(ValueError, match="it holds cell 70: leave before it enters elsewhere"):
         guest.enter(3)
-    with pytest.raises(ValueError, match="must begin at the vehicle.s cell: it holds cell 70"):
+    with pytest.raises(ValueError, match="must begin at the vehicle's cell: it holds cell 70"):
         guest.want([71])
     with pytest.raises(ValueError, match="cell 80 of the path is not next to cell 70"):
         guest.want([70, 80])
