@@ -29,8 +29,8 @@ def main() -> int:
         if (error.name or "").partition(".")[0] in _OURS:
             raise  # a fault of ours
         print(
-            f"swarm: the command needs {error.name}, which is not installed: pip install 'terrain-swarm[all]' "
-            "(without [all] there is the library swarm.client only)",
+            f"swarm: the command needs {error.name}, which is not installed: install the extra 'all' "
+            "(docs/start/install.md); without it there is the library swarm.client only",
             file=sys.stderr,
         )
         return 1

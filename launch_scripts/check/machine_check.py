@@ -193,7 +193,7 @@ def _packages(runs: Path) -> Said:
         else:
             fine += 1
     if wrong:
-        return "failure", f"{'; '.join(wrong)}: pip install 'terrain-swarm[all]'"
+        return "failure", f"{'; '.join(wrong)}: install the extra 'all' (docs/start/install.md)"
     return "ok", f"{fine} are as pinned; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}"
 
 

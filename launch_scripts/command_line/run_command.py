@@ -53,7 +53,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRAS:
             raise  # a fault of ours
-        needed = f"pip install 'terrain-swarm[{EXTRAS[package]}]'"
+        needed = f"install the extra '{EXTRAS[package]}' (docs/start/install.md)"
         print(f"swarm: this needs {package}, which is not installed: {needed}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:

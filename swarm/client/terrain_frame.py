@@ -122,7 +122,7 @@ class Frame:
 
     def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
         """(x_m, y_m) of a latitude and longitude. Raises ConfigError where the terrain has no coordinates, and
-        without pyproj, which `pip install 'terrain-swarm[wgs84]'` brings."""
+        without pyproj, which the extra `wgs84` brings."""
         if not (-90 <= lat_deg <= 90 and -360 <= lon_deg <= 360):
             raise ConfigError(f"lat_deg {lat_deg!r}, lon_deg {lon_deg!r} is no place on Earth")
         return self._transforms[0](lon_deg, lat_deg)
@@ -140,7 +140,7 @@ class Frame:
             from pyproj import CRS, Transformer
             from pyproj.exceptions import CRSError
         except ModuleNotFoundError as error:
-            raise ConfigError("latitudes and longitudes need pyproj: pip install 'terrain-swarm[wgs84]'") from error
+            raise ConfigError("latitudes and longitudes need pyproj: install the extra 'wgs84'") from error
         try:
             system = CRS.from_user_input(self.crs)
             degrees = _degrees_of(system)

@@ -41,7 +41,7 @@ else:
             try:
                 import numpy
             except ModuleNotFoundError as error:
-                raise ConfigError("this needs NumPy: pip install 'terrain-swarm[all]'") from error
+                raise ConfigError("this needs NumPy: install the extra 'all' (docs/start/install.md)") from error
             value = getattr(numpy, name)
             setattr(self, name, value)
             return value

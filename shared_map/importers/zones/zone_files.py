@@ -86,9 +86,7 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
     if any(importlib.util.find_spec(name) is None for name in ("pyogrio", "shapely")):
-        raise TerrainError(
-            f"{what} cannot be read: pyogrio and shapely are missing; pip install 'terrain-swarm[vectors]'"
-        )
+        raise TerrainError(f"{what} cannot be read: pyogrio and shapely are missing; install the extra 'vectors'")
     layer = open_layer(path, zone.layer, what)
     facts = FileFacts(path.name, layer.name, zone.crs or layer.crs or "none", layer.features)
     worth = _Worth(zone, layer, facts)

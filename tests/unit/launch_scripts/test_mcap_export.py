@@ -263,7 +263,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
         patched.delitem(sys.modules, "launch_scripts.report.mcap_export")
         patched.setitem(sys.modules, "mcap.writer", None)
         code, _, told = swarm("export --mcap", run)
-    needed = "swarm: this needs mcap, which is not installed: pip install 'terrain-swarm[ros2]'"
+    needed = "swarm: this needs mcap, which is not installed: install the extra 'ros2' (docs/start/install.md)"
     assert (code, told.strip()) == (2, needed)
     (tmp_path / "empty").mkdir()
     code, _, told = swarm("export --mcap", tmp_path / "empty")

@@ -105,7 +105,7 @@ def test_the_command_on_a_small_install_says_what_to_install(words: list[str]) -
     assert done.stdout == ""
     [sentence] = done.stderr.splitlines()
     assert sentence.startswith(
-        "swarm: the command needs typer, which is not installed: pip install 'terrain-swarm[all]'"
+        "swarm: the command needs typer, which is not installed: install the extra 'all' (docs/start/install.md)"
     )
 
 
