@@ -33,7 +33,7 @@ an earlier one. Values are returned; no step calls back. The bus and the codec p
 The states of a planner:
 
 ============  ==============================================  =====================================================
-state         what it answers                                 what ends it
+state         replies                                         ends with
 ============  ==============================================  =====================================================
 without tree  NO_TARGET; a query waits for a second at most   the first search: current
 current       routes to the target                            a move that takes too long here: behind; a map that
@@ -41,7 +41,7 @@ current       routes to the target                            a move that takes 
                                                               without tree; a tracker lost for 30 s, or a target
                                                               unseen by vehicles at its position: searching
 behind        routes to the previous root; a worker searches  its tree is adopted and brought up to date: current
-searching     routes to places to search, SEARCHING            a sighting or a pose: current
+searching     routes to places to search, SEARCHING           a sighting or a pose: current
 standby       as above, but it pushes nothing                 the leader falls silent: it leads, and pushes a route
                                                               to every follower
 ============  ==============================================  =====================================================

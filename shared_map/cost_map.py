@@ -45,8 +45,8 @@ class CostMap:
 
     pace_s_per_m    float32 (rows, cols)  what may be driven and how fast; changed in place
     ground_s_per_m  float32 (rows, cols)  the same without inflation: compare what a sensor sees with this
-    prior_s_per_m   float32 (rows, cols) bare cost without marks: the prior, times learned factors
-    factors         float32 (KEYS,) learned factor on the prior of each terrain class
+    prior_s_per_m   float32 (rows, cols)  bare cost without marks: the prior, times learned factors
+    factors         float32 (KEYS,)       learned factor on the prior of each terrain class
     version         grows by one with every `apply` and `learn` that changed the ground
 
     learning  take in what authors have learned
@@ -218,7 +218,7 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     """Few windows which cover all cells: bounding boxes by tile, merged where they touch; one box if there are very
     many.
 
-    cells  int64 (n,) flat indices in a grid with `columns` columns
+    cells  int64 (n,)  flat indices in a grid with `columns` columns
     """
     if len(cells) == 0:
         return []

@@ -233,7 +233,7 @@ def check(
 
 
 def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    """facts collects facts on the way, for the last line"""
+    """facts  collects facts on the way, for the last line"""
     from launch_scripts.check import scenario_check
     from launch_scripts.check.findings import warning
     from launch_scripts.ports import check_ports

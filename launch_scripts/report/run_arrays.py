@@ -134,7 +134,7 @@ class RunTracks:
 class GroundPace:
     """The ground as the map knew it at the beginning, in blocks of `side` x `side` cells, the last ones cut off.
 
-    pace_s_per_m  float16 (rows, cols) mean of passable cells in a block; inf if there are none
+    pace_s_per_m  float16 (rows, cols)  mean of passable cells in a block; inf if there are none
     best_s_per_m  pace of the quickest cell
     """
 

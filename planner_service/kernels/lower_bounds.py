@@ -7,7 +7,7 @@ that a way either stays inside, or comes in over the window's rim for the last t
 
 Arrays, beside those of `layout`:
     starts     int64    (n,)     padded cells
-    cost       float64 (n,) s; the cost driven from each start, or inf
+    cost       float64  (n,)     s; the cost driven from each start, or inf
     bound      float64  (n,)     s; proven lower bound on the cost from each start
     heuristic  float32  (size,)  s; as `cost`; no step costs less than it falls by. Size 0 if there is none
 """

@@ -36,7 +36,7 @@ class Capacity:
     Which sets are refused depends on what came first, so replicas are equal only within the bounds. The bounds
     limit what a hostile author can cost to some 330 MB.
 
-    sets, marks held now
+    sets, marks  held now
     """
 
     def __init__(self, max_sets: int = MAX_SETS, max_marks: int = MAX_MARKS) -> None:

@@ -58,8 +58,8 @@ class Terrain:
     classes           uint8    TerrainClass
     digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
     climb             what a step costs for what it climbs; None if it costs the same both ways
-    least_s_per_m     top speed of any vehicle, with any mark or factor
-    flight_m          float32 height of the surface of a flying class; None for ground classes
+    least_s_per_m     lowest pace of any vehicle, with any mark or learned factor
+    flight_m          float32  height of the surface of a flying class; None for ground classes
     notes             sentences about its origin and processing
     zones             what each zone did to it; empty of a prepared one
     """

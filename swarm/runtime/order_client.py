@@ -22,7 +22,8 @@ _ASK_S = 2.0
 _ASKS_OF_KEEPERS = 2
 """Questions to keepers alone, before everybody is asked: a keeper knows best, others may know as much."""
 _ASKS_OF_NOBODY = 4
-"""Queries, one per second, that no informed process answered: a keeper may start a little later than others."""
+"""Number of queries, within a second in all, that no informed process answered: a keeper may start a little later
+than others."""
 _ASKS = 10
 """Queries without a timely reply, although a process is there."""
 

@@ -252,7 +252,7 @@ def target_labels(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Labels at pins and at sightings, by target. No target has two, and none that is drawn has none.
 
-    targets whose position a tracker published
+    posed  targets whose position a tracker published
     lost   those of them that no tracker publishes now
     seen   targets that vehicles saw
     """

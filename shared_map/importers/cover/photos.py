@@ -21,7 +21,7 @@ from swarm.grid import GridSpec
 MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
 _DARK = 30
-"""Limit of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
+"""Out of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
 channels have no meaning."""
 _LEGEND_COLOURS, _LEGEND_SAME = 64, 0.6
 """A drawn map has few colours, though CORINE's legend has 44, and most of its pixels are as those to the left and
