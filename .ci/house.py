@@ -43,16 +43,22 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
-def code_lines(path: Path) -> int:
-    """Number of physical lines that hold code."""
-    said: set[int] = set()
+def docstrings(path: Path) -> Iterator[ast.Constant]:
+    """Yields the docstrings of a file, those of constants and fields included."""
     for node in ast.walk(tree_of(path)):
         if (
             isinstance(node, ast.Expr)
             and isinstance(node.value, ast.Constant)
             and isinstance(node.value.value, str)
         ):
-            said.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+            yield node.value
+
+
+def code_lines(path: Path) -> int:
+    """Number of physical lines that hold code."""
+    said: set[int] = set()
+    for each in docstrings(path):
+        said.update(range(each.lineno, (each.end_lineno or each.lineno) + 1))
     code: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline):
         if token.type not in _NOT_CODE:

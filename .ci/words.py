@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import ast
 import io
 import re
 import sys
@@ -17,7 +16,8 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from house import ROOT, docstrings
+
 FIRST = re.compile(
     r"(What|Who|Whose|Whom|Whoever|Where|When|Why|Which|Whether|How|Of|So|As|That|Nobody|Somebody|Lets?)\b"
 )
@@ -27,17 +27,6 @@ BANNED = re.compile(
 )
 _CODE = re.compile(r"```.*?```|`[^`]*`|^ *[a-z_, ]+ {2,}", re.S | re.M)
 """Code, and the names that begin the rows of a docstring."""
-
-
-def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yields the line and the text of each docstring, those of constants and fields included."""
-    for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Expr)
-            and isinstance(node.value, ast.Constant)
-            and isinstance(node.value.value, str)
-        ):
-            yield node.lineno, node.value.value
 
 
 def comments(source: str) -> Iterator[tuple[int, str]]:
@@ -54,7 +43,7 @@ def faults_of(path: Path) -> Iterator[str]:
     if path.suffix == ".md":
         texts = [(number, line) for number, line in enumerate(_CODE.sub("`", text).splitlines(), 1)]
     else:
-        first = list(docstrings(ast.parse(text)))
+        first = [(each.lineno, str(each.value)) for each in docstrings(path)]
         for line, each in first:
             if found := FIRST.match(each.strip()):
                 yield f'{where}:{line}: a docstring begins with "{found[0]}": begin with a noun phrase or a verb'
