@@ -80,7 +80,7 @@ def ways() -> str:
 
 
 def ros2() -> str:
-    """Returns the page of what `swarm ros2` forwards and of its settings."""
+    """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
     incoming = incoming_rows(EXAMPLE, has_map=True)
     settings = scenario_page.settings(Settings)
     return filled("ros2", outgoing=TABLE, incoming=incoming, qos=_QOS, settings=settings)

@@ -245,9 +245,9 @@ def certs(
     makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
     allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
 
-    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
+    swarm role router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
 
-    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
+    swarm role agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
     Copy ca.pem and the two files of a name to the machine where it runs. ca.key stays here: its holder can admit
     any process. Existing certificates are kept while more than a third of their time is left.

@@ -95,7 +95,7 @@ class RunOptions:
     seconds        How long the run lasts once the swarm is up.
     seed           Seed of everything random.
     no_live        Serve no live view. The run is recorded all the same.
-    record_inputs  Record what every process hears, so that `swarm replay` can repeat it.
+    record_inputs  Record what every process hears, so that `swarm runs replay` can repeat it.
     metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
     follow         The camera follows this vehicle or target, as a0-07.
     plain          Plain lines instead of the live table.

@@ -1,4 +1,4 @@
-"""`swarm simulate` and `swarm sweep`: a swarm in one process, with many seeds, and over many machines."""
+"""`swarm simulate` and `swarm study`: a swarm in one process, with many seeds, and over many machines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.command_line.declaring import RUN, command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
 from swarm.errors import ConfigError, StoreError, writing
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from launch_scripts.simulation.study.trials import Result, Trial
 
 app = typer.Typer()
+study_app = family_app("Run scenarios with many settings and seeds, on many processes and machines.")
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
 _SHOWN_FAILURES = 20
 """Commands that replay a failure. A terminal of 24 lines shows this number and the last sentence; results.parquet
@@ -192,8 +193,8 @@ def _total(verdicts: Sequence[Verdict], wall_s: float) -> dict[str, Any]:
     }
 
 
-@command(app, RUN)
-def sweep(
+@command(study_app)
+def run(
     study: Annotated[str, typer.Argument(metavar="STUDY", autocompletion=complete.studies)],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
@@ -206,9 +207,9 @@ def sweep(
     also with other seeds or settings, runs only the missing trials. Exit code 1 if a law broke in any trial. It
     needs the extra "sweep" (Dask, pyarrow).
 
-    swarm sweep study.toml
+    swarm study run study.toml
 
-    swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
+    swarm study run study.toml --scheduler tcp://127.0.0.1:8786 --out results
 
     study      A .toml file with scenarios, settings and seeds, or a built-in name.
     scheduler  An existing cluster of Dask, such as tcp://127.0.0.1:8786.

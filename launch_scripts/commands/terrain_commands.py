@@ -43,13 +43,13 @@ if TYPE_CHECKING:
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
     See what a file holds, what a scenario costs on it, what a photo shows;
-    correct the scenario, and look again. Without files: synth, jacksboro.
+    correct the scenario, and look again. Without files: generate, jacksboro.
 
     swarm terrain info dem.tif
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
     swarm terrain rules --picture rules.png
-    swarm terrain synth --out dem.tif --photo photo.tif
+    swarm terrain generate --out dem.tif --photo photo.tif
 
     Where to get an elevation model, and the rule for cost: docs/terrain.md.
     """)
@@ -224,7 +224,7 @@ def rules(
 
 
 @command(app)
-def synth(
+def generate(
     out: Annotated[Path, typer.Option()],
     rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
     cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
@@ -238,7 +238,7 @@ def synth(
 ) -> None:
     """Make a synthetic landscape: mountains, rivers, forest, roads.
 
-    swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
+    swarm terrain generate --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
 
     out           Write the heights: .tif (in UTM 32) or .npz.

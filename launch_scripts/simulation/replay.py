@@ -192,7 +192,7 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
 
 
 def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
-    """Copies a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
+    """Copies a recording, up to a time, into a folder which `swarm runs replay` and a test can replay. Raises
     StoreError."""
     head, scenario = recorded.head, folder / SCENARIO_FILE
     path = path_of(folder, head.role, head.id, head.incarnation)

@@ -1,4 +1,4 @@
-"""`swarm mavlink`, whatever comes in whatever order: what is never said to a vehicle, and what always is."""
+"""`gateway mavlink`, whatever comes in whatever order: what is never said to a vehicle, and what always is."""
 
 from __future__ import annotations
 

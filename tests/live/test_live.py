@@ -133,7 +133,7 @@ def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: 
     other = tmp_path / "other.toml"
     text = live.path.read_text().replace("relief_m = 300", "relief_m = 310").replace("count = 2", "count = 3")
     other.write_text(text)
-    told = swarm("planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
+    told = swarm("role", "planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
     assert told.returncode == 5, told.stderr
     assert "terrain files or cost rules differ" in told.stderr
     assert "Traceback" not in told.stderr

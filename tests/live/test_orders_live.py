@@ -129,9 +129,9 @@ def test_a_bad_order_gets_a_sentence(live: LiveSwarm, words: tuple[str, ...], sa
 def test_settings_and_stops_are_obeyed(live: LiveSwarm) -> None:
     assert order(live, "set", "time_scale", "5")["silent"] == []
     assert order(live, "vehicle", "stop", "a0-00")["silent"] == []
-    said = swarm("orders", "--connect", live.endpoint).stdout
+    said = swarm("order", "ls", "--connect", live.endpoint).stdout
     assert "set time_scale 5" in said
     assert "vehicle a0-00" in said
     order(live, "vehicle", "go", "a0-00")
     order(live, "set", "time_scale", "--as-scenario")
-    assert "no orders" in swarm("orders", "--connect", live.endpoint).stdout
+    assert "no orders" in swarm("order", "ls", "--connect", live.endpoint).stdout

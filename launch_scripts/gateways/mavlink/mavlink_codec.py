@@ -157,7 +157,7 @@ def pymavlink() -> Any:
     try:
         from pymavlink.dialects.v20 import common
     except ModuleNotFoundError as error:
-        raise ConfigError("swarm mavlink needs pymavlink: install the extra 'mavlink'") from error
+        raise ConfigError("swarm gateway mavlink needs pymavlink: install the extra 'mavlink'") from error
     return common
 
 

@@ -1,4 +1,4 @@
-"""CPU that the gateway to ROS takes for vehicles: a made-up swarm, `swarm ros2` as users start it, one hearer."""
+"""CPU that the gateway to ROS takes for vehicles: a made-up swarm, `gateway ros2` as users start it, one hearer."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def ros2(
     vehicles: Annotated[int, typer.Option(min=25, help="A multiple of 25.")] = 100,
     seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 20.0,
 ) -> dict[str, Any]:
-    """CPU that `swarm ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
+    """CPU that `swarm gateway ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
 
     \b
     ./launch_scripts/bench ros2 --vehicles 100

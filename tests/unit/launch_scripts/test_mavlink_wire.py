@@ -1,4 +1,4 @@
-"""What comes over the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+"""What comes over the links of `gateway mavlink`: bytes become checked messages of one vehicle, nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swarm export`: what a run left, as another program reads it."""
+"""`swarm runs export`: what a run left, as another program reads it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def read_layers(folder: Path) -> dict[str, list[Any]]:
 def test_a_geojson_has_every_place_and_time_in_wgs84(
     run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
 ) -> None:
-    code, out, _ = swarm(f"export {run.name} --runs", run.parent, "--out", tmp_path)
+    code, out, _ = swarm(f"runs export {run.name} --runs", run.parent, "--out", tmp_path)
     assert (code, "4 vehicle_tracks" in out) == (0, True)
     layers = read_layers(tmp_path)
     assert len(layers["captures"]) == len(recorder.captures) > 0
@@ -128,7 +128,7 @@ def test_what_never_moved_is_a_point_and_no_line_without_a_length(run: Path) -> 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_every_format_holds_all_layers_that_it_can(run: Path, tmp_path: Path, swarm: Swarm, ending: str) -> None:
-    assert swarm("export", run, "--format", ending, "--out", tmp_path)[0] == 0
+    assert swarm("runs", "export", run, "--format", ending, "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
     if ending == "csv":
         rows = list(csv.DictReader((tmp_path / f"{run.name}-vehicle_tracks.csv").open()))
@@ -142,7 +142,7 @@ def test_every_format_holds_all_layers_that_it_can(run: Path, tmp_path: Path, sw
         found = dict(zip(meta["fields"].tolist(), values, strict=True))
         assert set(found["track_fid"].tolist()) == set(range(len(tracks.vehicles)))
         assert not np.isnat(found["time"]).any()
-        assert swarm("export", run, "--format", "gpx", "--what", "marks", "--out", tmp_path)[0] != 0
+        assert swarm("runs", "export", run, "--format", "gpx", "--what", "marks", "--out", tmp_path)[0] != 0
         return
     several = ending in ("gpkg", "kml")
     for name in ("vehicle_tracks", "target_tracks", "captures", "routes", "marks"):
@@ -153,7 +153,7 @@ def test_every_format_holds_all_layers_that_it_can(run: Path, tmp_path: Path, sw
 
 
 def test_a_file_with_costs_says_how_they_count(run: Path, tmp_path: Path, swarm: Swarm) -> None:
-    assert swarm("export", run, "--what", "routes", "--out", tmp_path)[0] == 0
+    assert swarm("runs", "export", run, "--what", "routes", "--out", tmp_path)[0] == 0
     (path,) = tmp_path.iterdir()
     assert json.loads(path.read_text())["description"] == COSTS
 
@@ -162,8 +162,8 @@ def test_without_pyogrio_a_sentence_says_what_to_install_and_tables_are_written(
     run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyogrio", None)
-    assert swarm("export", run, "--what", "captures", "--format", "csv", "--out", tmp_path)[0] == 0
-    code, _, told = swarm("export --what captures", run, "--out", tmp_path)
+    assert swarm("runs", "export", run, "--what", "captures", "--format", "csv", "--out", tmp_path)[0] == 0
+    code, _, told = swarm("runs export --what captures", run, "--out", tmp_path)
     assert (code, "install the extra 'vectors'" in told) == (2, True)
 
 
@@ -200,7 +200,7 @@ def test_another_program_reads_the_same_from_a_geopackage(
     run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
 ) -> None:
     out = tmp_path / f"{run.name}.gpkg"
-    assert swarm("export", run, "--format", "gpkg", "--out", tmp_path)[0] == 0
+    assert swarm("runs", "export", run, "--format", "gpkg", "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
     meta, _, shapes, values = raw.read(out, layer="vehicle_tracks")
     assert meta["crs"] == "EPSG:32632"
@@ -225,7 +225,7 @@ def test_another_program_reads_the_same_from_a_geopackage(
     assert cells.sum() == len(recorder.observed.marked().cells)
     assert len(raw.read(out, layer="routes")[2]) == len(recorder.routes.kept)
     assert len(raw.read(out, layer="captures")[2]) == len(recorder.captures)
-    assert swarm("map", "export", run / "map.sqlite", tmp_path / "marks.gpkg")[0] == 0
+    assert swarm("marks", "export", run / "map.sqlite", tmp_path / "marks.gpkg")[0] == 0
     assert len(raw.read(tmp_path / "marks.gpkg", layer="marks")[2]) == 3
 
 
@@ -271,7 +271,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path
         ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
         ((tmp_path / "empty",), "has no tracks.npz: the run has not ended yet"),
     ):
-        code, _, told = swarm("export", *words)
+        code, _, told = swarm("runs", "export", *words)
         assert (code, complaint in told, told.count("\n")) == (2, True, 1), told
     whole = (run / TRACKS_FILE).read_bytes()
     for number, broken in enumerate((b"", b"PK", whole[: len(whole) // 2], whole[:300] + bytes(100) + whole[400:])):

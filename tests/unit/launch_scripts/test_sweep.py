@@ -1,4 +1,4 @@
-"""`swarm sweep` without a cluster: what a study means, what a trial does, what is kept and told."""
+"""`swarm study run` without a cluster: what a study means, what a trial does, what is kept and told."""
 
 from __future__ import annotations
 
