@@ -214,7 +214,7 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
         if writer.cut is not None:
             raise StoreError(writer.cut)
         if reader.damaged is not None:
-            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
+            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until-s")
         scenario.write_bytes(head.scenario.encode())
     except OSError as error:
         raise StoreError(f"cannot write {scenario}: {error.strerror or error}") from error

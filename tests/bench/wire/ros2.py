@@ -30,7 +30,19 @@ _START_S = 60.0
 @contextlib.contextmanager
 def _gateway(swarm: str, ros: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     program = "import sys; from launch_scripts.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "ros2", "--connect", swarm, "--namespace", "bench", "--ros", ros]
+    command = [
+        sys.executable,
+        "-c",
+        program,
+        "gateway",
+        "ros2",
+        "--connect",
+        swarm,
+        "--namespace",
+        "bench",
+        "--ros",
+        ros,
+    ]
     with (folder / "ros2.log").open("w") as log:
         process = subprocess.Popen([*command, "--runs", str(folder)], stdout=log, stderr=log, text=True)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from typer._completion_classes import BashComplete  # what a shell asks: there i
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
+from launch_scripts.command_line.old_names import COMMANDS, OPTIONS, current
 from launch_scripts.command_line.run_command import EXTRAS
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
@@ -90,6 +92,42 @@ def test_every_command_answers_to_h_as_to_help(
             assert max(map(len, said[0].splitlines())) <= 80
         # The others inherit it.
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
+
+
+def test_the_short_help_fits_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["swarm", "-h"])
+    assert main() == 0
+    rows = capsys.readouterr().out.splitlines()
+    names = [
+        row.split()[0] for row in inspect.cleandoc(cli.Root.__doc__ or "").splitlines() if row.startswith("  ")
+    ]
+    assert len(rows) + len(names) - sum(row.startswith("  ") and row[2] != " " for row in rows) <= 24
+    assert max(map(len, rows)) < 80
+    assert len(names) == 12
+    assert "deploy" in " ".join(rows), "it names the commands that it does not explain"
+
+
+def test_an_old_name_is_told_once_and_stands_for_a_command_that_there_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = {" ".join(path): each for path, each in EVERY}
+    for old, new in COMMANDS.items():
+        assert old not in tree
+        assert new in tree
+        assert current([*old.split(), "--id", "x"])[0] == [*new.split(), "--id", "x"]
+    for name, renamed in OPTIONS.items():
+        known = {option for param in tree[name].params for option in param.opts}
+        for old, new in renamed.items():
+            assert (new if new.startswith("--") else old).partition("=")[0] in known
+    assert current(["zone", "add", "--until=9s"])[0] == ["order", "zone", "add", "--for=9s"]
+    monkeypatch.setattr(sys, "argv", ["swarm", "export", "--mcap", "--runs", "/nowhere"])
+    assert main() == 2
+    named, option, sentence = capsys.readouterr().err.splitlines()
+    assert named == "swarm: `swarm export` is now `swarm runs export`; the old name goes in 0.3"
+    assert option == "swarm: `--mcap` is now `--format mcap`; the old name goes in 0.3"
+    assert "no run" in sentence
 
 
 def test_every_option_has_one_name_and_says_what_it_is() -> None:
