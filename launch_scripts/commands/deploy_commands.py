@@ -254,8 +254,7 @@ def certs(
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Make certificates that its processes lack or that end soon, too, and replacements for those that it
-              revokes.
+    scenario  Make certificates that its processes lack, that end soon or that it revokes, too.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """

@@ -155,7 +155,7 @@ class Vehicle:
     group        Whose it is.
     radius       Metres around it that others keep clear.
     sysid        Its MAVLink system; if not given, the first autopilot.
-    lost_after   Seconds without a heartbeat or a position, after which it is left to its own fail-safe.
+    lost_after   Seconds without heartbeat or position, after which it is left to its fail-safe.
     signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
     """
 

@@ -146,9 +146,8 @@ def export(
     swarm runs export LAST --format mcap
 
     what    tracks, targets, captures, routes or marks; may be given several times; all by default.
-    format  geojson, csv or gpx, a file per layer; gpkg or kml, one file with all layers; mcap, a recording with
-            ROS 2 messages for Foxglove. By default that of --out, or geojson.
-    out     File with the ending of a format, or folder; by default export/ in the run's folder.
+    format  geojson, csv or gpx: a file per layer; gpkg or kml: one file; mcap: ROS 2 messages.
+    out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     force   Replace files that are there.
     """
     from launch_scripts.observe.run_folder import find_run

@@ -34,7 +34,7 @@ app = family_app("Run one process of a swarm, by hand, on any machine.")
 class Place(Tls):
     """Locations of a process's scenario, router and files.
 
-    connect      The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.
+    connect      The router's endpoint, such as tls/HOST:7447; by default that of the run.
     health_port  Answer probes on this port, at /healthz and /readyz; 0 picks one.
     """
 

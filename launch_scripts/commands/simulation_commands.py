@@ -53,17 +53,15 @@ def simulate(
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
-    With --seeds, processes crash and hang, links are cut, also one way, clocks are set, agents run twice, messages
-    are lost, late, repeated and out of order. Exit code 1 if a law broke in any seed: a collision, a lethal entry,
-    an acknowledged mark lost, replicas that differ, a wait of ten seconds without a reason, a vehicle without a
-    route.
+    With --seeds, processes crash and hang, links are cut, clocks are set, messages are lost, late and repeated.
+    Without a name each seed takes the next of the small worlds. Exit code 1 if a law broke in any seed, such as by
+    a collision, a lost mark or a vehicle without a route.
 
     swarm simulate --seeds 0:100 --jobs 2
 
     swarm simulate doors --seeds 17:18
 
-    scenario  A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, corridor,
-              maze. With --seeds and without a name each seed takes the next of these worlds.
+    scenario  A .toml file or a built-in name; with --seeds also small, wide, open, doors, corridor or maze.
     seed      Seed of everything random.
     seeds     Try the seeds A to B - 1, each with faults of every kind.
     seconds   Simulated seconds.

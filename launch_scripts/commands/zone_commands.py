@@ -59,8 +59,7 @@ def add(
 
     Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
 
-    polygon        Corners as 'LAT,LON LAT,LON ...', each of them also xy:X,Y or cell:ROW,COL; cell:0,0 is the
-                   north-west corner of the terrain.
+    polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
     polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
     file           A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.
     layer          Layer of a file that has several.
