@@ -78,8 +78,8 @@ def _shared_once(text: str) -> tuple[list[str], str]:
     def named(block: re.Match[str]) -> str:
         rows = block[0].splitlines()
         names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
-        told = ", ".join(f"`{name}`" for name in names).replace(_SWARM, "the swarm")
-        link = [f"* [shared](#shared-options): {told}"] if names else []
+        told = ", ".join(f"`{name}`" for name in names).replace(_SWARM, "[the swarm](#shared-options)")
+        link = [f"* {told}"] if names else []
         return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
 
     return shared, _OPTIONS.sub(named, text)

@@ -154,8 +154,8 @@ def top(
 def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
     """Check if a swarm is ready: exit code 0 if it is, 1 if not, 4 without a reply.
 
-    With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
-    there in a fraction of a second. Otherwise it asks the whole swarm over its router, for two seconds.
+    With --url, put first, it asks the processes of one machine, without a router. Otherwise it asks the whole swarm
+    over its router, for two seconds.
 
     swarm health --url http://127.0.0.1:9464
 

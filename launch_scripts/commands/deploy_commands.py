@@ -75,9 +75,9 @@ def plan(
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
     An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
-    standbys, run on machines of their own. A second plan into
-    the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
-    archives of machines that it does not have.
+    standbys, run on machines of their own. A second plan
+    into the same folder keeps certificates that neither end soon nor are revoked, and removes archives of machines
+    that it does not have.
 
     hosts  The machines, in TOML: see docs/deploy.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
@@ -169,11 +169,10 @@ def size(
 
     swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
 
-    Machines are used to 60 % of cores and memory, and links to half. A process that is too small for its load is
-    named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
-    and the density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
+    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured swarms the table is
+    extrapolated. docs/scaling.md has the table and its errors.
 
-    Exit code 1 if a process has to do more than one core can.
+    Exit code 1 if a process has to do more than one core can: more machines do not help it.
 
     vehicles   Vehicles.
     targets    Targets, each with a planner.

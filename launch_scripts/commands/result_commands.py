@@ -108,8 +108,7 @@ def _left(name: str, runs: Path) -> LeftRun:
 def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
     """Write the report of a run again: report.html, one file for any browser.
 
-    It has the run's metrics and their meaning, its map, plots over time, tables per target, group and vehicle, the
-    scenario as it ran, machine and versions. Every run writes it at its end.
+    It has metrics, map, plots, tables, the scenario as it ran, machine and versions. Every run writes it.
 
     swarm runs report LAST
     """
