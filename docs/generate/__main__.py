@@ -37,7 +37,7 @@ _QOS = {
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
 _OPTION = re.compile(r"^\* `.*", re.MULTILINE)
 _OPTIONS = re.compile(r"(?:^\* `.*\n)+", re.MULTILINE)
-_SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
 _SHARED = 2
 """An option with one text in this number of commands is explained once."""
@@ -78,7 +78,7 @@ def _shared_once(text: str) -> tuple[list[str], str]:
     def named(block: re.Match[str]) -> str:
         rows = block[0].splitlines()
         names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
-        told = ", ".join(f"`{name}`" for name in names).replace(_SWARM, "[the swarm](#shared-options)")
+        told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[the swarm](#shared-options)")
         link = [f"* {told}"] if names else []
         return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
 
