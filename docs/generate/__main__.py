@@ -96,6 +96,7 @@ def design() -> str:
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
+    wire_page.JSON_PATH: wire_page.json_document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
     _REFERENCE / "cli.md": command_line,

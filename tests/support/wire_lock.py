@@ -15,14 +15,12 @@ from typing import Any
 
 import msgspec
 
-from docs.generate.wire_page import messages, parts, rows
+from docs.generate.wire_page import REQUIRED, messages, parts, rows
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
 
 PATH = Path(__file__).parents[2] / "docs" / "wire.lock"
-REQUIRED = " | refused"
-"""The end of a field without a default, as on the page of the wire."""
 NEVER_STEP = ("run", "nothing")
 """Messages by which builds of any two versions say which they are."""
 
@@ -105,7 +103,7 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
             yield f"{sentence}: {name} needs a step to its next version (swarm/wire/versions.py)"
         for struct, fields in before["structs"].items():
             for field in now["structs"].get(struct, [])[len(fields) :]:
-                if field.endswith(REQUIRED):
+                if field.endswith(f" | {REQUIRED}"):
                     added = f"{struct}.{field.partition(' | ')[0]} is added without a default"
                     yield f"{added}: builds before this one do not send it"
     elif name in NEVER_STEP:
