@@ -300,8 +300,8 @@ def _hills(rows: int, cols: int, seed: int, strength: float) -> Pace:
 def maps(panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
     """A figure of maps side by side."""
     figure = Figure(figsize=size, layout="constrained")
-    bare = {"xticks": [], "yticks": []}
-    return figure, list(np.atleast_1d(figure.subplots(1, panels, subplot_kw=bare)))
+    axes = figure.subplots(1, panels, subplot_kw={"xticks": [], "yticks": []})
+    return figure, list(np.atleast_1d(axes))
 
 
 def draw_ground(axes: Axes, pace: Pace) -> None:
