@@ -53,7 +53,7 @@ _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
 _LEAST_SIDE, _MOST_SIDE = 32, 16_384
 """Cells of a side: one tile of marks (`TILE_CELLS`), and the largest terrain that a scenario may have
-(docs/operate/limits.md)."""
+(docs/reference/limits.md)."""
 
 
 @command(app)
@@ -79,7 +79,7 @@ def plan(
     the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
     archives of machines that it does not have.
 
-    hosts  The machines, in TOML: see docs/deploy.md.
+    hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
     kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.

@@ -1,4 +1,4 @@
-"""Three machines, as docs/deploy.md says word by word, and the loss of one of them for good.
+"""Three machines, as docs/operate/machines.md says word by word, and the loss of one of them for good.
 
 Figures, of so many losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
 
@@ -29,12 +29,12 @@ from swarm.liveness import job_of, split_rank
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-PAGE = Path(__file__).parents[2] / "docs" / "deploy.md"
+PAGE = Path(__file__).parents[2] / "docs" / "operate" / "machines.md"
 COMMANDS_AT_MOST = 6
 LOST = "alpha"
 LOOKS_FROM, THROUGH = "desk", "bravo"
 LONGEST_S = 60.0
-"""Beside other tests on two cores; what it takes alone is in docs/deploy.md."""
+"""Beside other tests on two cores."""
 ADDRESSES = {"alpha": "10.77.0.1", "bravo": "10.77.0.2", "charlie": "10.77.0.3", LOOKS_FROM: "10.77.0.9"}
 PER_AGENT = 2
 SCENARIO = f"""
@@ -77,7 +77,7 @@ class Deployed:
             f'case "$1" in\n{cases}esac\nmkdir -p "$place"; cd "$place"; exec ip netns exec "$space" sh -c "$2"',
         )
         (folder / "my.toml").write_text(SCENARIO)
-        (folder / "hosts.toml").write_text("\n".join(block("From nothing", 0)))
+        (folder / "hosts.toml").write_text("\n".join(block("Steps", 0)))
 
     def follow(self, commands: list[str]) -> None:
         """Runs the commands of the page: those of `ssh` side by side, as they last as long as the swarm."""
@@ -115,7 +115,7 @@ def deployed(folder: Path) -> Iterator[tuple[Deployed, Onlooker]]:
     }
     with machines(ADDRESSES, environment) as network:
         made = Deployed(folder, network)
-        made.follow([*block("From nothing", 1), *block("Without systemd", 0)])
+        made.follow([*block("Steps", 1), *block("Without systemd", 0)])
         scenario = folder / "my.toml"
         endpoint = f"tls/{ADDRESSES[THROUGH]}:7447"
         onlooker = Onlooker(network, LOOKS_FROM, scenario, endpoint, made.kits / "certs")
@@ -247,7 +247,7 @@ def test_the_page_brings_up_three_machines_and_the_loss_of_one_costs_no_route_an
 
 
 def test_the_page_needs_few_commands() -> None:
-    assert len(block("From nothing", 1)) + len(block("From nothing", 2)) <= COMMANDS_AT_MOST
+    assert len(block("Steps", 1)) + len(block("Steps", 2)) <= COMMANDS_AT_MOST
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A run on two machines, as docs/deploy.md says: certificates, a launcher on each, a name that is revoked."""
+"""A run on two machines, as the page says: certificates, a launcher on each, a name that is revoked."""
 
 from __future__ import annotations
 

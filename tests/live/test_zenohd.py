@@ -1,5 +1,5 @@
 """zenohd and its storage-manager plugin as router and store. Opt-in: `ZENOHD=/opt/zenohd pytest -m zenohd`, or
-zenohd on PATH with the plugin beside it; `docs/deploy.md` says how to install them."""
+zenohd on PATH with the plugin beside it; `docs/operate/routers.md` says how to install them."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def test_the_python_of_the_tutorial_runs_as_it_says():
     assert failed == 0
 
 
-@pytest.mark.parametrize("page", ["tutorial/scenario.md", "tutorial/terrain.md"])
+@pytest.mark.parametrize("page", ["operate/scenario.md", "tutorial/terrain.md"])
 def test_every_scenario_of_the_tutorial_is_accepted(page):
     blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
     assert blocks
