@@ -1,4 +1,4 @@
-"""The pictures of docs/method.md, computed by the planner's own trees on small grids. They are deterministic.
+"""The pictures of docs/method/paper.md, computed by the planner's own trees on small grids. They are deterministic.
 
 python -m docs.generate.method_pictures [NAME ...]
 

@@ -1,4 +1,4 @@
-"""The pictures of docs/pulled.md and docs/air.md: routes on terrain, found as `swarm.client`'s users find them.
+"""The pictures of docs/behaviour/any-angle.md and fly.md: routes on terrain, as users of `swarm.client` find them.
 
 python -m docs.generate.route_pictures [NAME ...]
 """

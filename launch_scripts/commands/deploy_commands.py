@@ -171,7 +171,7 @@ def size(
 
     Machines are used to 60 % of cores and memory, and links to half. A process that is too small for its load is
     named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
-    and the density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
+    and the density of the scenario `thousand`; see docs/design/measurement.md for the table and its errors.
 
     Exit code 1 if a process has to do more than one core can.
 

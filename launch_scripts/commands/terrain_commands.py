@@ -51,7 +51,7 @@ app = family_app("""Look at terrains: what a file holds, what it costs, what a p
     swarm terrain rules --picture rules.png
     swarm terrain synth --out dem.tif --photo photo.tif
 
-    Where to get an elevation model, and the rule for cost: docs/terrain.md.
+    Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()
 _TIFF = (".tif", ".tiff")

@@ -243,7 +243,7 @@ def _step(
 
 
 def lower_bound(tree: CostToGoTree, heuristic: NDArray[np.float32] | None, cell: int, cost: float) -> float:
-    """s, what is proven of a padded cell that costs so much, as docs/certificates.md has it."""
+    """s, what is proven of a padded cell that costs so much, as docs/method/certificates.md has it."""
     grid = tree.cost_grid
 
     def rounding(cost: float) -> float:

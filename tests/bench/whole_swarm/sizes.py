@@ -1,4 +1,17 @@
-"""What a swarm costs by its number of vehicles, live or simulated: one size after the other."""
+"""Cost of a swarm by its number of vehicles, live or simulated: one size after the other.
+
+up                  from the command until all processes are alive and a route was served
+vehicle answered    from the command until every vehicle has a route, or was told that there is none
+ticks late          taken later than half a period after they were due, or never
+CPU of all          1,000 ms/s are one core; the processes that measure are not in it
+CPU of other work   of the whole machine, the processes that measure included; it makes ticks late
+sent, delivered     payloads only; delivered in a simulation is per simulated second
+a route query       from the question of a client beside the swarm to the parsed answer, 20 times a second
+over a raw get      a plain Zenoh get of as many bytes, in turn with it
+memory of all       proportional set size: shared pages count for their share
+times real time     simulated seconds over seconds of CPU
+power               exponent of the power of the number of vehicles that fits best
+"""
 
 from __future__ import annotations
 
@@ -24,7 +37,7 @@ MOST_LATE_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One row; docs/scale-figures.md says what each means.
+    """One row of the table.
 
     key     where it is in the figures of a run: `cpu_ms_per_s.agent` is in a dictionary
     times   what it is multiplied by to be shown
@@ -127,15 +140,15 @@ def swarm(
 
     \b
     ./launch_scripts/bench swarm --vehicles 1000
-    ./launch_scripts/bench swarm --series --write docs/scale-figures.md
+    ./launch_scripts/bench swarm --series --write sizes.md
     ./launch_scripts/bench swarm --vehicles 100,200,400,1000 --per-agent 25 --simulated
     bench swarm --vehicles 1000 --time-scale 0.001 --simulated     # what is told though nothing changes
 
     Starts the processes of `swarm up` on a free port of this machine, waits until every vehicle has a route,
     measures, and ends them: the scenario is `thousand` with a map that grows with the vehicles. With several sizes
     one after the other, and the power of the number of vehicles by which each figure grows. With --simulated the
-    same swarm in one process; each size gets 90 seconds of CPU at most. docs/scale-figures.md says what the rows
-    mean.
+    same swarm in one process; each size gets 90 seconds of CPU at most. The head of
+    tests/bench/whole_swarm/sizes.py says what the rows mean.
 
     Exit code 1 if vehicles met or entered lethal cells, or a size could not be measured.
     """

@@ -281,7 +281,7 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
 
 
 def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
-    """docs/scale-figures.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
+    """docs/method/measurements.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
     for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.450, 745), (1000, 512, 0.677, 889)):
         scenario = parse_scenario(
             f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"

@@ -123,12 +123,12 @@ def test_every_file_and_folder_that_a_page_names_exists(page):
 
 
 def test_the_python_of_the_tutorial_runs_as_it_says():
-    failed, tried = doctest.testfile(str(ROOT / "docs" / "tutorial" / "python.md"), module_relative=False)
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "science" / "python.md"), module_relative=False)
     assert tried > 8
     assert failed == 0
 
 
-@pytest.mark.parametrize("page", ["operate/scenario.md", "tutorial/terrain.md"])
+@pytest.mark.parametrize("page", ["operate/scenario.md", "gis/terrain.md", "gis/costs.md", "gis/vectors.md"])
 def test_every_scenario_of_the_tutorial_is_accepted(page):
     blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
     assert blocks

@@ -1,4 +1,4 @@
-"""What docs/method.md says of the paper's printed rules holds of them."""
+"""What docs/method/paper.md says of the paper's printed rules holds of them."""
 
 from __future__ import annotations
 
