@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from launch_scripts.observe.fact_table import count, grouped
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
 from launch_scripts.report.run_picture import (
@@ -34,7 +34,8 @@ from launch_scripts.report.run_picture import (
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text
-from swarm.errors import StoreError, writing
+from swarm.errors import StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 
 PAGE_FILE = "report.html"
@@ -54,8 +55,7 @@ def write_page(folder: Path) -> Path:
         text = page_of(folder, report)
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, ArithmeticError, TemplateError) as error:
         raise StoreError(f"{folder / REPORT_FILE} is damaged: {type(error).__name__}: {error}") from error
-    with writing(path):
-        write_file(path, text.encode())
+    write_file(path, text.encode())
     return path
 
 

@@ -31,7 +31,7 @@ def test_a_folder_that_takes_no_data_is_named_once_a_minute_and_when_it_does_aga
     folder = tmp_path / "run"
     watch = DiskWatch(folder)
     said = {now_s: watch.check_room(float(now_s)) for now_s in range(100)}
-    sentence = f"cannot write to {folder}: No such file or directory; all goes on but logs and recording"
+    sentence = f"cannot write {folder}: No such file or directory; all goes on but logs and recording"
     assert {now_s: each for now_s, each in said.items() if each} == {0: sentence, 60: sentence}
     folder.mkdir()
     later = [watch.check_room(float(now_s)) for now_s in range(100, 200)]

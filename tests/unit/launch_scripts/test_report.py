@@ -17,7 +17,6 @@ from support import fake_run
 
 from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import write_file
 from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
@@ -27,6 +26,7 @@ from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -162,8 +162,9 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenari
     report = make_report(recorder, terrain)
     with pytest.raises(StoreError, match=r"cannot write .*nowhere/report\.json: No such file"):
         write_report(tmp_path / "nowhere", report, recorder, terrain)
-    with pytest.raises(FileNotFoundError, match=r"nowhere/notes'$"):
-        write_file(tmp_path / "nowhere" / "notes", b"")
+    for path in (Path("/dev/full"), Path("/sys/notes")):  # ENOSPC, EACCES
+        with pytest.raises(StoreError, match=rf"cannot write {path}: (No space|Permission)"):
+            write_file(path, b"1")
 
 
 def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:
