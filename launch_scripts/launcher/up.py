@@ -49,7 +49,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
-from swarm.liveness import job_of
+from swarm.liveness import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
@@ -245,12 +245,15 @@ class _Run:
         scenario = as_process(self._options.scenario, spec.role, spec.id)
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
+        incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
+        if self._known is not None and self._take_over is None:  # else the lives before are its own, too
+            self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
-            incarnation=next_incarnation(self._run_dir, spec.role, spec.id),
+            incarnation=incarnation,
             started_ns=self._started_ns,
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,

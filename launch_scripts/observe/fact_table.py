@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
+from launch_scripts.plain_text import Duration
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 
@@ -60,8 +61,8 @@ def count(value: float | None) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """34 s"""
-    return NONE if value is None else f"{value:,.0f} s"
+    """34 s, 19 min"""
+    return NONE if value is None else str(Duration(value))
 
 
 def distance(value_m: float | None) -> str:
@@ -247,7 +248,7 @@ def together(alarms: Sequence[Alarm]) -> str:
     first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
     others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    lasting = "the first " if first.lasts else "over, the first "
+    lasting = "the longest " if first.lasts else "over, the first "
     return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when}"
 
 

@@ -6,6 +6,7 @@ import base64
 import io
 import re
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from launch_scripts.report.run_picture import (
 )
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
+from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.errors import StoreError
 from swarm.files import write_file
@@ -101,10 +103,13 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
     size = report.get("terrain") or {}
     grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
+    began = (report.get("made") or {}).get("began")
+    began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
     told = [
         Alarm(
             row["kind"], row["about"], row["text"], row["since_s"], row["over_s"],
-            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"],
+            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"], row.get("heard_s"),
+            began_ns,
         )
         for row in report.get("alarms") or []
     ]  # fmt: skip
