@@ -1,4 +1,4 @@
-"""How texts, moments and durations are written for people, on a terminal, in a log and on a page.
+"""The written form of texts, moments and durations for people, on a terminal, in a log and on a page.
 
 A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. They are two types, so that
 no sentence says one for the other; a time after "since" would be neither.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -99,6 +100,12 @@ def run_swarm(options: UpOptions) -> int:
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
     """The processes that are started here, in words."""
     return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
+
+
+def _how_busy() -> str:
+    """The load of this machine, in words."""
+    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    return f"the machine is {'' if load > cores else 'not '}overloaded: load {load:.1f} on {cores} cores"
 
 
 def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
@@ -212,9 +219,11 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        code = self._end(known, seconds)
         if self._startup_s is None and not self._stop_asked:
-            failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
+            missing = ", ".join(self._missing(watcher)) or "routes"
+            failures.append(f"the swarm was never whole: missing {missing}; {_how_busy()}")
+        has_run = isinstance(known, OwnPart) or known.routed or not failures
+        code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
@@ -406,11 +415,11 @@ class _Run:
         alive = sum(running.alive for running in self._swarm.running)
         return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
-    def _end(self, known: Recorder | OwnPart, seconds: float) -> int:
+    def _end(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds))
+                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds, failures))
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code
@@ -432,7 +441,7 @@ class _Run:
         else:
             self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
 
-    def _report(self, known: Recorder | OwnPart, seconds: float) -> bool:
+    def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""
         measured: dict[str, Any] = {"run_id": self._run_id, "seconds": seconds, "startup_s": self._startup_s}
         as_json = self._options.as_json
@@ -442,7 +451,7 @@ class _Run:
             else:
                 self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
             return True
-        report = make_report(known, self._terrain, **measured)
+        report = make_report(known, self._terrain, failures=failures, **measured)
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
         if as_json:
             self._terminal.print_json(json.dumps(numbers, indent=2))

@@ -82,7 +82,7 @@ class Alarm:
 
     @property
     def serious(self) -> bool:
-        return self.kind in _SERIOUS
+        return is_serious(self.kind)
 
     @property
     def label(self) -> str:
@@ -127,6 +127,11 @@ class Alarm:
             "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
             "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "target": self.target,
         }  # fmt: skip
+
+
+def is_serious(kind: str) -> bool:
+    """Returns True of what must not be, or stops a part of the run."""
+    return kind in _SERIOUS
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from launch_scripts.observe.fact_table import count, grouped
+from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
@@ -82,8 +82,10 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         facts=headline(report, folder.resolve().name),
         cards=cards(report),
+        verdict=(said := str(report.get("verdict") or "")),
+        well=WELL in said,
         alarms=_alarms(report),
-        left_behind=_left_behind(report),
+        left_behind=left_behind(report),
         map=_map(folder, report),
         slower=SLOWER,
         quicker=QUICKER,
@@ -118,18 +120,6 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
         for line, alarms in grouped(told, grid)
     ]
     return sorted(groups, key=lambda group: not group[1])
-
-
-def _left_behind(report: Mapping[str, Any]) -> list[str]:
-    """Returns unfinished business of vehicles, in sentences."""
-    vehicles, routed = report["vehicles"], report.get("vehicles_routed")
-    unrouted = 0 if routed is None else vehicles - routed
-    told = (
-        (report.get("lost"), "are lost at the end"),
-        (report.get("stranded"), "are stranded at the end"),
-        (unrouted, "never had a route"),
-    )
-    return [f"{count(number)} of {count(vehicles)} vehicles {words}" for number, words in told if number]
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:

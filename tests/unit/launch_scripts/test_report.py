@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from support import fake_run
 
+from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report import run_picture as picture
@@ -31,27 +33,10 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 
 ASKED_FOR = [
-    "scenario",
-    "seed",
-    "seconds",
-    "vehicles",
-    "targets",
-    "processes",
-    "restarts",
-    "captures",
-    "stranded",
-    "lost",
-    "reroute_requests",
-    "marks",
-    "routes_served",
-    "collisions",
-    "lethal_entries",
-    "startup_s",
-    "gap",
-    "growth_ms",
-    "route_query_ms",
-    "mark_to_tree_ms",
-]
+    "scenario", "seed", "seconds", "vehicles", "targets", "processes", "restarts", "captures", "stranded", "lost",
+    "reroute_requests", "marks", "routes_served", "collisions", "lethal_entries", "startup_s", "gap", "growth_ms",
+    "route_query_ms", "mark_to_tree_ms",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +73,12 @@ def test_the_report_has_every_number_that_was_asked_for(
     assert report["captures"] == len(played.captures) > 0
     assert report["marks"] == report["marked_cells"] > 0
     assert report["vehicles_routed"] == 10
+    outcome = r"10 of 10 vehicles routed, \d+ captures?, no collision\. All went well\."
+    assert re.fullmatch(outcome, report["verdict"])
+    worse = {**report, "collisions": 1, "lost": 2}
+    assert verdict(worse, ["agent-a0 did not end"]).endswith(
+        "1 collision. Not all went well: agent-a0 did not end; collisions 1; 2 of 10 vehicles lost at the end."
+    )
     assert set(report["gap"]) == {"mean", "p95", "max"}
     assert set(report["growth_ms"]) == {"p50", "p99"}
     assert len(report["series"]["t_s"]) == len(report["series"]["captures"]) >= 10
