@@ -120,7 +120,7 @@ def test_what_does_not_go_together_may_not_stay(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["ca", "a0"])
 def test_a_key_is_for_its_owner_only_whatever_was_left(tmp_path: Path, name: str) -> None:
-    left = tmp_path / f"{name}.key.part"
+    left = tmp_path / f"{name}.{os.getpid()}.part.key"
     left.write_text("")
     left.chmod(0o666)
     with left.open() as reader:
