@@ -58,7 +58,7 @@ def _locked(kind: type[Message]) -> dict[str, Any]:
 
 
 def _layout(struct: type[msgspec.Struct]) -> str:
-    """How fields are written, and whether what a later build adds is read past."""
+    """The layout of fields, and whether fields of a later build are skipped."""
     config = struct.__struct_config__
     return ("list" if config.array_like else "map") + (", no other fields" if config.forbid_unknown_fields else "")
 
@@ -69,7 +69,7 @@ def document() -> str:
 
 
 def faults() -> list[str]:
-    """What breaks the rules since the lock was written last, a sentence each."""
+    """Broken rules since the lock was written last, a sentence each."""
     return list(broken(json.loads(PATH.read_text(encoding="utf-8")), lock()))
 
 
@@ -113,7 +113,7 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
 
 
 def _changed(before: Lock, now: Lock) -> Iterator[str]:
-    """What is written otherwise in one version of a message. Fields may be added behind the others."""
+    """The differences in one version of a message. Fields may be added behind the others."""
     for struct, fields in before["structs"].items():
         kept = now["structs"].get(struct, [])
         for index, field in enumerate(fields):

@@ -1,4 +1,4 @@
-"""A full disk stops nobody but what needs it, and that says so.
+"""A full disk stops only the parts that need it, and these report it.
 
 /dev/full, which takes no byte, and a limit of the size of files stand for it.
 """

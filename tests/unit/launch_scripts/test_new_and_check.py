@@ -207,7 +207,7 @@ def test_more_plots_than_agents_have_use_for_are_a_warning_with_what_to_set() ->
         "map.plot_regions: 4 agents share 256 plots of right of way, and speak of each in which vehicles drive"
         " 10 times a second; set it to 4, for larger ones"
     )
-    assert list(plots(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have nobody to tell
+    assert list(plots(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have no third
     assert list(plots(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
     assert list(plots(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 

@@ -1,4 +1,4 @@
-"""What the recorder makes of what it heard."""
+"""The recorder's figures for the messages that it heard."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_n
 
 
 def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
-    """So who heard all lives and who heard only the last have the same sums."""
+    """A recorder of all incarnations has the same sums as a recorder of the last only."""
     first = stats("agent", "a0", 1, 2.0, {"marks": 7})
     second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
     other = stats("agent", "a0", 5, 6.0, {"marks": 100})
@@ -395,7 +395,7 @@ def sample(time_s: float) -> Sample:
 
 
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recorder) -> None:
-    """What a recorder holds, by its own lists: captures, samples and places are all bounded."""
+    """The size of a recorder by its own lists: captures, samples and places are all bounded."""
 
     def record(from_s: int, until_s: int, step_s: int) -> int:
         for at_s in range(from_s, until_s, step_s):

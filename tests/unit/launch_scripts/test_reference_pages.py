@@ -1,4 +1,4 @@
-"""The generated pages say what the code says; a setting that nobody explains is refused."""
+"""The generated pages agree with the code; a setting without an explanation is refused."""
 
 from __future__ import annotations
 

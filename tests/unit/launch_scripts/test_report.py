@@ -1,4 +1,4 @@
-"""What a run leaves behind: the numbers and the picture."""
+"""The results of a run: the numbers and the picture."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenar
     write_report(tmp_path, report, recorder, terrain)
     assert report["captures"] is None
     assert (tmp_path / "report.png").stat().st_size > 10_000
-    # It may be stopped before a vehicle has told where it is.
+    # It may be stopped before a vehicle has reported its place.
     series = {"t_s": [0.5], **{state.name.lower(): [0] for state in VehicleState}}
     assert not plots.PLOTS[0].draw(Figure().add_subplot(), plots.PLOTS[0], {"series": series})
 

@@ -139,7 +139,7 @@ class Part:
         self.watcher.listen(0.0)
 
     def deliveries(self) -> list[str]:
-        """Topics of what has arrived at the launcher."""
+        """Topics of the samples that have arrived at the launcher."""
         return [topic for _, _, to, topic, payload in self.swarm.deliveries if to == "launcher" and payload]
 
 

@@ -1,4 +1,4 @@
-"""What a planner tells people about trackers: one sentence for each oddity, all counted, nothing lost."""
+"""A planner's sentences about trackers: one for each oddity, all counted, none lost."""
 
 from __future__ import annotations
 
