@@ -16,7 +16,8 @@ import typer
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
-from swarm.errors import ConfigError, StoreError, writing
+from swarm.errors import ConfigError, StoreError
+from swarm.files import writing
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -49,7 +50,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
-from swarm.liveness import job_of
+from swarm.liveness import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
@@ -99,6 +100,12 @@ def run_swarm(options: UpOptions) -> int:
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
     """The processes that are started here, in words."""
     return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
+
+
+def _how_busy() -> str:
+    """The load of this machine, in words."""
+    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    return f"the machine is {'' if load > cores else 'not '}overloaded: load {load:.1f} on {cores} cores"
 
 
 def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
@@ -212,9 +219,11 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        code = self._end(known, seconds)
         if self._startup_s is None and not self._stop_asked:
-            failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
+            missing = ", ".join(self._missing(watcher)) or "routes"
+            failures.append(f"the swarm was never whole: missing {missing}; {_how_busy()}")
+        has_run = isinstance(known, OwnPart) or known.routed or not failures
+        code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
@@ -245,12 +254,15 @@ class _Run:
         scenario = as_process(self._options.scenario, spec.role, spec.id)
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
+        incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
+        if self._known is not None and self._take_over is None:  # else the lives before are its own, too
+            self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
-            incarnation=next_incarnation(self._run_dir, spec.role, spec.id),
+            incarnation=incarnation,
             started_ns=self._started_ns,
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
@@ -403,11 +415,11 @@ class _Run:
         alive = sum(running.alive for running in self._swarm.running)
         return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
-    def _end(self, known: Recorder | OwnPart, seconds: float) -> int:
+    def _end(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds))
+                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds, failures))
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code
@@ -429,7 +441,7 @@ class _Run:
         else:
             self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
 
-    def _report(self, known: Recorder | OwnPart, seconds: float) -> bool:
+    def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""
         measured: dict[str, Any] = {"run_id": self._run_id, "seconds": seconds, "startup_s": self._startup_s}
         as_json = self._options.as_json
@@ -439,7 +451,7 @@ class _Run:
             else:
                 self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
             return True
-        report = make_report(known, self._terrain, **measured)
+        report = make_report(known, self._terrain, failures=failures, **measured)
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
         if as_json:
             self._terminal.print_json(json.dumps(numbers, indent=2))

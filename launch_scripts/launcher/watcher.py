@@ -41,6 +41,8 @@ _OTHER_LINES = 4
 class OwnPart(LatestState):
     """The processes that a launcher has started, and who else is there. They are all of its plan."""
 
+    hears = (STATS,)
+
     def __init__(self, grid: GridSpec, started_ns: int) -> None:
         super().__init__(RunPlan((), (), 0, started_ns), grid)
         self.own: frozenset[ProcessSpec] = frozenset()

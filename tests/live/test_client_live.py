@@ -63,7 +63,7 @@ def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live:
         assert all("gets no route to t0" in line for line in run.end(within_s=60).splitlines())
         assert run.process.returncode == 0
         eventually(lambda: "rover" not in watching.vehicles, 3, "the rover's leaving")
-        # What it said, and not what holds: vehicles that see the same ground may state otherwise at once.
+        # The author's statement, not the winner: vehicles that see the same ground may state otherwise at once.
         eventually(lambda: any(".rover." in author for _, author in watching._sets), 10, "its marks")
         said = next(each for (_, author), each in watching._sets.items() if ".rover." in author)
         assert set(struct.unpack(f"<{len(said.paces) // 4}f", said.paces)) == {0.5}

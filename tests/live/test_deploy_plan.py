@@ -1,6 +1,6 @@
 """Three machines, as docs/operate/machines.md says word by word, and the loss of one of them for good.
 
-Figures, of so many losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
+Figures for a number of losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
 
 from __future__ import annotations
 
@@ -164,19 +164,19 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
     orphans = {vehicle: before["targets"][vehicle] for vehicle in left if before["targets"][vehicle] in gone.leads}
     acknowledged = before["acknowledged"][gone.ids["keeper"][0]]
 
-    # Who answered last is the one that is gone; its standby may have led before, too.
+    # The planner that answered last has ended; its standby may have led before, too.
     dead = {
         target: max(before["answered"][target].items(), key=lambda life: life[1][1])[0] for target in gone.leads
     }
 
     def answers(target: str) -> list[float]:
-        """When others than the dead planner first answered after the loss."""
+        """Time of the first answer after the loss by another planner than the dead one."""
         found = onlooker.notes["answered"][target]
         return [first for life, (first, _) in found.items() if life != dead[target] and first > lost_s]
 
     def first_routes() -> list[float]:
-        """Of each vehicle whose planner is gone: when another one pushed a route, or it began one, perhaps of
-        another target."""
+        """For each vehicle whose planner has ended: the time at which another planner pushed a route, or the
+        vehicle began one, perhaps of another target."""
         notes = onlooker.notes
         return [
             min(
@@ -211,7 +211,7 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
 
 
 def steady(leads: dict[str, float], planner: str) -> bool:
-    """Whether a planner leads, and none of its standbys has for a while."""
+    """True if a planner leads, and none of its standbys has led for a while."""
     others = [at_s for id, at_s in leads.items() if id != planner and job_of(id) == planner]
     now_s = time.monotonic()
     return now_s - leads.get(planner, -math.inf) < 1.0 and now_s - max(others, default=-math.inf) > 3.0

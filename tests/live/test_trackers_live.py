@@ -1,4 +1,4 @@
-"""A target whose tracker is a process from outside: served, stolen by nobody, lost, regained, handed over."""
+"""A target whose tracker is an outside process: served, never stolen, lost, regained, passed on."""
 
 from __future__ import annotations
 

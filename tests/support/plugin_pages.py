@@ -21,7 +21,7 @@ def write_example(kind: str, folder: Path, more: str = "") -> Path:
 
 
 def write_all_examples(folder: Path, more: str) -> Path:
-    """As `write_example` of all pages together: one scenario with a plug-in of every kind, after `more`."""
+    """Like `write_example` for all pages together: one scenario with a plug-in of every kind, after `more`."""
     arrays: list[str] = []
     tables: dict[str, list[str]] = {}
     for kind in PLUGIN_KINDS:

@@ -1,4 +1,4 @@
-"""Each alert asks for what is exported, says what to do, and fires on what it is about."""
+"""Each alert queries an exported metric, names a remedy, and fires on its condition."""
 
 from __future__ import annotations
 

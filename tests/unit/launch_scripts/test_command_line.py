@@ -25,7 +25,7 @@ from swarm.config.setting_types import Walk
 
 
 def offered(*words: str) -> list[str]:
-    """What the shell is offered after these words; the last is not finished."""
+    """Completions of the shell after these words; the last is not finished."""
     shell = BashComplete(command(), {}, "swarm", "_SWARM_COMPLETE")
     return [item.value for item in shell.get_completions(list(words[:-1]), words[-1])]
 
@@ -43,9 +43,9 @@ ROLES = {
     "PIL", "cryptography", "jinja2", "llvmlite", "markupsafe", "matplotlib", "msgpack", "msgspec", "numba", "numpy",
     "packaging", "prometheus_client", "psutil", "rasterio", "rich", "scipy", "typer", "yaml", "zenoh",
 }  # fmt: skip
-"""What the extra `roles` brings, by the names of its modules."""
+"""Modules that the extra `roles` brings."""
 SAID_ELSEWHERE = {"pymavlink", "pyproj", "serial"}
-"""What is missing of these is said where it is imported."""
+"""A missing one of these is reported where it is imported."""
 
 
 def test_a_package_that_an_install_may_lack_has_the_extra_that_brings_it() -> None:
