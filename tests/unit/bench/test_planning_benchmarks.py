@@ -64,7 +64,7 @@ def test_a_peer_that_is_not_installed_is_said_to_be_left_out(monkeypatch: pytest
     )
     report = bench("peers", "--size", "64", "--repeats", "1", "--no-memory")
     assert report["notes"] == [
-        f"{name} is not installed, so it is not measured: `uv sync --extra bench` brings it."
+        f"{name} is not installed, so it is not measured: `uv sync --group bench` brings it."
         for name in rivals.EXTRA
     ]
     libraries = {row["library"] for row in report["rows"]}
