@@ -3,10 +3,7 @@ traceback."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
-from pathlib import Path
 
 EXTRAS = {
     "typer": "terrain", "rich": "terrain", "numpy": "planner", "numba": "planner", "llvmlite": "planner",
@@ -66,15 +63,6 @@ class StoreError(SwarmError):
     """The keeper's store or a run folder cannot be opened or written."""
 
     exit_code = 6
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turns what the system refuses, such as a full disk, into a StoreError that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 class ProtocolError(SwarmError):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,7 @@ from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"
+_MEASUREMENTS = Path(__file__).with_name("measurements.toml")
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
     "LATCHED": "reliable, transient local, last 1",
@@ -69,14 +71,9 @@ def _shared_once(text: str) -> tuple[list[str], str]:
     return shared, _OPTIONS.sub(named, text)
 
 
-def land_cover() -> str:
-    """Returns the page of land-cover codes."""
-    return filled("land-cover", tables=TABLES.values())
-
-
-def ways() -> str:
-    """Returns the page of classes of roads and water."""
-    return filled("ways", kinds=BUILT_IN, columns=COLUMNS)
+def measurements() -> str:
+    """Returns the page of measurements."""
+    return filled("measurements", **tomllib.loads(_MEASUREMENTS.read_text(encoding="utf-8")))
 
 
 def ros2() -> str:
@@ -96,11 +93,13 @@ def design() -> str:
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
+    wire_page.JSON_PATH: wire_page.json_document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
     _REFERENCE / "cli.md": command_line,
-    _REFERENCE / "land-cover.md": land_cover,
-    _REFERENCE / "ways.md": ways,
+    _REFERENCE / "land-cover.md": lambda: filled("land-cover", tables=TABLES.values()),
+    _REFERENCE / "ways.md": lambda: filled("ways", kinds=BUILT_IN, columns=COLUMNS),
+    _REFERENCE.with_name("method") / "measurements.md": measurements,
     _REFERENCE / "ros2.md": ros2,
     _DESIGN / "index.md": design,
 }

@@ -34,7 +34,8 @@ from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
 from swarm.config.write import toml_value
-from swarm.errors import ConfigError, writing
+from swarm.errors import ConfigError
+from swarm.files import replacing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ app = family_app("""Look at terrains: what a file holds, what it costs, what a p
     swarm terrain rules --picture rules.png
     swarm terrain synth --out dem.tif --photo photo.tif
 
-    Where to get an elevation model, and the rule for cost: docs/terrain.md.
+    Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()
 _TIFF = (".tif", ".tiff")
@@ -269,8 +270,8 @@ def synth(
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix.lower() == ".npz":
-        with writing(out):
-            np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
+        with replacing(out) as half:
+            np.savez_compressed(half, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
     else:
         write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:

@@ -83,10 +83,9 @@ class Column:
     checked: bool = True
 
     def describe(self) -> str:
-        """Returns the text for the reference of the wire: "column of float32, 0 ... inf"."""
+        """Returns the text for the reference of the wire: "float32[ids]"."""
         dtype = self.dtype
-        name = f"column of {name_of(dtype)}" if isinstance(dtype, str) else f"rows of {width_of(dtype)} bytes"
-        return name + (f", one for each of `{self.per}`" if self.per else "")
+        return f"{name_of(dtype) if isinstance(dtype, str) else f'row{width_of(dtype)}'}[{self.per}]"
 
 
 @dataclass(frozen=True, slots=True)

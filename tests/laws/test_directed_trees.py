@@ -1,4 +1,4 @@
-"""Where uphill is not downhill, and some steps are too steep: the laws of the tree under every strategy."""
+"""Uphill differs from downhill, and some steps are too steep: the laws of the tree under every strategy."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_what_is_said_of_a_route_does_not_depend_on_who_else_asks(strategy: str,
 
 
 class Extremes(Play):
-    """Marks that are told as dear and as cheap as the wire allows, and that are taken back."""
+    """Marks with the highest and lowest paces that the wire allows, and their removal."""
 
     def _mark(self, event: Marks) -> Window:
         rng = np.random.default_rng(event.seed)
@@ -165,7 +165,7 @@ class Extremes(Play):
         for row, col in marked:
             if np.isfinite(self.pace[row, col]):
                 self.pace[row, col] = rng.choice(np.array([PACE_LEAST, PACE_MOST, 1.0, 3.0], np.float32))
-        # What was marked most dearly, or most cheaply, may go again.
+        # The marks with the highest and the lowest pace may be removed again.
         for row, col in np.argwhere((self.pace == np.float32(PACE_MOST)) | (self.pace == np.float32(PACE_LEAST))):
             if rng.random() < 0.4:
                 self.pace[row, col] = 1.0

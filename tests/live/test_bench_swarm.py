@@ -34,7 +34,7 @@ def running(folder: Path) -> dict[str, int]:
 
 @pytest.fixture
 def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the bench and all that it starts keep temporary files."""
+    """The folder of temporary files of the bench and all that it starts."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     return tmp_path

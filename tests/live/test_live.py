@@ -41,7 +41,7 @@ def served_cell(bus: ZenohBus, target: str = "t0") -> tuple[int, int]:
 
 
 def incarnation(bus: ZenohBus, row: int, col: int) -> int | None:
-    """Of the planner that serves a route now; None if nobody does."""
+    """Incarnation of the planner that serves a route now; None if none does."""
     for reply in ask(bus, ROUTE, RouteRequest(row=row, col=col), timeout_s=0.5, target="t0"):
         if reply.routes[0].status is RouteStatus.OK:
             return int(reply.incarnation)

@@ -1,4 +1,4 @@
-"""A run outlives its processes: they may all be started again, and what was acknowledged is there."""
+"""A run outlives its processes: all may be started again, and the acknowledged state is there."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from swarm.config.setting_types import Walk
 
 
 def offered(*words: str) -> list[str]:
-    """What the shell is offered after these words; the last is not finished."""
+    """Completions of the shell after these words; the last is not finished."""
     shell = BashComplete(command(), {}, "swarm", "_SWARM_COMPLETE")
     return [item.value for item in shell.get_completions(list(words[:-1]), words[-1])]
 

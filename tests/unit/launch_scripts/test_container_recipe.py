@@ -1,4 +1,5 @@
-"""The recipe of the image: linted, built from what is there, nobody is root, and what it compiles is found."""
+"""The recipe of the image: linted, built from files that exist, no process is root, and its compiled kernels are
+found."""
 
 from __future__ import annotations
 
@@ -101,7 +102,8 @@ def test_every_step_is_a_script_that_the_shell_can_read(steps: list[Step]) -> No
 def test_the_steps_of_the_first_stage_make_an_environment_whose_kernels_are_only_read(
     steps: list[Step], tmp_path: Path
 ) -> None:
-    """As the builder of an image does them, below a folder of our own: with the lock, and no compiled kernel."""
+    """The steps as the builder of an image does them, below a folder of our own: with the lock, and no compiled
+    kernel."""
     folders = {name: str(tmp_path / name.strip("/").replace("/", "-")) for name in ("/opt/swarm", "/opt/kernels")}
     folders |= {"/opt/uv": str(tmp_path / "uv"), "/src": str(tmp_path / "src")}
 

@@ -1,4 +1,4 @@
-"""The archives of `swarm deploy plan`: each machine gets what is its own, and what starts it is sound."""
+"""The archives of `swarm deploy plan`: each machine gets its own files, and its start files are sound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies still in the live view: the mesh, closed ground, zones, layers, margin, legends and words."""
+"""The still parts of the live view: the mesh, closed ground, zones, layers, margin, legends and words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swarm map`: what is exported comes back as it was, and the bands of a GeoTIFF show the winners."""
+"""`swarm map`: an export comes back unchanged, and the bands of a GeoTIFF show the winners."""
 
 from __future__ import annotations
 

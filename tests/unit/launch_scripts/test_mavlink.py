@@ -1,4 +1,4 @@
-"""The core of `swarm mavlink`: what a vehicle is told, when, and what the swarm hears of it."""
+"""The core of `swarm mavlink`: the commands of a vehicle, their times, and the reports to the swarm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The monitor: listens, records, serves on loopback, and is in nobody's way."""
+"""The monitor: listens, records, serves on loopback, and delays no other process."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def terrain() -> Terrain:
 
 
 def chunks(path: Path) -> list[Any]:
-    """What a recording holds."""
+    """The content of a recording."""
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
@@ -69,7 +69,7 @@ def chunks(path: Path) -> list[Any]:
 
 
 def rows_by_entity(path: Path) -> dict[str, int]:
-    """Entity -> rows logged over time, without what is static."""
+    """Entity -> rows logged over time, without static ones."""
     counts: dict[str, int] = {}
     for chunk in chunks(path):
         if not chunk.is_static:
@@ -124,7 +124,7 @@ def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[
 def test_an_instance_has_three_components_of_which_one_says_who_it_is(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
-    """Of more than three the viewer tells only their number, when one points at it."""
+    """With more than three, the viewer shows only their number at the pointer."""
     recorded(scenario, terrain, tmp_path)
     for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
         parts = components(tmp_path / "run.rrd", entity)
@@ -140,7 +140,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
 def test_whoever_opens_the_view_late_has_all_of_it_soon(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
-    """As if the server had dropped what is old: what is drawn after they came holds every component."""
+    """The server may have dropped old data: the drawings after a viewer came hold every component."""
     longer = msgspec.structs.replace(scenario, seconds=16.0)
     rig = Rig(longer, terrain, tmp_path / "run.rrd", audience=NOBODY)
     told = list(fake_run(terrain, hidden_truth(terrain), longer))
@@ -236,7 +236,7 @@ DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]
         "searched", "positions", [0, 2, 0, 2, 0],
     ),
 }  # fmt: skip
-"""What is told, the entity and its component, and how many instances each of its rows has."""
+"""The message, the entity and its component, and the number of instances in each of its rows."""
 
 
 @pytest.mark.parametrize("what", DRAWN_AND_TAKEN_AWAY)

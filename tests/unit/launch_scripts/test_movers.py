@@ -1,4 +1,4 @@
-"""What moves in the live view: where it is drawn, how it looks, what it says of itself."""
+"""The moving parts of the live view: place, look and text."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def columns(states: list[VehicleState], targets: list[int], target_ids: list[str
 
 
 def route(*cells: int, target: str = "t0", cols: int = 1000, **more: Any) -> RouteNow:
-    """A route over these cells of a grid which has so many columns."""
+    """A route over these cells of a grid with that number of columns."""
     of_grid = np.array(cells, np.int32)
     places = np.stack(np.divmod(of_grid, cols), axis=1).astype(np.float32)
     return RouteNow(target, of_grid, places, **more)
@@ -294,7 +294,7 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
     mesh = TerrainMesh(hill(1, nodes))
     routes = [route(*on_tree(parents, start)) for start in starts]
     lines = RouteLines(mesh, 1)
-    for _ in range(2):  # what was drawn before leaves nothing behind
+    for _ in range(2):  # earlier drawings leave nothing behind
         strips = lines.lines(routes)
         drawn = []
         for n in range(many(strips)):

@@ -1,9 +1,10 @@
-"""What a run leaves behind: the numbers and the picture."""
+"""The results of a run: the numbers and the picture."""
 
 from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from support import fake_run
 
+from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import write_file
 from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
@@ -27,31 +28,15 @@ from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 
 ASKED_FOR = [
-    "scenario",
-    "seed",
-    "seconds",
-    "vehicles",
-    "targets",
-    "processes",
-    "restarts",
-    "captures",
-    "stranded",
-    "lost",
-    "reroute_requests",
-    "marks",
-    "routes_served",
-    "collisions",
-    "lethal_entries",
-    "startup_s",
-    "gap",
-    "growth_ms",
-    "route_query_ms",
-    "mark_to_tree_ms",
-]
+    "scenario", "seed", "seconds", "vehicles", "targets", "processes", "restarts", "captures", "stranded", "lost",
+    "reroute_requests", "marks", "routes_served", "collisions", "lethal_entries", "startup_s", "gap", "growth_ms",
+    "route_query_ms", "mark_to_tree_ms",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +73,12 @@ def test_the_report_has_every_number_that_was_asked_for(
     assert report["captures"] == len(played.captures) > 0
     assert report["marks"] == report["marked_cells"] > 0
     assert report["vehicles_routed"] == 10
+    outcome = r"10 of 10 vehicles routed, \d+ captures?, no collision\. All went well\."
+    assert re.fullmatch(outcome, report["verdict"])
+    worse = {**report, "collisions": 1, "lost": 2}
+    assert verdict(worse, ["agent-a0 did not end"]).endswith(
+        "1 collision. Not all went well: agent-a0 did not end; collisions 1; 2 of 10 vehicles lost at the end."
+    )
     assert set(report["gap"]) == {"mean", "p95", "max"}
     assert set(report["growth_ms"]) == {"p50", "p99"}
     assert len(report["series"]["t_s"]) == len(report["series"]["captures"]) >= 10
@@ -151,7 +142,7 @@ def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenar
     write_report(tmp_path, report, recorder, terrain)
     assert report["captures"] is None
     assert (tmp_path / "report.png").stat().st_size > 10_000
-    # It may be stopped before a vehicle has told where it is.
+    # It may be stopped before a vehicle has reported its place.
     series = {"t_s": [0.5], **{state.name.lower(): [0] for state in VehicleState}}
     assert not plots.PLOTS[0].draw(Figure().add_subplot(), plots.PLOTS[0], {"series": series})
 
@@ -162,8 +153,9 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenari
     report = make_report(recorder, terrain)
     with pytest.raises(StoreError, match=r"cannot write .*nowhere/report\.json: No such file"):
         write_report(tmp_path / "nowhere", report, recorder, terrain)
-    with pytest.raises(FileNotFoundError, match=r"nowhere/notes'$"):
-        write_file(tmp_path / "nowhere" / "notes", b"")
+    for path in (Path("/dev/full"), Path("/sys/notes")):  # ENOSPC, EACCES
+        with pytest.raises(StoreError, match=rf"cannot write {path}: (No space|Permission)"):
+            write_file(path, b"1")
 
 
 def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:

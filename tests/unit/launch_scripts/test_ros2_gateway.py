@@ -1,4 +1,4 @@
-"""What ROS is told of a swarm: on topics that are declared, at most at their rates, and the map whole."""
+"""The topics of ROS: they are declared, keep to their rates, and the map is whole."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = No
 
 
 def puts(actions: list[Any], row: str) -> list[Any]:
-    """What was put of a row, as a hearer reads it."""
+    """Messages of a row, as a subscriber reads them."""
     found = [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
     return [TYPES.unpack(each, ROWS[row].type_name) if isinstance(each, bytes) else each for each in found]
 

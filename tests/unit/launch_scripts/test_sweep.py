@@ -1,4 +1,5 @@
-"""`swarm sweep` without a cluster: what a study means, what a trial does, what is kept and told."""
+"""`swarm sweep` without a cluster: the meaning of a study, the work of a trial, the kept results and the
+messages."""
 
 from __future__ import annotations
 
@@ -391,7 +392,7 @@ def test_intervals_of_many_values_are_students_and_of_few_there_are_none():
 def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """As where it comes while a future is cleared away: Python tells of the exception there, and goes on."""
+    """The exception comes while a future is cleared away: Python reports it there, and goes on."""
     told_of: list[int] = []
 
     def run(sweep: Sweep, workers: int, scheduler: str | None, told: Callable[[Trial, None], None]) -> None:

@@ -239,7 +239,7 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
 
 
 def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
-    """The held route ends 10 cells short of where the target is now, and going on costs nothing extra: gap 1. Where
+    """The held route ends 10 cells short of where the target is now, and going on costs nothing extra: gap 1. If
     the target has come towards the vehicle and beside it, the way to and fro counts."""
     pace = flat()
     tree = TargetTree(GRID, PlannerConfig())

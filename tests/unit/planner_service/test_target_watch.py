@@ -1,4 +1,4 @@
-"""What a planner tells people about trackers: one sentence for each oddity, all counted, nothing lost."""
+"""A planner's sentences about trackers: one for each oddity, all counted, none lost."""
 
 from __future__ import annotations
 
@@ -183,13 +183,6 @@ def test_a_standby_counts_and_reports_nothing() -> None:
     here.hear(cell=GRID.cells)
     here.tick()
     assert (here.counted(), here.told) == ({}, [])
-
-
-def test_the_age_of_a_pose_counts_from_the_beginning_of_the_planner_which_gives_it() -> None:
-    here = Watch()
-    here.hear()
-    now_ns = here.now_ns + NS_PER_S
-    assert [here.watch.age_s(now_ns, began_ns) for began_ns in (0, now_ns - TICK_NS)] == [1.0, 0.1]
 
 
 def test_however_many_trackers_a_liar_makes_up_few_are_named() -> None:

@@ -1,4 +1,4 @@
-"""What a photo shows: rules without labels, learning from a few, and the mistakes that must not happen."""
+"""Classes in a photo: rules without labels, learning from a few, and forbidden mistakes."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ class Disk:
         self.store.save(self.replica.merge(sets).sets)
 
     def compact(self, gone: set[str], killed: bool) -> list[MarkSet]:
-        """Compact all tiles; a keeper that is killed between its disk and the network tells nobody."""
+        """Compacts all tiles; a keeper that is killed between its disk and the network sends nothing."""
         tiles = range(GRID.tiles)
         compacted = [
             each

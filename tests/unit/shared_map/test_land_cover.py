@@ -329,7 +329,8 @@ def test_a_drawing_in_a_legends_colours_is_read_as_its_codes(
 def test_an_image_whose_palette_has_a_legends_colours_is_read_as_its_codes(
     tmp_path: Path, dem: Path, setting: str
 ) -> None:
-    """As programs for pictures write it: entries are counted from 0, and their colours are the legend's."""
+    """The file as programs for pictures write it: entries are counted from 0, and their colours are the
+    legend's."""
     grounds = TABLES["worldcover"].grounds
     entries = patches(range(len(grounds)))
     path = written(tmp_path / "drawn.tif", entries, "uint8")

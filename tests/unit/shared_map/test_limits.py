@@ -1,4 +1,4 @@
-"""Quotas: an author that overdraws its budget waits, loses nothing and holds nobody up."""
+"""Quotas: an author that exceeds its budget waits, loses nothing and delays no other author."""
 
 from __future__ import annotations
 

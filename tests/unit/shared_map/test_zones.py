@@ -31,7 +31,7 @@ SQUARE_CELLS = {row * COLS + col for row in range(2, 6) for col in range(3, 8)}
 
 
 class ZoneWorld(SwarmModel):
-    """A keeper, somebody who finds things, and a listener."""
+    """A keeper, an author that finds things, and a listener."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(terrain=terrain_of_pace(np.ones((ROWS, COLS), np.float32)), **options)
@@ -50,7 +50,7 @@ class ZoneWorld(SwarmModel):
         self.run(0.3)
 
     def order(self, **fields: Any) -> Zones | str | None:
-        """What the keeper answers: zones, or its refusal."""
+        """The keeper's answer: zones, or its refusal."""
         heard: list[Event] = []
         self.person.ask(ZONES, ZoneOrder(**fields), heard.append, tag="z", keeper="k")
         self.run(0.3)

@@ -45,7 +45,7 @@ NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5
 
 
 class Bodies(list[Body]):
-    """All that is put on BODY."""
+    """All puts on BODY."""
 
     def __init__(self, world: SwarmModel) -> None:
         world.bus("ear-of-bodies").subscribe(BODY, self._hear)

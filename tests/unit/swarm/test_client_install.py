@@ -1,4 +1,4 @@
-"""What a robot installs: the client library imports little, quickly, and reads every message without NumPy."""
+"""The install of a robot: the client library imports little, quickly, and reads every message without NumPy."""
 
 from __future__ import annotations
 

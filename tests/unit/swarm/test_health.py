@@ -1,4 +1,4 @@
-"""What a loop says of itself is read whole at any moment, grows old when it hangs, and reaches a supervisor."""
+"""A loop's record is read whole at any moment, grows old when the loop hangs, and reaches a supervisor."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_nothing_was_written_where_there_are_zeros_or_rubbish() -> None:
 
 
 class Sleepy:
-    """A service whose tick hangs once it is told to."""
+    """A service whose tick hangs on request."""
 
     def __init__(self) -> None:
         self.counters = Counters()
@@ -107,7 +107,7 @@ class Sleepy:
 
 
 def until(board: Board, holds) -> Vitals:
-    """What is on a board once something holds of it."""
+    """The record of a board once a condition holds."""
     deadline_s = time.monotonic() + 30
     while (found := board.read()) is None or not holds(found):
         assert time.monotonic() < deadline_s, found
@@ -209,7 +209,7 @@ def test_a_manager_that_reads_nothing_holds_nobody_up_and_hears_of_the_start_lat
 
 
 def falls_silent(manager: socket.socket) -> bool:
-    """Whether there is silence for as long as the socket waits, once what was on its way has come."""
+    """True if there is silence for as long as the socket waits, once messages in transit have come."""
     for _ in range(1000):  # more than a socket keeps
         try:
             told(manager)
@@ -228,7 +228,7 @@ def fill(manager: socket.socket) -> None:
 
 
 def select_ready(manager: socket.socket) -> bool:
-    """Whether more can be read."""
+    """True if more can be read."""
     return bool(select.select([manager], [], [], 0)[0])
 
 

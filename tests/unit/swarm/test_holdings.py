@@ -1,4 +1,4 @@
-"""What a host holds by what wardens grant, and what it asks for."""
+"""The cells that a host holds by the grants of wardens, and its requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from swarm.wire.topics import STANDING
 
 
 def test_no_word_of_one_life_hides_that_of_another() -> None:
-    """Both are heard under one key; what says that an older one has ended is said by no other."""
+    """Both are heard under one key; no other message tells that an older one has ended."""
     assert not STANDING.newest
 
 

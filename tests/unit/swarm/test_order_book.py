@@ -67,7 +67,7 @@ class Keeper:
         self.now = NOW
 
     def give(self, **fields: Any) -> str | None:
-        """Why it is refused; None if it is not."""
+        """The reason of its refusal; None if it is not."""
         self.now += 1
         order = judged(GiveOrder(**fields), self.book, SCENARIO, VEHICLES, self.now)
         if isinstance(order, str):

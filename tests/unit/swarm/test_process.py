@@ -122,7 +122,7 @@ def test_ticks_fall_where_the_phase_says_whenever_the_process_starts_and_however
     process.run()
     assert service.ticks[0] // 10**6 == start_ms  # at once
     next_ms = start_ms + 1 + (29 - start_ms) % 100
-    # The second takes 130 ms, and what waits meanwhile gets as long: one is late, and those after it are not.
+    # The second takes 130 ms, and waiting events get as long: one is late, and those after it are not.
     assert [tick // 10**6 - next_ms for tick in service.ticks[1:]] == [0, 260, 300, 400]
 
 
@@ -295,7 +295,7 @@ def idle(how: str) -> subprocess.Popen[bytes]:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_loop_in_good_order(number):
     process = idle("signal")
-    for _ in range(50):  # impatient, until it is gone
+    for _ in range(50):  # impatient until it ends
         process.send_signal(number)
         process.send_signal(signal.SIGTERM)
         time.sleep(0.002)
