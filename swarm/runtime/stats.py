@@ -5,13 +5,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET
+from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET, np
 from swarm.wire.messages.processes import Stats
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 CAPTURES_OF = "captures_of"
 """Per target, by the process that moves the targets."""
