@@ -256,7 +256,7 @@ class UpOptions:
     metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
     log_format     of all logs of this machine
-    record_inputs  of every process, for `swarm replay`
+    record_inputs  of every process, for `swarm runs replay`
     takes_over     from the launcher that runs this part of the run here
     stays_watched  goes on beyond the scenario's seconds while a viewer is connected
     """

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.network
 
 
 def sets_in(store: Path) -> int:
-    done = swarm("map", "inspect", store, "--json")
+    done = swarm("marks", "show", store, "--json")
     assert done.returncode == 0, done.stderr
     return int(json.loads(done.stdout)["sets"])
 

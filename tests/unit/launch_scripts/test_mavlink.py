@@ -1,4 +1,4 @@
-"""The core of `swarm mavlink`: the commands of a vehicle, their times, and the reports to the swarm."""
+"""The core of `swarm gateway mavlink`: the commands of a vehicle, their times, and the reports to the swarm."""
 
 from __future__ import annotations
 

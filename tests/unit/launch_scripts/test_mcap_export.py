@@ -1,4 +1,4 @@
-"""`swarm export --mcap`: what a run left, as readers of MCAP and ROS that are not ours read it."""
+"""`swarm runs export --format mcap`: what a run left, as readers of MCAP and ROS that are not ours read it."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: S
     old = tmp_path / "old"
     old.mkdir()
     shutil.copy(run / TRACKS_FILE, old)
-    code, out, _ = swarm("export --mcap", old)
+    code, out, _ = swarm("runs export --format mcap", old)
     assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
     with (old / "export" / "old.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -223,17 +223,17 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
         damaged.mkdir(exist_ok=True)
         for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
             (damaged / each).write_bytes(content if each == file else (run / each).read_bytes())
-        code, _, told = swarm("export --mcap", damaged)
+        code, _, told = swarm("runs export --format mcap", damaged)
         assert (code > 0, complaint in told, told.count("\n")) == (True, True, 1), told
         assert not list(damaged.rglob("*.mcap*"))
     with monkeypatch.context() as patched:
         patched.delitem(sys.modules, "launch_scripts.report.mcap_export")
         patched.setitem(sys.modules, "mcap.writer", None)
-        code, _, told = swarm("export --mcap", run)
+        code, _, told = swarm("runs export --format mcap", run)
     needed = "swarm: this needs mcap, which is not installed: install the extra 'ros2' (docs/start/install.md)"
     assert (code, told.strip()) == (2, needed)
     (tmp_path / "empty").mkdir()
-    code, _, told = swarm("export --mcap", tmp_path / "empty")
+    code, _, told = swarm("runs export --format mcap", tmp_path / "empty")
     assert (code, "has no tracks.npz" in told) == (2, True)
 
 

@@ -1,4 +1,4 @@
-"""`swarm sweep` without a cluster: the meaning of a study, the work of a trial, the kept results and the
+"""`swarm study run` without a cluster: the meaning of a study, the work of a trial, the kept results and the
 messages."""
 
 from __future__ import annotations
