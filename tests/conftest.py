@@ -13,11 +13,12 @@ from hypothesis import settings
 from support.effort import few, try_all
 
 TESTS = Path(__file__).parent
-# What a test starts finds this checkout and what tests share, wherever it is started.
+# Processes that a test starts find this checkout and the support modules, whatever their folder.
 os.environ["PYTHONPATH"] = os.pathsep.join((str(TESTS.parent), str(TESTS)))
 
 EXAMPLES = 100
-"""Of a property that names no number of its own, with `--thorough`; each commit tries a share (support.effort)."""
+"""Number of examples of a property that names none, with `--thorough`; each commit tries a share
+(support.effort)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

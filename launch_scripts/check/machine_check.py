@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check.findings import Finding, Level, failure, warning
-from launch_scripts.observe.run_folder import can_write
 from launch_scripts.process_table import processes_of
 from swarm.config.agents import plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
-from swarm.errors import SwarmError
+from swarm.errors import StoreError, SwarmError
+from swarm.files import check_writable
 
 PACKAGE = "terrain-swarm"
 _EXTRAS = ("all", "roles", "vectors")
@@ -147,9 +147,9 @@ def _unwritable(runs: Path) -> str | None:
     if not folder.is_dir():
         return f"{folder} is not a folder; choose another --runs"
     try:
-        can_write(folder)
-    except OSError as error:
-        return f"{folder} cannot be written: {error.strerror or error}; choose another --runs"
+        check_writable(folder)
+    except StoreError as error:
+        return f"{error}; choose another --runs"
     return None
 
 

@@ -27,13 +27,14 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.observe.run_folder import SAY_EVERY_S, can_write
+from launch_scripts.observe.run_folder import SAY_EVERY_S
 from launch_scripts.web import LOOPBACK
 from launch_scripts.web.live_page import LivePage
 from launch_scripts.web.server import Audience, Server
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import BusError, StoreError
+from swarm.files import check_writable, writing
 
 log = logging.getLogger(__name__)
 
@@ -194,13 +195,9 @@ def new_recording_path(folder: Path) -> Path:
     """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: no file is overwritten."""
     for n in range(1, 10_000):
         path = folder / ("run.rrd" if n == 1 else f"run-{n}.rrd")
-        try:
+        with writing(path), contextlib.suppress(FileExistsError):
             path.open("xb").close()
             return path
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     raise StoreError(f"{folder} is full of recordings")
 
 
@@ -339,7 +336,7 @@ class RecordingWatch:
         if self._limit.due("say", now_ns):
             return f"the recording {self._path} has ended: {self._why()}; another begins when there is space", False
         if self._limit.due("try", now_ns):
-            with contextlib.suppress(OSError, StoreError):
+            with contextlib.suppress(StoreError):
                 check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
                 self._begin(self._path)
@@ -358,18 +355,19 @@ class RecordingWatch:
     def _why(self) -> str:
         try:
             check_space(self._path.parent)
-        except OSError as error:
-            return error.strerror or str(error)
+        except StoreError as error:
+            return str(error)
         return "it does not grow"
 
 
 def check_space(folder: Path) -> None:
-    """Raises OSError if there is no space for a recording. It is tried by writing, as there are quotas and limits
-    that nothing else shows; but only where that does not fill the disk for everybody else meanwhile."""
-    left = os.statvfs(folder)
-    if left.f_bavail * left.f_frsize < 2 * _SPACE_BYTES:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    can_write(folder, _SPACE_BYTES)
+    """Raises StoreError if there is no space for a recording. It is tried by writing, as there are quotas and
+    limits that nothing else shows; but only where that does not fill the disk for all others meanwhile."""
+    with writing(folder):
+        left = os.statvfs(folder)
+        if left.f_bavail * left.f_frsize < 2 * _SPACE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    check_writable(folder, _SPACE_BYTES)
 
 
 def _files(path: Path | None) -> list[rr.FileSink]:

@@ -1,4 +1,4 @@
-"""Scenarios that no swarm can run: a sentence and an exit code, soon, and nobody left behind."""
+"""Scenarios that no swarm can run: a sentence and an exit code, soon, and no process left behind."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from swarm.errors import ConfigError, SwarmError
 
 SERIES = (100, 300, 1000, 3000, 10_000)
 MOST_LATE_SHARE = 0.1
-"""Of a run whose agents are later than this the rates say little: it does less than it should."""
+"""The rates of a run whose agents are later than this say little: it does less than it should."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ def swarm(
     simulated: Annotated[bool, typer.Option("--simulated", help="One process on a manual clock.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = 5,
 ) -> dict[str, Any]:
-    """What a swarm costs: lateness, CPU, messages, memory, start-up, latency of routes, by number of vehicles.
+    """The cost of a swarm: lateness, CPU, messages, memory, start-up, latency of routes, by number of vehicles.
 
     \b
     ./launch_scripts/bench swarm --vehicles 1000
@@ -171,7 +171,7 @@ def swarm(
 
 def run_sizes(sizes: Sequence[Size], seconds: float, simulated: bool) -> dict[str, Any]:
     """Measures each size. One that cannot be measured says why, and the others go on; of a single one SwarmError is
-    raised. An interrupt keeps what has been measured."""
+    raised. An interrupt keeps the results so far."""
     rows: list[dict[str, Any]] = []
     report: dict[str, Any] = {"simulated": simulated, "seconds": seconds, "rows": rows, "interrupted": False}
     try:
@@ -207,7 +207,7 @@ def run_sizes(sizes: Sequence[Size], seconds: float, simulated: bool) -> dict[st
 
 
 def broken(report: dict[str, Any]) -> list[str]:
-    """What must not be: vehicles that met, runs that failed or did not end in order."""
+    """Violations: vehicles that met, runs that failed or did not end in order."""
     found = ["interrupted"] if report["interrupted"] else []
     for row in report["rows"]:
         title = f"{row['vehicles']:,} vehicles: "
@@ -237,7 +237,7 @@ def lines_of(report: dict[str, Any], figures: Sequence[Figure]) -> list[dict[str
 
 
 def remarks(report: dict[str, Any]) -> list[str]:
-    """What has to be known to read the figures: what is missing and why, and what the exponents are of."""
+    """Remarks that explain the figures: missing values with their reasons, and the rows behind each exponent."""
     rows = report["rows"]
     found = []
     for row in rows:
@@ -274,7 +274,7 @@ def exponent(xs: Sequence[float], ys: Sequence[float | None]) -> float | None:
 
 
 def keeps_pace(row: dict[str, Any]) -> bool:
-    """Whether a run does what it should in a second, so that its rates say what that costs."""
+    """True if a run keeps up with time, which makes its rates meaningful."""
     late = row.get("ticks", {}).get("agent", {}).get("late_share")
     return late is None or late <= MOST_LATE_SHARE
 

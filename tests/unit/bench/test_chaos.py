@@ -1,4 +1,4 @@
-"""What `bench chaos` is made of: faults by seed, hostile messages, recovery, and the laws of a run."""
+"""The parts of `bench chaos`: faults by seed, hostile messages, recovery, and the laws of a run."""
 
 from __future__ import annotations
 

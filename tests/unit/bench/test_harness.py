@@ -1,4 +1,4 @@
-"""The harness of benchmarks: each command is listed, and says in a sentence what is wrong."""
+"""The harness of benchmarks: each command is listed, and answers bad input with a sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The order of the house is told in a sentence for each fault, and holds here."""
+"""The order of the house: each fault has a sentence, and none is here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was learned of kinds of ground is seen: in the live view, in figures, in the report."""
+"""Factors of learned ground are visible: in the live view, in figures, in the report."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Who may see the live view: pages of this machine come in, those of other sites neither read nor connect;
-and nobody can keep it busy."""
+"""Access to the live view: pages of this machine come in, those of other sites neither read nor connect; no client
+can keep it busy."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sinks() -> Iterator[Sinks]:
 
 
 def ports(sinks: Sinks) -> tuple[int, int]:
-    """Of the page and of the stream."""
+    """Ports of the page and of the stream."""
     assert sinks.gate is not None
     return sinks.web_port, sinks.gate.port
 

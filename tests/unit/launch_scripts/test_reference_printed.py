@@ -1,4 +1,4 @@
-"""What docs/method/paper.md says of the paper's printed rules holds of them."""
+"""The statements of docs/method/paper.md about the paper's printed rules hold."""
 
 from __future__ import annotations
 

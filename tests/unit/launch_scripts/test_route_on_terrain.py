@@ -89,7 +89,7 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path, tmp_path: Path) -> Non
         find_route(str(hill), "cell:10,35", "cell:10,75")
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
-        (["--row", "1"], "give --target, --row and --col"),
+        (["--row", "1"], "give --target and --from"),
         (
             ["--terrain", str(hill), "--from", "cell:1,1", "--to", "cell:2,2", "--out", str(tmp_path / "a.doc")],
             "write .geojson",

@@ -1,4 +1,4 @@
-"""Every kind of file is read onto one metric grid; what is wrong with a file is said in one sentence."""
+"""Every kind of file is read onto one metric grid; each fault of a file is one sentence."""
 
 from __future__ import annotations
 

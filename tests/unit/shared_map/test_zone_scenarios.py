@@ -1,4 +1,4 @@
-"""Files of zones in a scenario: checked as it is read, part of a terrain's identity, told by `terrain info`."""
+"""Files of zones in a scenario: checked when it is read, part of a terrain's identity, listed by `terrain info`."""
 
 from __future__ import annotations
 

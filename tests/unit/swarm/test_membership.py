@@ -177,7 +177,7 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
     liar = Node(world, role="agent", id="zz", run_id="another", terrain="bbbb")
     liar.bus.serve(RUN, liar.post, role="agent", id="zz")
     for turn in range(3):
-        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # everybody asks anew
+        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # every member asks again
         world.settle()
         for node in nodes:
             node.member.tick(world.scheduler.clock.now_ns())

@@ -275,7 +275,7 @@ def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
     assert not set(spawns["a1"].values()) & set(spawns["a0"].values())
 
 
-# --- what is told of them -----------------------------------------------------------------------------------
+# --- reports ----------------------------------------------------------------------------------------------------
 
 
 def test_a_region_that_the_vehicles_have_left_is_told_so_once() -> None:

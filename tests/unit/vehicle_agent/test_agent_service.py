@@ -97,7 +97,7 @@ def test_nothing_is_ever_forced_until_a_route_has_run_out() -> None:
     planner = world.planners["t"]
     assert [request.force for request in planner.requests] == [False]
     assert planner.requests[0].vehicles == ["a0-00"]
-    # The target walks away and nobody pushes a newer route: the old one runs out.
+    # The target walks away and no planner pushes a newer route: the old one runs out.
     world.put_target("t", 2, 2)
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
     assert any(request.force for request in planner.requests)
