@@ -175,9 +175,8 @@ def cost(
         seconds = time.perf_counter() - started
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
-            write_raster(
-                out, [pace], terrain.grid, descriptions=["pace, seconds per metre; -1 lethal"], nodata=-1.0
-            )
+            bands = ["pace, seconds per metre; -1 lethal"]
+            write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", nodata=-1.0)
             tell("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
     _draw(terrain, picture, name)
