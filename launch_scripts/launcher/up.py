@@ -39,6 +39,7 @@ from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.web.live_page import LivePage
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
@@ -160,8 +161,14 @@ class _Run:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        self._doing: Callable[[], str] = lambda: self._preparing
+        self._page: LivePage | None = None
+        """The live view's start page, until the monitor serves it."""
         view = options.scenario.monitor
-        if "monitor" in options.roles and view.live and view.web_port:
+        if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
+            name = f"{self._scenario.name}, run {run_id}"
+            told = {"life": "", "at_s": 0.0, "name": name}
+            self._page = LivePage(view.web_port, lambda: {**told, "state": self._doing()})
             self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
@@ -176,6 +183,7 @@ class _Run:
         finally:
             self._warm_up.close()
             self._signals.close()
+            self._leave_page()
 
     def _run(self) -> int:
         with self._terminal.busy(lambda: self._preparing):
@@ -183,6 +191,8 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
+        if self._page is not None:
+            self._page.terrain = self._terrain
         homes = load_beside(self._run_dir, "homes", scenario_key(self._scenario))
         check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
@@ -218,6 +228,7 @@ class _Run:
                 watcher.begin()
                 watcher.look_after([running.spec for running in self._swarm.running])
                 try:
+                    self._leave_page()
                     self._swarm.start()
                     log.info("all processes are started")
                     seconds = self._watch(watcher)
@@ -234,6 +245,12 @@ class _Run:
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
+
+    def _leave_page(self) -> None:
+        """Leaves the live view's port to the monitor."""
+        if self._page is not None:
+            self._page.server.close()
+            self._page = None
 
     def _stopped_early(self) -> int:
         self._terminal.say("stopped before the swarm was up: there is nothing to report", "yellow")
@@ -279,7 +296,7 @@ class _Run:
 
     def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
         """Waits for `done(timeout_s)` or a signal, and shows so if it takes long."""
-        began_s = time.monotonic()
+        began_s, self._doing = time.monotonic(), text
         with self._terminal.busy(text):
             while not self._stop_asked and not done(_TURN_S):
                 if time.monotonic() - began_s > within_s:
