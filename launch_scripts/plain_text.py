@@ -7,6 +7,7 @@ no sentence says one for the other; a time after "since" would be neither.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
@@ -41,6 +42,11 @@ class Moment:
     def __str__(self) -> str:
         """14:22:10, by the clock on this machine's wall"""
         return time.strftime("%H:%M:%S", time.localtime(self.ns // NS_PER_S))
+
+
+def unanswered(silent: Sequence[str], asked: int, within_s: float) -> str:
+    """8 of 17 did not answer within 2 s: agent-a0, ..."""
+    return f"{len(silent)} of {asked} did not answer within {within_s:g} s: {', '.join(silent)}"
 
 
 def plain(text: str) -> str:

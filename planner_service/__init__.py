@@ -63,6 +63,9 @@ the candidacy's. The same without a process, a network or a file:
 True
 """
 
-from planner_service.route_finder import FoundRoute, RouteFinder
+from swarm.errors import require
+
+require(__name__, "numpy", "numba")
+from planner_service.route_finder import FoundRoute, RouteFinder  # noqa: E402
 
 __all__ = ["FoundRoute", "RouteFinder"]

@@ -3,6 +3,30 @@ traceback."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
+EXTRAS = {
+    "typer": "terrain", "rich": "terrain", "numpy": "planner", "numba": "planner", "llvmlite": "planner",
+    "PIL": "terrain", "matplotlib": "terrain", "packaging": "terrain", "rasterio": "terrain", "scipy": "terrain",
+    "yaml": "terrain", "cryptography": "roles", "jinja2": "roles", "markupsafe": "roles",
+    "prometheus_client": "roles", "psutil": "roles", "rerun": "view", "pyogrio": "vectors", "shapely": "vectors",
+    "pyproj": "wgs84", "pymavlink": "mavlink", "serial": "mavlink", "mcap": "ros2", "rosbags": "ros2",
+    "xxhash": "ros2", "dask": "sweep", "distributed": "sweep", "pyarrow": "sweep",
+}  # fmt: skip
+"""Package that the base install lacks -> the smallest extra which brings it."""
+
+
+def missing(package: str) -> str:
+    """End of a sentence about a package of `EXTRAS` which is not installed."""
+    return f"{package}, which is not installed: install the extra '{EXTRAS[package]}' (docs/start/install.md)"
+
+
+def require(module: str, *packages: str) -> None:
+    """Raises ModuleNotFoundError, with the extra to install, if a module lacks one of its packages."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"{module} needs {missing(package)}", name=package)
+
 
 class SwarmError(Exception):
     """A fault of the input, a file or the network, explained in one sentence. A fault of ours is any other

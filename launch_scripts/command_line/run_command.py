@@ -13,13 +13,7 @@ import typer
 from typer.exceptions import TyperException
 
 from swarm.config.input_files import quoted
-from swarm.errors import ConfigError, StoreError, SwarmError
-
-EXTRAS = {
-    "pyogrio": "vectors", "shapely": "vectors", "mcap": "ros2", "rosbags": "ros2", "xxhash": "ros2",
-    "dask": "sweep", "distributed": "sweep", "pyarrow": "sweep", "rerun": "all",
-}  # fmt: skip
-"""Package that a small install lacks -> the extra which brings it."""
+from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -53,8 +47,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRAS:
             raise  # a fault of ours
-        needed = f"install the extra '{EXTRAS[package]}' (docs/start/install.md)"
-        print(f"swarm: this needs {package}, which is not installed: {needed}", file=sys.stderr)
+        print(f"swarm: this needs {missing(package)}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:
         _leave_output()

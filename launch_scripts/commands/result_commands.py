@@ -152,6 +152,7 @@ def export(
     force   Replace files that are there.
     mcap    Write a recording with ROS 2 messages instead, for Foxglove.
     """
+    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
@@ -160,12 +161,14 @@ def export(
             if each not in allowed:
                 raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
     folder = find_run(run, runs)
-    if mcap:
-        from launch_scripts.report.mcap_export import export_mcap
+    with progress(f"exporting {folder}"):
+        if mcap:
+            from launch_scripts.report.mcap_export import export_mcap
 
-        typer.echo(export_mcap(folder, out, force))
-        return
-    for line in export_run(folder, what or (), format, out, force):
+            lines = [export_mcap(folder, out, force)]
+        else:
+            lines = export_run(folder, what or (), format, out, force)
+    for line in lines:
         typer.echo(line)
 
 

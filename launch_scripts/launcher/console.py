@@ -211,9 +211,12 @@ def _busy_line(
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Tell]:
-    """Yields a function that reports progress, on a terminal only and after the first second."""
-    console, now = Console(stderr=True), ["working"]
+def progress(what: str = "working") -> Iterator[Tell]:
+    """Yields a function that reports progress, on a terminal only and after the first second.
+
+    what  the work, until that function says more
+    """
+    console, now = Console(stderr=True), [what]
 
     def tell(what: str, share: float) -> None:
         now[0] = f"{what}, {share:.0%}"

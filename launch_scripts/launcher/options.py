@@ -258,6 +258,7 @@ class UpOptions:
     log_format     of all logs of this machine
     record_inputs  of every process, for `swarm replay`
     takes_over     from the launcher that runs this part of the run here
+    stays_watched  goes on beyond the scenario's seconds while a viewer is connected
     """
 
     scenario: Scenario
@@ -271,6 +272,7 @@ class UpOptions:
     record_inputs: bool = False
     metrics_port: int | None = None
     takes_over: bool = False
+    stays_watched: bool = False
     signals_address: str = LOOPBACK
     log_format: LogFormat = "text"
 

@@ -64,6 +64,8 @@ _CALM_TURN_S = 0.1
 """Once all processes are up: each turn takes a third of a millisecond."""
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
+_RELOADED_WITHIN_S = 10.0
+"""A viewer that leaves may be a page that is loaded again."""
 _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {RECORDED_BESIDE}"
 """Said by all others."""
 
@@ -150,12 +152,17 @@ class _Run:
         self._up_at_s: float | None = None
         """Time when the swarm was whole, on the run's clock."""
         self._web_port = 0
+        self._outlasts = False
+        """True while the run goes on for a viewer only."""
         self._known: Recorder | OwnPart | None = None
         self._take_over: TakeOver | None = None
         if options.takes_over:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        view = options.scenario.monitor
+        if "monitor" in options.roles and view.live and view.web_port:
+            self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
 
@@ -299,7 +306,7 @@ class _Run:
 
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
-        began_s = time.monotonic()
+        began_s = watched_s = time.monotonic()
         self._book = watcher.known.observed.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
@@ -327,7 +334,10 @@ class _Run:
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
-            if now_s - began_s >= limit_s:
+            watched_s = now_s if watcher.viewers else watched_s
+            stays = self._options.stays_watched and self._startup_s is not None
+            self._outlasts = stays and now_s - began_s >= limit_s and now_s - watched_s < _RELOADED_WITHIN_S
+            if now_s - began_s >= limit_s and not self._outlasts:
                 break
         return time.monotonic() - began_s
 
@@ -384,8 +394,9 @@ class _Run:
         if self._up_at_s is None:
             return f"{self._scenario.name}: starting, {up} processes are up, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
-        of = "" if seconds >= UNTIL_STOPPED_S else f" of {self._up_at_s + seconds:.0f}"
-        live = f", live view {page_of(self._web_port)}" if self._web_port else ""
+        of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
+        until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
+        live = f"{until}, live view {page_of(self._web_port)}" if self._web_port else ""
         return f"{self._scenario.name}: {elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:

@@ -39,7 +39,7 @@ from swarm.config.vehicle_classes import aloft_classes
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import VIEWERS, Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
@@ -147,6 +147,7 @@ class MonitorService:
         self._member.tick(now_ns)
         self._turn += 1
         audience = self._audience()
+        self.counters.gauge(VIEWERS, float(audience.now))
         if self._watched != (watched := audience.now > 0):
             self._watched = watched
             self._observer.pace(FOLLOWED, _ROUTES_SEEN_S if watched else ROUTES_S, now_ns)

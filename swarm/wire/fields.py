@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, missing
 from swarm.grid import MOST_PLOTS
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ else:
             try:
                 import numpy
             except ModuleNotFoundError as error:
-                raise ConfigError("this needs NumPy: install the extra 'all' (docs/start/install.md)") from error
+                raise ConfigError(f"this needs {missing('numpy')}") from error
             value = getattr(numpy, name)
             setattr(self, name, value)
             return value

@@ -96,7 +96,7 @@ def peers(
             for name, ms in medians.items()
         ],
         "notes": [
-            f"{package} is not installed, so it is not measured: `uv sync --extra bench` brings it."
+            f"{package} is not installed, so it is not measured: `uv sync --group bench` brings it."
             for package in missing_packages()
         ],
     }

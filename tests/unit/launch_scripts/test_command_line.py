@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import signal
 import subprocess
@@ -18,7 +17,6 @@ from typer._completion_classes import BashComplete  # what a shell asks: there i
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
-from launch_scripts.command_line.run_command import EXTRAS
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
 from swarm.config.setting_types import Walk
@@ -39,26 +37,6 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tu
 
 
 EVERY = list(commands())
-ROLES = {
-    "PIL", "cryptography", "jinja2", "llvmlite", "markupsafe", "matplotlib", "msgpack", "msgspec", "numba", "numpy",
-    "packaging", "prometheus_client", "psutil", "rasterio", "rich", "scipy", "typer", "yaml", "zenoh",
-}  # fmt: skip
-"""Modules that the extra `roles` brings."""
-SAID_ELSEWHERE = {"pymavlink", "pyproj", "serial"}
-"""A missing one of these is reported where it is imported."""
-
-
-def test_a_package_that_an_install_may_lack_has_the_extra_that_brings_it() -> None:
-    found: set[str] = set()
-    for folder in ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts"):
-        for path in Path(folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Import):
-                    found |= {each.name.partition(".")[0] for each in node.names}
-                elif isinstance(node, ast.ImportFrom) and node.module:
-                    found.add(node.module.partition(".")[0])
-    ours = {"swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts"}
-    assert found - ours - sys.stdlib_module_names - ROLES - SAID_ELSEWHERE == EXTRAS.keys()
 
 
 def test_every_command_completes_its_options_and_its_sub_commands() -> None:

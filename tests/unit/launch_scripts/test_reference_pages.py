@@ -128,12 +128,11 @@ def test_the_python_of_the_tutorial_runs_as_it_says():
     assert failed == 0
 
 
-@pytest.mark.parametrize("page", ["operate/scenario.md", "gis/terrain.md", "gis/costs.md", "gis/vectors.md"])
-def test_every_scenario_of_the_tutorial_is_accepted(page):
-    blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
-    assert blocks
-    for block in blocks:
-        msgspec.convert(tomllib.loads(block), Scenario)
+@pytest.mark.parametrize("folder", ["operate", "gis", "behaviour"])
+def test_every_scenario_of_the_pages_is_accepted(folder):
+    pages = [page.read_text(encoding="utf-8") for page in _PAGES if page.parent.name == folder]
+    blocks = re.findall(r"^```toml\n(.*?)^```", "\n".join(pages), re.M | re.S)
+    assert [msgspec.convert(tomllib.loads(block), Scenario) for block in blocks]
 
 
 def test_file_names_in_commands_exist():

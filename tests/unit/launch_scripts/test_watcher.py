@@ -20,9 +20,11 @@ from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
+from swarm.bus.bus import Disappeared
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.liveness import Peer, split_rank
+from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.orders import Order, Orders
 from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
@@ -90,10 +92,12 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
     watcher, _ = begun(swarm)
     bus = swarm.bus("monitor")
     for role, port in (("agent", 8080), ("monitor", 0), ("monitor", 9090)):
-        bus.publish(STATS, stats(role, "0", web_port=port), role=role, id="0")
+        bus.publish(STATS, stats(role, "0", web_port=port, gauges={VIEWERS: port}), role=role, id="0")
         swarm.run(3)
         watcher.listen(0.0)
-        assert watcher.web_port == (port if role == "monitor" else 0)
+        assert watcher.web_port == watcher.viewers == (port if role == "monitor" else 0)
+    watcher.take(Disappeared(Peer("monitor", "0", 1)), 0)
+    assert not watcher.viewers, "a demo goes on for viewers that are there"
 
 
 # --- a launcher that records nothing -----------------------------------------------------------------------------

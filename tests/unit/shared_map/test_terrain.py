@@ -162,8 +162,8 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     from pyogrio.raw import write
     from rasterio.transform import from_origin
 
-    pages = Path(__file__).parents[3] / "docs" / "gis"
-    text = (pages / "terrain.md").read_text() + (pages / "vectors.md").read_text()
+    gis = Path(__file__).parents[3] / "docs" / "gis"
+    text = (gis / "terrain.md").read_text() + (gis / "vectors.md").read_text()
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     (tmp_path / "mine.toml").write_text("".join(blocks[:4]))
     # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
