@@ -30,7 +30,7 @@ PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|
 _COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
 _SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
 _HEAVY = re.compile(r"swarm (up|demo|run|simulate|study|sweep|replay|compare)\b")
-_SYNTH = "swarm terrain synth --rows 200 --cols 240 --out dem.tif --photo photo.tif"
+_SYNTH = "swarm terrain generate --rows 200 --cols 240 --out dem.tif --photo photo.tif"
 
 
 class Block(NamedTuple):
