@@ -17,6 +17,7 @@ from launch_scripts.commands import (
     result_commands,
     role_commands,
     run_commands,
+    runs_commands,
     scenario_commands,
     simulation_commands,
 )
@@ -77,6 +78,7 @@ def _root(
 
 for module in (
     run_commands,
+    runs_commands,
     simulation_commands,
     scenario_commands,
     result_commands,

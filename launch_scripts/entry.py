@@ -10,7 +10,7 @@ from launch_scripts.web.health_probe import fast
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 _RUNS = ("demo", "up")
 """Commands that start processes."""
-_SAYS_MORE = ("-h", "--help", "--only")
+_SAYS_MORE = ("-h", "--help", "--only", "-d", "--detach")
 """With words that begin so it is for the command to say which processes, if any."""
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import typer
 from typer.exceptions import TyperException
 
+from launch_scripts.command_line.declaring import ENVIRONMENT
 from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError, SwarmError
 
@@ -41,13 +42,13 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             sys.stdout.flush()
     except TyperException as error:
         if said := _sentence(error):
-            print(f"swarm: {said}", file=sys.stderr)
+            print(f"swarm: {said}{_given_by(said)}", file=sys.stderr)
         return ConfigError.exit_code
     except typer.Abort:
         print("swarm: stopped; nothing is written", file=sys.stderr)
         return 1
     except SwarmError as error:
-        print(f"swarm: {error}", file=sys.stderr)
+        print(f"swarm: {error}{_given_by(str(error))}", file=sys.stderr)
         return error.exit_code
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -88,6 +89,16 @@ def _sentence(error: TyperException) -> str:
     elif "command" in said and "Did you mean" not in said and hasattr(ctx.command, "commands"):
         said = f"{said} There are {', '.join(ctx.command.commands)}"
     return said if ctx is None else f"{said.removesuffix('.')}; `{ctx.command_path} -h` explains"
+
+
+def _given_by(said: str) -> str:
+    """Returns the variables of the environment that gave their values to options of a sentence, in words."""
+    named = [
+        f"{option} is {variable}"
+        for variable, option in ENVIRONMENT.items()
+        if os.environ.get(variable) and option in said and not any(word.startswith(option) for word in sys.argv)
+    ]
+    return f" ({', '.join(named)} of the environment)" if named else ""
 
 
 def _fill_streams() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -48,6 +49,14 @@ class Speaker(NamedTuple):
     role: str
     id: str
     run: str
+
+
+def name_process(speaker: Speaker) -> None:
+    """Gives this process a title, which `ps` and `top` of the system show, where setproctitle is installed."""
+    with contextlib.suppress(ImportError):
+        from setproctitle import setproctitle
+
+        setproctitle(f"swarm: {speaker.role} {speaker.id} (run {speaker.run})")
 
 
 class JsonLines(logging.Formatter):

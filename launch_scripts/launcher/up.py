@@ -16,7 +16,7 @@ from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
-from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
+from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to, name_process
 from launch_scripts.launcher.options import (
     UpOptions,
     as_process,
@@ -35,6 +35,7 @@ from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
+from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
@@ -85,7 +86,9 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    log_to(run_dir / "launcher.log", options.log_format, Speaker(LAUNCHER, "0", run_id))
+    speaker = Speaker(LAUNCHER, "0", run_id)
+    name_process(speaker)
+    log_to(run_dir / LAUNCHER_LOG, options.log_format, speaker)
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
@@ -305,6 +308,7 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S
+                self._register()
                 began_s = now_s
                 if watcher.routes_served or not self._all_external:
                     so_far = "all processes are alive and routes are served"
@@ -351,10 +355,15 @@ class _Run:
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if watcher.web_port != self._web_port:
             self._web_port = watcher.web_port
+            self._register()
             self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
             self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
             self._show(known, watcher.now_ns())
+
+    def _register(self) -> None:
+        """Says to commands how far the run is; `begin_run` has said if that is impossible."""
+        register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S

@@ -41,7 +41,7 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tu
 EVERY = list(commands())
 ROLES = {
     "PIL", "cryptography", "jinja2", "llvmlite", "markupsafe", "matplotlib", "msgpack", "msgspec", "numba", "numpy",
-    "packaging", "prometheus_client", "psutil", "rasterio", "rich", "scipy", "typer", "yaml", "zenoh",
+    "packaging", "prometheus_client", "psutil", "rasterio", "rich", "scipy", "setproctitle", "typer", "yaml", "zenoh",
 }  # fmt: skip
 """What the extra `roles` brings, by the names of its modules."""
 SAID_ELSEWHERE = {"pymavlink", "pyproj", "serial"}
