@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,9 +58,7 @@ class Where(Tls):
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
         found = find_swarm(self.runs, self.run)
-        if found.others:
-            told = ", ".join(found.others[:_NAMED])
-            typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
+        say_newest(found.run, found.others)
         return found.network
 
     def network(self) -> NetworkConfig:
@@ -89,6 +88,13 @@ class Where(Tls):
     def __str__(self) -> str:
         endpoint = self.connect or ", ".join(self._found.connect)
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
+
+
+def say_newest(run: str | None, others: Sequence[str]) -> None:
+    """Says which run a command asks, if others run too."""
+    if others:
+        told = ", ".join(others[:_NAMED])
+        typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import heapq
 import json
+import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, STDOUT, Popen
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
-from launch_scripts.commands.running_swarm import RUNS, RunOption
+from launch_scripts.commands.running_swarm import RUNS, RunOption, say_newest
 from launch_scripts.commands.shared_options import AsJson
 
 if TYPE_CHECKING:
@@ -29,33 +31,24 @@ app = typer.Typer()
 
 RunArgument = Annotated[
     str | None,
-    typer.Argument(
-        metavar="[RUN]",
-        envvar="SWARM_RUN",
-        show_envvar=False,
-        help="Name of the run, or its folder; if not given, the one that runs.",
-        autocompletion=complete.runs,
-    ),
+    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete.runs),
 ]
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""
 _TURN_S = 0.2
-_WIDE = 1000
-"""A row is one line, which a narrow terminal breaks: a copied folder is whole."""
-_Line = tuple[datetime, str, str]
+_Line = tuple[float, str, str]
 """Time, process and text of a line of a log."""
 
 
 @command(app, RUN)
-def ps(
-    all: Annotated[bool, typer.Option("--all", "-a", help="Runs that are over too.")] = False,
-    as_json: AsJson = False,
-) -> None:
+def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJson = False) -> None:
     """List your runs on this machine, from any folder.
 
     swarm ps
 
     swarm ps -a
+
+    all  Runs that are over too.
     """
     from rich.console import Console
 
@@ -72,9 +65,8 @@ def ps(
         column.justify = "left"
     for each in told:
         table.add_row(*(plain("" if value is None else str(value)) for value in each.values()))
-    Console(highlight=False, width=_WIDE).print(
-        table if told else "no run of yours runs here; `swarm ps -a` lists all"
-    )
+    # A row is one line, which a narrow terminal breaks: a copied folder is whole.
+    Console(highlight=False, width=1000).print(table if told else "no run of yours runs here; see `swarm ps -a`")
 
 
 @command(app, RUN)
@@ -84,18 +76,22 @@ def down(run: RunArgument = None) -> int:
     A second `swarm down` kills what still runs.
 
     swarm down
+
+    run  Name of the run, or its folder; if not given, the one that runs.
     """
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_registry import registered
     from swarm.errors import ConfigError
 
-    found, running = _chosen(run), [each.name for each in registered() if each.launchers]
-    if not found.launchers:
-        raise ConfigError(f"run {found.name} does not run here; there run {', '.join(running) or 'none'}")
+    running = [each.name for each in registered() if each.launchers]
     if run is None and len(running) > 1:
         raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
+    found = _chosen(run)
+    if not found.launchers:
+        raise ConfigError(f"run {found.name} does not run here; these do: {', '.join(running) or 'none'}")
     for pid in found.launchers:
-        os.kill(pid, signal.SIGINT)
+        with suppress(ProcessLookupError):  # it ended by itself
+            os.kill(pid, signal.SIGINT)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
     with terminal.busy(f"run {found.name} ends"):
         while (left := _chosen(str(found.folder)).launchers) and time.monotonic() < until_s:
@@ -110,21 +106,19 @@ def down(run: RunArgument = None) -> int:
 
 @command(app, RUN)
 def logs(
-    process: Annotated[
-        str | None,
-        typer.Argument(metavar="[ROLE-ID]", help="One process, such as planner-t3; if not given, all by time."),
-    ] = None,
-    follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Go on with new lines until the run ends.")
-    ] = False,
-    lines: Annotated[int | None, typer.Option("--lines", "-n", min=0, help="Only the last lines.")] = None,
+    process: Annotated[str | None, typer.Argument(metavar="ROLE-ID")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f")] = False,
+    lines: Annotated[int | None, typer.Option("--lines", "-n", min=0)] = None,
     run: RunOption = None,
 ) -> None:
     """Print the logs of a run, which may be over.
 
     swarm logs planner-t3 -f
 
-    run  Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    process  One process, such as planner-t3; if not given, all by time.
+    follow   Go on with new lines until the run ends.
+    lines    Print at most this number of lines of the past.
+    run      Name of the run, or its folder; if not given, the newest that runs, or else the newest.
     """
     from launch_scripts.plain_text import plain
     from launch_scripts.stop_requests import stop_requests
@@ -134,10 +128,10 @@ def logs(
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
     if process is not None and process not in names:
         raise ConfigError(f"run {found.name} has no log of {process!r}; it has {', '.join(names) or 'none'}")
-    width, read = max(map(len, names), default=0), dict[Path, int]()
+    width, read = max(map(len, names), default=0), dict[int, int]()
     told: Iterable[_Line] = _new_lines(found.folder, process, read)
     told = told if lines is None else deque(told, maxlen=lines)
-    with stop_requests():
+    with suppress(KeyboardInterrupt), stop_requests():
         while True:
             for _, name, text in told:
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
@@ -149,13 +143,13 @@ def logs(
 
 
 @command(app, RUN)
-def open(
-    run: RunArgument = None,
-    only_print: Annotated[bool, typer.Option("--print", help="Open no browser.")] = False,
-) -> None:
+def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--print")] = False) -> None:
     """Open the live page of a run, or its report if it is over.
 
     swarm open
+
+    run         Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    only_print  Print the address, and open no browser.
     """
     import webbrowser
 
@@ -164,28 +158,23 @@ def open(
 
     found = _chosen(run)
     report = found.folder / "report.html"
-    if found.launchers and found.web_port:
-        address = page_of(found.web_port)
-    elif not found.launchers and report.is_file():
-        address = report.as_uri()
-    else:
+    if not (found.web_port if found.launchers else report.is_file()):
         what = "serves no live page" if found.launchers else "is over and left no report"
         raise ConfigError(f"run {found.name} {what}; `swarm logs --run {found.name}` says more")
+    address = page_of(found.web_port) if found.launchers else report.as_uri()
     typer.echo(address)
     if not only_print:
         webbrowser.open(address)
 
 
 @command(app, RUN)
-def kill(
-    process: Annotated[str, typer.Argument(metavar="ROLE-ID", help="The process, such as planner-t3.")],
-    run: RunOption = None,
-) -> None:
+def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOption = None) -> None:
     """Kill one process of a run of this machine, to see that its launcher starts it again.
 
     swarm kill planner-t3
 
-    run  Name of the run, or its folder; if not given, the newest that runs.
+    process  The process, such as planner-t3.
+    run      Name of the run, or its folder; if not given, the newest that runs.
     """
     import psutil
 
@@ -217,15 +206,9 @@ def in_background(*, as_json: bool) -> int:
         can_write(registry())
     except (OSError, RuntimeError) as error:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
-    words = [word for word in sys.argv[1:] if word not in ("-d", "--detach")]
-    launcher = subprocess.Popen(
-        [sys.executable, "-P", "-m", "launch_scripts.entry", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
+    words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
+    words = [word for word in words if word not in ("-d", "--detach")]
+    launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, text=True, start_new_session=True)
     assert launcher.stdout is not None
     try:
         for line in launcher.stdout:
@@ -249,6 +232,7 @@ def _chosen(name: str | None) -> KnownRun:
     if name is None:
         if not known:
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
+        say_newest(known[0].name, [each.name for each in known[1:] if each.launchers])
         return known[0]
     folder = find_run(name, RUNS).resolve()
     return next((run for run in known if run.folder == folder), KnownRun(folder, (), 0, False))
@@ -287,37 +271,27 @@ def _log_files(folder: Path) -> list[Path]:
     return sorted((*folder.glob("*.log"), *folder.glob("*.log.1")), reverse=True)
 
 
-def _new_lines(folder: Path, process: str | None, read: dict[Path, int]) -> Iterator[_Line]:
+def _new_lines(folder: Path, process: str | None, read: dict[int, int]) -> Iterator[_Line]:
     """Yields lines of all logs, or of those of one process, by time.
 
-    read  how many bytes of each file have been read; goes on with the lines
+    read  inode of a file, which keeps it under a new name -> number of bytes that have been read; grows here
     """
     files = [file for file in _log_files(folder) if process in (None, file.name.partition(".log")[0])]
     return heapq.merge(*(_lines_of(file, read) for file in files), key=lambda line: line[0])
 
 
-def _lines_of(file: Path, read: dict[Path, int]) -> Iterator[_Line]:
+def _lines_of(file: Path, read: dict[int, int]) -> Iterator[_Line]:
     """Yields the lines of one log behind those which have been read. A line without a time has that of the one
     before it, as in a traceback."""
-    name, at = file.name.partition(".log")[0], datetime.min.replace(tzinfo=UTC)
-    with file.open("rb") as opened:
-        if read.get(file, 0) > os.fstat(opened.fileno()).st_size:
-            read[file] = 0  # begun again
-        opened.seek(read.get(file, 0))
+    at_s = -math.inf
+    with suppress(OSError), file.open("rb") as opened:  # it may have got another name
+        inode, size = (each := os.fstat(opened.fileno())).st_ino, each.st_size
+        read[inode] = opened.seek(read.get(inode, 0) if read.get(inode, 0) <= size else 0)
         for raw in opened:
             if not raw.endswith(b"\n"):
                 return
+            read[inode] += len(raw)
             text = raw.decode(errors="replace").rstrip()
-            at = _time_of(text) or at
-            read[file] = read.get(file, 0) + len(raw)
-            yield at, name, text
-
-
-def _time_of(text: str) -> datetime | None:
-    """Returns the time of a line, as text or JSON has it; None without one."""
-    try:
-        stamp = json.loads(text)["time"] if text.startswith("{") else " ".join(text.split(" ", 2)[:2])
-        at = datetime.fromisoformat(stamp)
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return at if at.tzinfo is not None else None
+            with suppress(ValueError, OverflowError):  # text, or JSON
+                at_s = datetime.fromisoformat(text[:29] if text[:1] != "{" else text[10:34]).timestamp()
+            yield at_s, file.name.partition(".log")[0], text

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.observe.run_registry import LAUNCHER_LOG, open_logs
+from launch_scripts.observe.run_registry import LAUNCHER_LOG, logging_into, open_logs
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
@@ -145,12 +145,8 @@ def _launcher_of(run_dir: Path) -> int:
 
 def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
-    found: dict[str, int] = {}
-    for pid, path in open_logs():
-        name = path.name.partition(".log")[0]
-        if path.parent == run_dir and name.startswith(_NAMES) and pid not in other_than:
-            found[name] = pid
-    return found
+    found = logging_into(run_dir)
+    return {name: pid for name, pid in found.items() if name.startswith(_NAMES) and pid not in other_than}
 
 
 def writing(file: Path) -> list[int]:

@@ -157,6 +157,7 @@ class _Run:
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
+        self._register()
         planners = any(TABLE[role].kernels for role in self._options.roles)
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
         self._warm_up.begin()

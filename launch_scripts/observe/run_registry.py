@@ -68,8 +68,7 @@ class KnownRun:
         for pid in self.launchers:
             with suppress(psutil.Error):
                 started += psutil.Process(pid).children(recursive=True)
-        logs = {path: pid for pid, path in open_logs(started) if path.parent == self.folder}
-        return {path.name.partition(".log")[0]: pid for path, pid in logs.items() if path.name != LAUNCHER_LOG}
+        return logging_into(self.folder, started)
 
 
 def registry() -> Path:
@@ -157,6 +156,13 @@ def _runs(entry: _Entry) -> bool:
         mine = process.uids().real == os.getuid() and process.status() != psutil.STATUS_ZOMBIE
         return mine and abs(_started_s(entry.pid) - entry.started_s) < _SAME_START_S
     return False
+
+
+def logging_into(folder: Path, processes: Iterable[Process] | None = None) -> dict[str, int]:
+    """Name -> pid of the processes that log into a run's folder, as `open_logs` finds them; no launcher is among
+    them."""
+    found = {path.name.partition(".log")[0]: pid for pid, path in open_logs(processes) if path.parent == folder}
+    return {name: pid for name, pid in found.items() if name + ".log" != LAUNCHER_LOG}
 
 
 def open_logs(processes: Iterable[Process] | None = None) -> Iterator[tuple[int, Path]]:
