@@ -53,6 +53,9 @@ follow their routes and mark hazards missing from the map; all meet on Zenoh.
 
     swarm simulate jacksboro --seed 7  in one process, faster than real time
 
+Variables stand for options: SWARM_CONNECT, SWARM_NAMESPACE, SWARM_TLS_DIR,
+SWARM_RUN, SWARM_RUNS and SWARM_LOG_FORMAT (docs/operate/run.md).
+
 `swarm COMMAND -h` explains a command; `swarm --install-completion` lets the Tab key complete them.
 """,
     no_args_is_help=True,
