@@ -208,7 +208,7 @@ def in_background(*, as_json: bool) -> int:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
     words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
     words = [word for word in words if word not in ("-d", "--detach")]
-    launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, text=True, start_new_session=True)
+    launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, errors="replace", start_new_session=True)
     assert launcher.stdout is not None
     try:
         for line in launcher.stdout:

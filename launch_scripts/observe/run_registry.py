@@ -18,12 +18,11 @@ import msgspec
 from launch_scripts.observe.run_folder import write_file
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import SwarmError
+from swarm.runtime.run_secret import state_folder
 
 if TYPE_CHECKING:
     from psutil import Process
 
-STATE = "SWARM_STATE"
-"""Variable of the environment that names another state folder."""
 LAUNCHER_LOG = "launcher.log"
 _SAME_START_S = 0.05
 """Starts of processes are known to a hundredth of a second."""
@@ -72,12 +71,8 @@ class KnownRun:
 
 
 def registry() -> Path:
-    """The folder of the registry. Raises OSError without a home folder."""
-    base = Path(os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser())
-    folder = Path(os.environ.get(STATE) or base / "terrain-swarm") / "runs"
-    if not folder.is_absolute():
-        raise OSError(f"found {folder}, expected an absolute path in {STATE} or XDG_STATE_HOME")
-    return folder
+    """The folder of the registry. Raises RuntimeError without a home folder."""
+    return Path(os.environ.get("SWARM_STATE") or state_folder()) / "runs"
 
 
 def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
