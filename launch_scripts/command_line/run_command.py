@@ -92,11 +92,13 @@ def _sentence(error: TyperException) -> str:
 
 
 def _given_by(said: str) -> str:
-    """Returns the variables of the environment that gave their values to options of a sentence, in words."""
+    """Returns the variables of the environment whose option or value a sentence names, in words."""
+    given = {each: os.environ[each] for each in ENVIRONMENT if os.environ.get(each)}
     named = [
         f"{option} is {variable}"
-        for variable, option in ENVIRONMENT.items()
-        if os.environ.get(variable) and option in said and not any(word.startswith(option) for word in sys.argv)
+        for variable, value in given.items()
+        if (option := ENVIRONMENT[variable]) in said or f"'{value}'" in said
+        if not any(word == value or word.startswith(option) for word in sys.argv)
     ]
     return f" ({', '.join(named)} of the environment)" if named else ""
 

@@ -167,7 +167,7 @@ def run_role(
     from launch_scripts.launcher.child_process import load_entry
     from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
-    from launch_scripts.launcher.log_file import Speaker, log_to, name_process
+    from launch_scripts.launcher.log_file import Speaker, log_to
     from launch_scripts.launcher.options import next_incarnation
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import TABLE, processes_of
@@ -213,9 +213,7 @@ def run_role(
     run_id = wanted_run or next((info.run_id for info in found), None) or options.common_run_id(scenario)
     added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
     run_dir = options.make_run_dir(part.runs, run_id)
-    speaker = Speaker(role, id, run_id)
-    name_process(speaker)
-    log_to(None, part.log_format, speaker)
+    log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
     if not is_router:
         with progress() as tell:

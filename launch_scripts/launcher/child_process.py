@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to, name_process
+from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
 from swarm.runtime.health import Board, Health
@@ -136,9 +136,7 @@ def _redirect(log_path: Path, log_format: LogFormat, setup: RoleSetup) -> None:
     os.dup2(nowhere, 2)
     os.close(nowhere)
     faulthandler.enable()
-    speaker = Speaker(setup.role, setup.id, setup.run_id)
-    name_process(speaker)
-    log_to(log_path, log_format, speaker, takes_output=True)
+    log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
 
 
 def _leave(code: int) -> None:

@@ -16,7 +16,7 @@ from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
-from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to, name_process
+from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.options import (
     UpOptions,
     as_process,
@@ -86,9 +86,7 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    speaker = Speaker(LAUNCHER, "0", run_id)
-    name_process(speaker)
-    log_to(run_dir / LAUNCHER_LOG, options.log_format, speaker)
+    log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:

@@ -168,6 +168,8 @@ def test_a_sentence_about_an_option_names_the_variable_which_gave_its_value(
     for line, variable, value in (
         ("status", "SWARM_CONNECT", "nowhere"),
         ("up synthetic", "SWARM_LOG_FORMAT", "xml"),
+        ("status --connect tcp/127.0.0.1:9", "SWARM_NAMESPACE", "a/b"),
+        ("down", "SWARM_RUN", "nix"),
         ("status --connect tcp/127.0.0.1:9", "SWARM_TLS_DIR", str(tmp_path)),
     ):
         with monkeypatch.context() as environment:
