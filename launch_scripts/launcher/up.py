@@ -36,6 +36,7 @@ from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
+from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
@@ -89,7 +90,7 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    log_to(run_dir / "launcher.log", options.log_format, Speaker(LAUNCHER, "0", run_id))
+    log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
@@ -175,6 +176,7 @@ class _Run:
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
+        self._register()
         planners = any(TABLE[role].kernels for role in self._options.roles)
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
         self._warm_up.begin()
@@ -341,6 +343,7 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S
+                self._register()
                 began_s = now_s
                 if watcher.routes_served or not self._all_external:
                     so_far = "all processes are alive and routes are served"
@@ -390,10 +393,15 @@ class _Run:
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if watcher.web_port != self._web_port:
             self._web_port = watcher.web_port
+            self._register()
             self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
             self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
             self._show(known, watcher.now_ns())
+
+    def _register(self) -> None:
+        """Says to commands how far the run is; `begin_run` has said if that is impossible."""
+        register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
