@@ -18,7 +18,7 @@ from launch_scripts.command_line.old_names import current
 from launch_scripts.command_line.run_command import run_command
 
 LEAVES = (
-    "run_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
+    "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
     "simulation_commands:app",
 )  # fmt: skip
 """Apps of commands without a family, in `launch_scripts.commands`."""
@@ -56,7 +56,8 @@ class Root(TyperGroup):
       terrain ...           Inspect and convert terrain
 
     More: swarm help --all
-    `swarm COMMAND -h` explains a command.
+    `swarm COMMAND -h` explains a command. SWARM_CONNECT and other variables
+    stand for options (docs/operate/run.md).
     """
 
     all = False

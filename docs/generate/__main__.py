@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,7 @@ from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"
+_MEASUREMENTS = Path(__file__).with_name("measurements.toml")
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
     "LATCHED": "reliable, transient local, last 1",
@@ -37,12 +39,23 @@ _QOS = {
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
 _OPTION = re.compile(r"^\* `.*", re.MULTILINE)
 _OPTIONS = re.compile(r"(?:^\* `.*\n)+", re.MULTILINE)
-SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
 _SHARED = 2
 """An option with one text in this number of commands is explained once."""
 _LEFT_OUT = re.compile(r"\*\*(?:Usage|Commands)\*\*:\n\n(?:```[^`]*```\n|(?:\* .*\n)+)\n?")
 """Parts of Typer's text which say nothing that the examples and the next sections do not say."""
+_SHORTER = (
+    (r"  \[required\]|\n\*\*\w+\*\*:\n(?=\n\* )", ""),
+    (r"(\n\* .*\n)\n+(?=\* )", r"\1"),
+    (r"(?<=\n\* `)([^-`]\S*) <.*?>`", r"\1`"),
+    (r"(?<=\n\* `)(-[a-z], )?(--[\w-]+) <?([^`]+?)(?: range)?>?`", r"\1\2=\3`"),
+    (
+        r"  \[(?:default: ([^]]*?))?(?:; )?(?:([\d.e-]*)<=x<=(.*)|x>=(.*))?\]\n",
+        lambda found: _limits(*found.groups("")),
+    ),
+)
+"""Pattern in Typer's text -> shorter text."""
 _OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `(?:-h, )?--help`.*\n", re.MULTILINE)
 
 
@@ -52,12 +65,17 @@ def command_line() -> str:
     _load(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root, info_name="swarm"), name="swarm")
     text = _OF_EVERY_COMMAND.sub("", _LEFT_OUT.sub("", text.partition("\n")[2]))
-    text = re.sub(r"(?<=[a-z]) range(?=>)|  \[required\]|\n\*\*\w+\*\*:\n(?=\n\* )", "", text)
-    text = re.sub(r"(\n\* .*\n)\n+(?=\* )", r"\1", text)
-    text = re.sub(r"(?<=\n\* `)([^-`]\S*) <.*?>`", r"\1`", text)
-    text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
+    for pattern, short in _SHORTER:
+        text = re.sub(pattern, short, text)
+    text = _EXAMPLES.sub(lambda found: re.sub(r"^|\n+", lambda end: end[0][:1] + "    ", found[0]), text)
     shared, text = _shared_once(text.strip())
     return filled("cli", commands=text, shared=shared)
+
+
+def _limits(default: str, least: str, most: str, at_least: str) -> str:
+    """Returns the default and the limits of an option as the page has them."""
+    limits = f"{least}..{most}" if most else f"{at_least}.." if at_least else ""
+    return f" [{'; '.join(filter(None, (default, limits)))}]\n"
 
 
 def _load(group: Any) -> None:
@@ -72,27 +90,22 @@ def _load(group: Any) -> None:
 def _shared_once(text: str) -> tuple[list[str], str]:
     """Returns the rows of options that many commands share, and the page with names in place of these rows."""
     times = Counter(_OPTION.findall(text))
-    usual = {row.split("`")[1].partition(" ")[0]: row for row, _ in reversed(times.most_common())}
+    usual = {row.split("`")[1].partition("=")[0]: row for row, _ in reversed(times.most_common())}
     shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
 
     def named(block: re.Match[str]) -> str:
         rows = block[0].splitlines()
-        names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
-        told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[the swarm](#shared-options)")
+        names = [row.split("`")[1].partition("=")[0] for row in rows if row in shared]
+        told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[swarm](#shared-options)")
         link = [f"* {told}"] if names else []
         return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
 
     return shared, _OPTIONS.sub(named, text)
 
 
-def land_cover() -> str:
-    """Returns the page of land-cover codes."""
-    return filled("land-cover", tables=TABLES.values())
-
-
-def ways() -> str:
-    """Returns the page of classes of roads and water."""
-    return filled("ways", kinds=BUILT_IN, columns=COLUMNS)
+def measurements() -> str:
+    """Returns the page of measurements."""
+    return filled("measurements", **tomllib.loads(_MEASUREMENTS.read_text(encoding="utf-8")))
 
 
 def ros2() -> str:
@@ -112,11 +125,13 @@ def design() -> str:
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
+    wire_page.JSON_PATH: wire_page.json_document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
     _REFERENCE / "cli.md": command_line,
-    _REFERENCE / "land-cover.md": land_cover,
-    _REFERENCE / "ways.md": ways,
+    _REFERENCE / "land-cover.md": lambda: filled("land-cover", tables=TABLES.values()),
+    _REFERENCE / "ways.md": lambda: filled("ways", kinds=BUILT_IN, columns=COLUMNS),
+    _REFERENCE.with_name("method") / "measurements.md": measurements,
     _REFERENCE / "ros2.md": ros2,
     _DESIGN / "index.md": design,
 }

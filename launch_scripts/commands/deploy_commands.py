@@ -44,7 +44,8 @@ from swarm.config.input_files import quoted
 from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
-from swarm.errors import ConfigError, writing
+from swarm.errors import ConfigError
+from swarm.files import write_file
 
 app = family_app("A plan, certificates and configurations for several machines.")
 KitName = Literal["systemd", "compose"]
@@ -53,7 +54,7 @@ _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
 _LEAST_SIDE, _MOST_SIDE = 32, 16_384
 """Cells of a side: one tile of marks (`TILE_CELLS`), and the largest terrain that a scenario may have
-(docs/operate/limits.md)."""
+(docs/reference/limits.md)."""
 
 
 @command(app)
@@ -79,7 +80,7 @@ def plan(
     into the same folder keeps certificates that neither end soon nor are revoked, and removes archives of machines
     that it does not have.
 
-    hosts  The machines, in TOML: see docs/deploy.md.
+    hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
     kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
@@ -169,8 +170,8 @@ def size(
 
     swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
 
-    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured swarms the table is
-    extrapolated. docs/scaling.md has the table and its errors.
+    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured
+    swarms the table is extrapolated; docs/design/measurement.md has it and its errors.
 
     Exit code 1 if a process has to do more than one core can: more machines do not help it.
 
@@ -337,6 +338,5 @@ def zenohd(
         plugins=None if plugins is None else str(plugins.resolve()),
         volume=volume,
     )
-    with writing(out):
-        out.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    write_file(out, (json.dumps(config, indent=2) + "\n").encode())
     print(f"{out}: run `zenohd -c {out}`")

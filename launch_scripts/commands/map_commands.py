@@ -26,7 +26,8 @@ from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import BusError, StoreError, writing
+from swarm.errors import BusError, StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.runtime.operator import replies_to
@@ -134,16 +135,15 @@ def export(store: Store, out: Path) -> None:
         shown = [each for each in sets if each.tile < grid.tiles]
         own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
         left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
-    with writing(out):
-        if ending in _TEXT:
-            with KeeperStore(store, read_only=True) as kept:
-                classes = kept.classes
-            out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
-        elif ending in _PIXELS:
-            _write_tiff(out, terrain, grid, sets)
-        else:
-            pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
-            write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
+    if ending in _TEXT:
+        with KeeperStore(store, read_only=True) as kept:
+            classes = kept.classes
+        write_file(out, stored_marks.to_json(terrain, grid, sets, classes).encode())
+    elif ending in _PIXELS:
+        _write_tiff(out, terrain, grid, sets)
+    else:
+        pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+        write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     print(f"{out}: {_counted(grid, shown)}{left_out}")
 
 

@@ -45,7 +45,7 @@ AsScenario = Annotated[bool, typer.Option(hidden=True)]
 def pause(where: Where, as_json: AsJson = False) -> int:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
-    Vehicles drive to the middle of the cell that they are entering and stop there. Planners go on planning.
+    Vehicles stop in the middle of the cell that they are entering.
 
     swarm order pause
 
@@ -211,6 +211,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     """
     import msgspec
 
+    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
     from swarm.runtime.operator import Operator
@@ -229,7 +230,8 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
                 cell = cell_of(place, frame, "--at")
                 order = msgspec.structs.replace(order, cell=cell)
                 said = {"at": fields_of(frame, cell)}
-            given, acknowledged = Operator(bus).give(order)
+            with progress("waiting until all processes obey"):
+                given, acknowledged = Operator(bus).give(order)
             told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
             printed.append({"given": msgspec.to_builtins(given), **told, **said})
             silent |= bool(acknowledged.silent)
@@ -260,9 +262,13 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
 def print_obeyed(acknowledged: Acknowledged) -> int:
     """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
+    from launch_scripts.plain_text import unanswered
+    from swarm.runtime.operator import OBEY_S
+
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
     typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
     if acknowledged.silent:
-        names = ", ".join(acknowledged.silent)
-        typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)
+        asked = len(acknowledged.silent) + len(acknowledged.obeyed)
+        said = unanswered(acknowledged.silent, asked, OBEY_S)
+        typer.echo(f"{said}; they obey as soon as they hear a keeper", err=True)
     return int(bool(acknowledged.silent))

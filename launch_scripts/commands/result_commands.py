@@ -149,6 +149,7 @@ def export(
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     force   Replace files that are there.
     """
+    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
@@ -161,12 +162,14 @@ def export(
     if ending in ENDINGS and ending != chosen:
         raise ConfigError(f"--format: found {chosen!r} with --out {out}, expected {ending!r}, or a folder")
     folder = find_run(run, runs)
-    if chosen == "mcap":
-        from launch_scripts.report.mcap_export import export_mcap
+    with progress(f"exporting {folder}"):
+        if chosen == "mcap":
+            from launch_scripts.report.mcap_export import export_mcap
 
-        typer.echo(export_mcap(folder, out, force))
-        return
-    for line in export_run(folder, what or (), chosen, out, force):
+            lines = [export_mcap(folder, out, force)]
+        else:
+            lines = export_run(folder, what or (), chosen, out, force)
+    for line in lines:
         typer.echo(line)
 
 

@@ -78,7 +78,7 @@ class Joins:
 def router(place: Place, listen: str | None = None, id: str = "0") -> None:
     """Run the Zenoh router of a swarm. `--connect` links it to another router.
 
-    With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
+    With certificates, each process may do what its name allows and nothing else: see docs/operate/access.md.
 
     swarm role router my.toml --listen tcp/127.0.0.1:7447
 

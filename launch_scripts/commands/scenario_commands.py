@@ -23,7 +23,8 @@ from launch_scripts.commands.shared_options import (
     Seconds,
     Walk,
 )
-from swarm.errors import BusError, ConfigError, SwarmError, writing
+from swarm.errors import BusError, ConfigError, SwarmError
+from swarm.files import write_file
 
 if TYPE_CHECKING:
     from launch_scripts.check.findings import Finding
@@ -105,8 +106,7 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
     if is_terminal():
         choices = _asked(file, choices)
     text = _text(file, choices)
-    with writing(file), file.open("x", encoding="utf-8") as opened:
-        opened.write(text)
+    write_file(file, text.encode())
     typer.echo(f"{file} is written; `swarm check {file}` looks at it, `swarm up {file}` runs it")
 
 
@@ -200,8 +200,7 @@ def check(
 ) -> int:
     """Check a scenario before a run: files, terrain, ports and this machine.
 
-    It checks keys and values, files, the terrain and the locations on it, certificates, ports, plug-ins, and
-    whether this machine is large enough. Exit code 1 if the scenario cannot run. Runs the modules of its plug-ins.
+    Exit code 1 if the scenario cannot run. Runs the modules of its plug-ins.
 
     swarm check my.toml
 

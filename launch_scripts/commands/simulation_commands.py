@@ -16,7 +16,8 @@ import typer
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
-from swarm.errors import ConfigError, StoreError, writing
+from swarm.errors import ConfigError, StoreError
+from swarm.files import writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -85,7 +86,7 @@ def _simulate_once(
     import msgspec
 
     from launch_scripts.check.scenario_check import check_places
-    from launch_scripts.launcher.console import Terminal
+    from launch_scripts.launcher.console import Terminal, progress
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
@@ -112,7 +113,8 @@ def _simulate_once(
         folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")
-        result = run_to_end(done)
+        with progress() as tell:
+            result = run_to_end(done, tell)
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -18,15 +18,16 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.console import make_output_outlive_readers
+from launch_scripts.launcher.console import Tell, make_output_outlive_readers, progress
 from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
+from launch_scripts.observe.run_registry import pids_of
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import gaps_to
-from launch_scripts.plain_text import plain
+from launch_scripts.plain_text import plain, unanswered
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
 from swarm.clock import NS_PER_S, MonotonicClock
@@ -54,6 +55,7 @@ class Status:
 
     members    processes that have answered, those of the run first; routers belong to none
     strangers  those of another run in the same namespace
+    pids       name -> pid of those on this machine
     """
 
     members: list[RunInfo]
@@ -61,18 +63,30 @@ class Status:
     latest: LatestState
     frame: MapFrame | None
     now_ns: int
+    pids: dict[str, int]
+
+    @property
+    def silent(self) -> list[str]:
+        """Processes that the run needs, or that are alive, and have not answered."""
+        latest = self.latest
+        expected = dict.fromkeys((*latest.plan.crew_now(latest.plan.targets_now(latest.book)), *latest.up()))
+        answered = {(info.role, info.id) for info in (*self.members, *self.strangers)}
+        return [f"{role}-{id}" for role, id in expected if (role, id) not in answered]
 
     @property
     def state(self) -> RunState:
         return state_of(self.latest, self.now_ns)
 
 
-def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObserver:
+def observed(
+    bus: Bus, where: Where, least_s: float = _LISTEN_S, tell: Tell = lambda what, share: None
+) -> OutsideObserver:
     """Context of an observer that has received the state of all processes which reply in time. Raises BusError if
     no process replies."""
     clock, observer = MonotonicClock(), OutsideObserver(bus)
     began_s = time.monotonic()
     while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
+        tell(f"asking the swarm: {len(observer.answers)} processes have answered", spent_s / _MOST_S)
         observer.listen(clock, 0.1)
     if observer.latest is None:
         admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
@@ -82,15 +96,16 @@ def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObser
 
 def ask_status(where: Where) -> Status:
     """A running swarm as it is now. Raises BusError if no process replies."""
-    with where.bus() as bus:
-        return status_of(observed(bus, where), MonotonicClock().now_ns())
+    with progress(f"asking the swarm {where}") as tell, where.bus() as bus:
+        return status_of(observed(bus, where, tell=tell), MonotonicClock().now_ns())
 
 
 def status_of(observer: OutsideObserver, now_ns: int) -> Status:
     """Returns the state received up to now. At least one process has replied."""
     assert observer.latest is not None
     members, strangers = observer.members()
-    return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
+    pids = pids_of(members[0].run_id)
+    return Status(members, strangers, observer.latest, frame_of_members(members), now_ns, pids)
 
 
 def print_status(status: Status, console: Console) -> None:
@@ -109,6 +124,8 @@ def print_status(status: Status, console: Console) -> None:
             say(f"terrain: {extent_of(frame, 'latlon')}")
         for line in facts.lines(state):
             say(line)
+    if silent := status.silent:
+        say(unanswered(silent, len(silent) + len(status.members), _MOST_S), "yellow")
     console.print(_processes(status))
     if (spoken := _wire_versions(status)) is not None:
         say(spoken)
@@ -139,14 +156,16 @@ def _wire_versions(status: Status) -> str | None:
 
 
 def _processes(status: Status) -> Table:
-    crew = columns("process", "up", "messages out", "in", "dropped")
+    crew = columns("process", "pid", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.latest.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
         told = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
         up_s = max(status.now_ns - info.incarnation, 0) / NS_PER_S
         leading = {True: ", leads", False: ", stands by", None: ""}[status.latest.leads.get((info.role, info.id))]
-        crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
+        name = f"{info.role}-{info.id}"
+        pid = str(status.pids.get(name, "-"))
+        crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
 
 
@@ -168,6 +187,7 @@ def status_fields(status: Status) -> dict[str, Any]:
         return {
             "role": info.role,
             "id": info.id,
+            "pid": status.pids.get(f"{info.role}-{info.id}"),
             "incarnation": info.incarnation,
             "wire_version": info.wire_version,
             "leads": status.latest.leads.get((info.role, info.id)),
@@ -190,6 +210,7 @@ def status_fields(status: Status) -> dict[str, Any]:
         "planners": [planner_fields(planner) for _, planner in sorted(latest.status.items())],
         "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(latest).items()},
         "orders": list(status.state.orders),
+        "silent": status.silent,
         "strangers": [f"{info.role}-{info.id}" for info in status.strangers],
     }
 
@@ -216,7 +237,9 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
             raise BusError(f"only routers answer {where}: is the swarm running?")
         with Live(console=console, auto_refresh=False) if moving else nullcontext() as live:
             while True:
-                state, processes = state_of(latest, clock.now_ns()), latest.loads.lines(latest.up())
+                pids = pids_of(run.run_id) if each or as_json else {}
+                state = state_of(latest, clock.now_ns())
+                processes = [replace(load, pid=pids.get(load.name)) for load in latest.loads.lines(latest.up())]
                 if as_json:
                     print(json.dumps(top_fields(run, state, processes)), flush=True)
                 elif live is None:

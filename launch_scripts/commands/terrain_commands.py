@@ -34,7 +34,8 @@ from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
 from swarm.config.write import toml_value
-from swarm.errors import ConfigError, writing
+from swarm.errors import ConfigError
+from swarm.files import replacing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -42,13 +43,7 @@ if TYPE_CHECKING:
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
-    swarm terrain info dem.tif
-    swarm terrain cost jacksboro --picture cost.png
-    swarm terrain classify dem.tif photo.tif --picture classes.png
-    swarm terrain rules --picture rules.png
-    swarm terrain generate --out dem.tif --photo photo.tif
-
-    Where to get an elevation model, and the rule for cost: docs/terrain.md.
+    Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()
 _TIFF = (".tif", ".tiff")
@@ -174,9 +169,8 @@ def cost(
         seconds = time.perf_counter() - started
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
-            write_raster(
-                out, [pace], terrain.grid, descriptions=["pace, seconds per metre; -1 lethal"], nodata=-1.0
-            )
+            bands = ["pace, seconds per metre; -1 lethal"]
+            write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", nodata=-1.0)
             tell("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
     _draw(terrain, picture, name)
@@ -266,8 +260,8 @@ def generate(
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix.lower() == ".npz":
-        with writing(out):
-            np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
+        with replacing(out) as half:
+            np.savez_compressed(half, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
     else:
         write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:

@@ -18,6 +18,7 @@ from launch_scripts.commands.order_commands import checked, print_obeyed
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
+from launch_scripts.plain_text import Duration
 from swarm.errors import ConfigError
 from swarm.places import FORMS, corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
 
 app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
 
-    A zone is held by the shared map: every planner and vehicle goes by it, processes that start later do, too, and
-    what vehicles find there does not change it.
+    The shared map holds a zone: all planners and vehicles go by it, also later ones.
     """)
 _LASTS = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -166,7 +166,7 @@ def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
 def _line(zone: Zone, frame: MapFrame) -> str:
     row0, col0, row1, col1 = zone.window
     kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
-    left = "" if zone.until_ns is None else f", ends in {max(zone.until_ns / 1e9 - time.time(), 0):.0f} s"
+    left = "" if zone.until_ns is None else f", ends in {Duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
     within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
     whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"

@@ -37,6 +37,7 @@ from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
+from swarm.files import writing
 from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 
@@ -116,8 +117,15 @@ def _replaced(network: NetworkConfig, changes: dict[str, object]) -> NetworkConf
         raise ConfigError(f"network: {explain(str(error), raw, NetworkConfig)}") from error
 
 
-def tls_of(ca: str | None, certificate: str | None, key: str | None) -> TlsConfig | None:
-    """The three --tls options, all or none."""
+def tls_of(ca: str | None, certificate: str | None, key: str | None, folder: str | None = None) -> TlsConfig | None:
+    """The three --tls options, all or none; without them the files in the folder of --tls-dir."""
+    if ca is certificate is key is None and folder is not None:
+        if not Path(folder, "ca.pem").is_file():
+            raise ConfigError(f"--tls-dir: no file ca.pem in {folder}, which `swarm deploy certs` writes")
+        keys = [each for each in Path(folder).glob("*.key") if each.stem != "ca"]
+        own = keys[0] if len(keys) == 1 else None  # of many, a process finds its own by name
+        certificate, key = (folder, folder) if own is None else (str(own.with_suffix(".pem")), str(own))
+        return TlsConfig(ca=f"{folder}/ca.pem", certificate=certificate, key=key)
     if ca is None and certificate is None and key is None:
         return None
     if ca is None or certificate is None or key is None:
@@ -226,7 +234,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
     A restart is therefore the later one even if the clock was set back meanwhile.
     """
     path = run_dir / "lives" / f"{role}-{id}"
-    try:
+    with writing(path):
         path.parent.mkdir(exist_ok=True)
         file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
         try:
@@ -241,8 +249,6 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
             os.fsync(file)
         finally:
             os.close(file)
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return incarnation
 
 
@@ -259,6 +265,7 @@ class UpOptions:
     log_format     of all logs of this machine
     record_inputs  of every process, for `swarm runs replay`
     takes_over     from the launcher that runs this part of the run here
+    stays_watched  goes on beyond the scenario's seconds while a viewer is connected
     """
 
     scenario: Scenario
@@ -272,6 +279,7 @@ class UpOptions:
     record_inputs: bool = False
     metrics_port: int | None = None
     takes_over: bool = False
+    stays_watched: bool = False
     signals_address: str = LOOPBACK
     log_format: LogFormat = "text"
 

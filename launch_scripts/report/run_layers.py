@@ -26,7 +26,8 @@ from launch_scripts.report.exporter import (
 )
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
+from swarm.files import check_writable, writing
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 
@@ -207,10 +208,9 @@ def free_places(folder: Path, names: Sequence[str], out: Path | None, force: boo
     there = [path for path in paths if path.exists()]
     if there and not force:
         raise ConfigError(f"{there[0]} is there already; --force replaces it, --out FOLDER writes elsewhere")
-    try:
+    with writing(to):
         to.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot make the folder {to}: {error.strerror or error}") from error
+    check_writable(to)
     return paths
 
 

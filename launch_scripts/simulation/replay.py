@@ -23,6 +23,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
+from swarm.files import write_file
 from swarm.recording.recording import path_of, versions
 from swarm.recording.records import FOLDER, SUFFIX, Called, Cut, Handled, Head, RecordReader, RecordWriter
 from swarm.recording.replaying import Outcome, Replaying, replay
@@ -215,9 +216,7 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
             raise StoreError(writer.cut)
         if reader.damaged is not None:
             raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until-s")
-        scenario.write_bytes(head.scenario.encode())
-    except OSError as error:
-        raise StoreError(f"cannot write {scenario}: {error.strerror or error}") from error
+        write_file(scenario, head.scenario.encode())
     except StoreError:
         path.unlink(missing_ok=True)
         raise

@@ -1,4 +1,4 @@
-"""Containers of a plan: each process once and by itself, nobody root, keys with their owners. And the example for
+"""Containers of a plan: each process once and by itself, none as root, keys with their owners. And the example for
 Kubernetes: pods as the standard "restricted" wants them, valid by its schemas."""
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def test_the_example_lets_pods_reach_routers_and_a_node_be_emptied() -> None:
 
 
 def restricted(pod: dict[str, Any]) -> list[str]:
-    """What the Pod Security Standard "restricted" forbids of these pods: kubernetes.io, Pod Security Standards."""
+    """The prohibitions of the Pod Security Standard "restricted" for these pods: kubernetes.io, Pod Security
+    Standards."""
     wrong = [key for key in ("hostNetwork", "hostPID", "hostIPC", "initContainers") if pod.get(key)]
     kinds = {"configMap", "secret", "emptyDir", "projected", "persistentVolumeClaim"}
     wrong += [str(each) for each in pod["volumes"] if set(each) - {"name"} - kinds]

@@ -106,7 +106,7 @@ def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
 
 
 def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:
-    """The vehicles that an agent says it has, once they are so many."""
+    """The vehicles that an agent reports, once the number is reached."""
     heard: set[str] = set()
     with client(live.network) as bus:
         bus.collect(FLEET)

@@ -33,7 +33,7 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
         assert manager.recv(100) == b"STATUS=its start"
 
         def missing() -> list[str] | None:
-            """What the keeper says that it lacks; None while nobody answers."""
+            """The keeper's stated lack; None while no keeper answers."""
             try:
                 answer = ask(url, live=False)
             except BusError:

@@ -1,4 +1,5 @@
-"""Orders to real processes: each command returns when all obey, and what was ordered outlives whoever obeys."""
+"""Orders to real processes: each command returns when all obey, and an order outlives the processes that obey
+it."""
 
 from __future__ import annotations
 
@@ -25,14 +26,14 @@ OPTIONS = ("--no-live",)
 
 
 def order(live: LiveSwarm, *words: object, code: int = 0) -> Any:
-    """What a command says, as JSON."""
+    """The output of a command, as JSON."""
     done = swarm("order", *words, "--connect", live.endpoint, "--json")
     assert done.returncode == code, done.stdout + done.stderr
     return json.loads(done.stdout) if code == 0 else done.stderr
 
 
 def places(live: LiveSwarm, seconds: float) -> list[dict[str, int]]:
-    """The cells of all vehicles, at the first and the last report of so many seconds."""
+    """The cells of all vehicles, at the first and the last report within the given seconds."""
     inbox = Inbox()
     first: dict[str, int] = {}
     last: dict[str, int] = {}

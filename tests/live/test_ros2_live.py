@@ -84,7 +84,7 @@ def running(gateway: Gateway) -> Iterator[Gateway]:
 
 @pytest.fixture
 def session(gateway: Gateway) -> Iterator[zenoh.Session]:
-    """Of a node of ours at the ROS side's router."""
+    """Session of a node of ours at the ROS side's router."""
     with open_ros(gateway.endpoint) as session:
         yield session
 
@@ -216,7 +216,7 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
         ends.enter_context(made_up_swarm(network, "bench"))
         port = ends.enter_context(ros_router())
         peer = ends.enter_context(RosPeer(port, definitions))
-        # Before the gateway is there: the SDK asks nobody for what was latched before.
+        # Before the gateway starts: the SDK does not ask for latched messages.
         for row in OUT:
             peer.hear(topic_of(row), ROWS[row].type_name)
         process = Gateway(endpoint, port, tmp_path, tmp_path).start("--namespace", "bench")

@@ -1,4 +1,4 @@
-"""A run on two machines, as docs/deploy.md says: certificates, a launcher on each, a name that is revoked."""
+"""A run on two machines, as the page says: certificates, a launcher on each, a name that is revoked."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successo
         bus.publish(STATS, said, role="agent", id=id)
 
     def says(bus: ZenohBus, id: str) -> bool:
-        """Whether what it says is heard; a0 speaks meanwhile, so that not hearing is no matter of time."""
+        """True if its message is received; a0 speaks meanwhile, so that silence is no matter of time."""
         heard.clear()
         until_s = time.monotonic() + 10
         while heard.count("a0") < 5 and time.monotonic() < until_s:

@@ -67,7 +67,7 @@ def ros2(
     \b
     ./launch_scripts/bench ros2 --vehicles 100
 
-    As a share of one core, and what a hearer of all topics gets meanwhile.
+    As a share of one core, and the messages that a subscriber of all topics receives meanwhile.
     """
     from launch_scripts.gateways.ros2.ros_node import open_ros
 

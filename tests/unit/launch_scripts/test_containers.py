@@ -1,4 +1,4 @@
-"""`swarm deploy plan --kit compose`: what is written stands for itself and is whole."""
+"""`swarm deploy plan --kit compose`: the written files are whole and need no others."""
 
 from __future__ import annotations
 

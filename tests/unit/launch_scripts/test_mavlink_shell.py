@@ -25,7 +25,7 @@ LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
 
 
 class PlayedLink:
-    """Brings the pieces of a list, or one piece without end, and keeps what is written."""
+    """Brings the pieces of a list, or one piece without end, and keeps the written bytes."""
 
     whole = True
 

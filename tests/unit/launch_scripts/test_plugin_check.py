@@ -1,4 +1,4 @@
-"""The test kit of plug-ins: it passes what is built in and the examples of the pages, and finds what is wrong."""
+"""The test kit of plug-ins: it passes the built-in ones and the examples of the pages, and finds faults."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
     assert "from 8" in said or "from 9" in said
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
-        assert (file.crs.to_string(), file.nodata, file.shape) == (SYSTEM, -1.0, (60, 80))
+        assert (file.crs.to_string(), file.nodata, file.shape, file.units) == (SYSTEM, -1.0, (60, 80), ("s",))
     assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0

@@ -1,4 +1,4 @@
-"""What a run leaves behind: the scenario as run, results that add up, and which run was last."""
+"""The folder of a run: the scenario as run, results that add up, and the link to the last run."""
 
 from __future__ import annotations
 
@@ -157,11 +157,6 @@ def test_a_number_that_no_report_has_is_damage(number: str, tmp_path: Path) -> N
 def test_a_damaged_file_of_a_run_does_not_keep_it_from_its_report(facts: str, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(facts)
     assert ended(tmp_path) == {}
-
-
-def test_a_run_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no run 'r9': neither a folder nor in"):
-        find_run("r9", tmp_path)
 
 
 # --- results ------------------------------------------------------------------------------------------------------

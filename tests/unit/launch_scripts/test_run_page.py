@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Reader(html.parser.HTMLParser):
-    """What a browser would make of a page: its elements, what they would load, its text."""
+    """A browser's view of a page: its elements, their sources, its text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
