@@ -10,8 +10,8 @@ returns the exit code.
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import pkgutil
 import re
 from collections.abc import Callable
 from copy import copy
@@ -31,14 +31,16 @@ PREPARE = "Before a run"
 ASK = "Ask a running swarm"
 ORDER = "Give a running swarm orders"
 LEFT = "Finished runs"
-ROLE = "One role, by hand"
-ADMIN = "Several machines, and figures"
+ADMIN = "Processes, machines and other systems"
 """The panels in which help shows commands."""
 
 NETWORK = "Where the swarm is"
-CERTIFICATES = "Certificates (all three, or none)"
+CERTIFICATES = "Certificates (a folder, or all three files)"
 PART = "A part of a swarm"
 """The panels in which help shows options."""
+
+ENVIRONMENT: dict[str, str] = {}
+"""Variable of the environment -> the option that it stands for, where the command line does not have that."""
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Settings of every command, which inherits them from the root."""
@@ -47,11 +49,17 @@ _AS_IT_STANDS = (" ", "\b", "[", "swarm ")
 """Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
 
 
-def command(app: typer.Typer, panel: str | None = None, name: str | None = None) -> Callable[[F], F]:
-    """Adds a function to an app as a command, and returns the function as it is."""
+def command(
+    app: typer.Typer, panel: str | None = None, name: str | None = None, **settings: Any
+) -> Callable[[F], F]:
+    """Adds a function to an app as a command, and returns the function as it is.
+
+    settings  what else Typer takes of a command
+    """
 
     def added(function: F) -> F:
-        app.command(name, rich_help_panel=panel, help=_prose(function.__doc__))(_called_with_options(function))
+        made = app.command(name, rich_help_panel=panel, help=_prose(function.__doc__), **settings)
+        made(_called_with_options(function))
         return function
 
     return added
@@ -122,20 +130,26 @@ def _parameter(
     )
 
 
+def from_environment(variable: str, **more: Any) -> Any:
+    """An option whose value may be in a variable of the environment: `SWARM_NAMESPACE` for `--namespace`."""
+    ENVIRONMENT[variable] = "--" + variable.removeprefix("SWARM_").lower().replace("_", "-")
+    return typer.Option(envvar=variable, show_envvar=False, **more)
+
+
 class Family(TyperGroup):
-    """A group whose commands are those of the Typer app `MODULE.app`, which is imported when one is asked for.
+    """A group whose commands are those of a Typer app, `MODULE:APP`, which is imported when one is asked for.
 
     help  the line beside its name among the other commands; the app has a longer one of its own
     """
 
     def __init__(self, name: str, module: str, help: str, panel: str) -> None:
         self.module = module
-        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel)
+        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel, suggest_commands=False)
 
     @cached_property
     def group(self) -> Any:
         """The group of the app itself."""
-        return typer.main.get_command(importlib.import_module(self.module).app)
+        return typer.main.get_group(pkgutil.resolve_name(self.module))
 
     @property
     def commands(self) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -12,6 +13,9 @@ from typing import Any
 import typer
 from typer.exceptions import TyperException
 
+from launch_scripts.command_line.declaring import ENVIRONMENT
+from launch_scripts.command_line.old_names import current, meant
+from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
 
@@ -30,18 +34,21 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     _fill_streams()
     try:
         try:
-            code = command().main(prog_name=name, standalone_mode=False)
+            words, told = current(sys.argv[1:])
+            for sentence in told:
+                print(f"swarm: {sentence}", file=sys.stderr)
+            code = command().main(args=words, prog_name=name, standalone_mode=False)
         finally:
             sys.stdout.flush()
     except TyperException as error:
         if said := _sentence(error):
-            print(f"swarm: {said}", file=sys.stderr)
+            print(f"swarm: {said}{_given_by(said)}", file=sys.stderr)
         return ConfigError.exit_code
     except typer.Abort:
         print("swarm: stopped; nothing is written", file=sys.stderr)
         return 1
     except SwarmError as error:
-        print(f"swarm: {error}", file=sys.stderr)
+        print(f"swarm: {error}{_given_by(str(error))}", file=sys.stderr)
         return error.exit_code
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -78,9 +85,27 @@ def _sentence(error: TyperException) -> str:
         said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
-    elif "command" in said and "Did you mean" not in said and hasattr(ctx.command, "commands"):
-        said = f"{said} There are {', '.join(ctx.command.commands)}"
-    return said if ctx is None else f"{said.removesuffix('.')}; `{ctx.command_path} -h` explains"
+    elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
+        said = said.removesuffix(".") + meant(unknown[1], ctx.command.commands)
+    elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
+        names = [name for each in ctx.command.params if not getattr(each, "hidden", False) for name in each.opts]
+        said = f"No such option: {option}{nearest(option, names)}"
+    if ctx is None:
+        return said
+    said = re.sub(r"(?<!\.)\.$", "", said)
+    return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
+
+
+def _given_by(said: str) -> str:
+    """Returns the variables of the environment whose option or value a sentence names, in words."""
+    given = {each: os.environ[each] for each in ENVIRONMENT if os.environ.get(each)}
+    named = [
+        f"{option} is {variable}"
+        for variable, value in given.items()
+        if (option := ENVIRONMENT[variable]) in said or f"'{value}'" in said
+        if not any(word == value or word.startswith(option) for word in sys.argv)
+    ]
+    return f" ({', '.join(named)} of the environment)" if named else ""
 
 
 def _fill_streams() -> None:

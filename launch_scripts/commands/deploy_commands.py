@@ -76,9 +76,9 @@ def plan(
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
     An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
-    standbys, run on machines of their own. A second plan into
-    the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
-    archives of machines that it does not have.
+    standbys, run on machines of their own. A second plan
+    into the same folder keeps certificates that neither end soon nor are revoked, and removes archives of machines
+    that it does not have.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
@@ -174,7 +174,7 @@ def size(
     named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
     and the density of the scenario `thousand`; see docs/design/measurement.md for the table and its errors.
 
-    Exit code 1 if a process has to do more than one core can.
+    Exit code 1 if a process has to do more than one core can: more machines do not help it.
 
     vehicles   Vehicles.
     targets    Targets, each with a planner.
@@ -246,17 +246,16 @@ def certs(
     makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
     allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
 
-    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
+    swarm role router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
 
-    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
+    swarm role agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
     Copy ca.pem and the two files of a name to the machine where it runs. ca.key stays here: its holder can admit
     any process. Existing certificates are kept while more than a third of their time is left.
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Make certificates that its processes lack or that end soon, too, and replacements for those that it
-              revokes.
+    scenario  Make certificates that its processes lack, that end soon or that it revokes, too.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """

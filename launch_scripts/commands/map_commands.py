@@ -1,4 +1,4 @@
-"""`swarm map`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
+"""`swarm marks`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[Ma
 
 
 @command(app)
-def inspect(store: Store, as_json: AsJson = False) -> None:
+def show(store: Store, as_json: AsJson = False) -> None:
     """Show the marks in a store, by author.
 
-    swarm map inspect runs/LAST/map.sqlite
+    swarm marks show runs/LAST/map.sqlite
     """
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
@@ -107,7 +107,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if found["authors_that_learned"]:
-        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm map learned {store}")
+        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm marks factors {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
@@ -120,9 +120,9 @@ def export(store: Store, out: Path) -> None:
     JSON holds all marks and learned factors, and can be imported. Other formats hold the winning marks as pixels or
     polygons.
 
-    swarm map export runs/LAST/map.sqlite marks.json
+    swarm marks export runs/LAST/map.sqlite marks.json
 
-    swarm map export runs/LAST/map.sqlite marks.gpkg
+    swarm marks export runs/LAST/map.sqlite marks.gpkg
 
     out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
@@ -157,9 +157,9 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
 def import_(file: Path, store: Path) -> None:
     """Import exported marks into a store, which no keeper uses.
 
-    swarm map import marks.json my.sqlite
+    swarm marks import marks.json my.sqlite
 
-    file   A .json file of `swarm map export`.
+    file   A .json file of `swarm marks export`.
     store  The store; made if missing.
     """
     terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
@@ -170,7 +170,7 @@ def import_(file: Path, store: Path) -> None:
 
 
 @command(app)
-def learned(
+def factors(
     where: Where,
     store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
@@ -179,9 +179,9 @@ def learned(
 
     A row has driven over prior pace, and the factor on the prior (map.learning).
 
-    swarm map learned
+    swarm marks factors
 
-    swarm map learned runs/LAST
+    swarm marks factors runs/LAST
 
     store  A keeper's store, or the folder of its run; if not given, the running swarm is asked.
     """

@@ -368,13 +368,15 @@ def write_raster(
     grid: GridSpec,
     *,
     descriptions: Sequence[str] = (),
+    unit: str = "",
     tags: Mapping[str, str] | None = None,
     **profile: Any,
 ) -> None:
     """Writes a tiled, compressed GeoTIFF with overviews (its tile pyramid). A terrain without a place gets none.
 
     bands         (rows, cols) each, of one dtype
-    descriptions  what each band holds, with its unit
+    descriptions  meaning of each band
+    unit          unit of the first band, as a GIS shows it: s, s/m
     profile       as rasterio takes it, such as nodata
 
     Raises StoreError if it cannot be written.
@@ -399,6 +401,7 @@ def write_raster(
                 file.write(band, number)
             for number, text in enumerate(descriptions, 1):
                 file.set_band_description(number, text)
+            file.set_band_unit(1, unit)
             file.update_tags(**(tags or {}))
             factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
             if factors:

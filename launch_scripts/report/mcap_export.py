@@ -1,4 +1,4 @@
-"""`swarm export --mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`.
+"""`runs export --format mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`.
 
 A viewer that jumps to an instant shows the last message of each topic. Each message therefore holds all of its
 topic: all vehicles, all routes, all marks; large topics are written less often. One message is made at a time.

@@ -193,7 +193,7 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
 
 
 def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
-    """Copies a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
+    """Copies a recording, up to a time, into a folder which `swarm runs replay` and a test can replay. Raises
     StoreError."""
     head, scenario = recorded.head, folder / SCENARIO_FILE
     path = path_of(folder, head.role, head.id, head.incarnation)
@@ -215,7 +215,7 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
         if writer.cut is not None:
             raise StoreError(writer.cut)
         if reader.damaged is not None:
-            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
+            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until-s")
         write_file(scenario, head.scenario.encode())
     except StoreError:
         path.unlink(missing_ok=True)

@@ -72,9 +72,8 @@ def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> 
 
 @pytest.mark.parametrize("name", PODS)
 def test_the_command_line_takes_the_words_of_a_pod(name: str) -> None:
-    role, *words = PODS[name]["spec"]["containers"][0]["args"]
-    context = command().make_context("swarm", [role, *words], resilient_parsing=True)
-    taken = command().get_command(context, role).make_context(role, words).params
+    _, role, *words = PODS[name]["spec"]["containers"][0]["args"]
+    taken = command().commands["role"].commands[role].make_context(role, words).params
     assert (taken["health_port"], taken["signals_address"], taken["log_format"]) == (HEALTH_PORT, "0.0.0.0", "json")
     assert taken["scenario"] == "/etc/swarm/scenario.toml"
 
@@ -130,7 +129,7 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
         assert LABEL.fullmatch(compose["name"])
         for each in containers:
             service = compose["services"][each.name]
-            assert service["command"][0] == each.process.role
+            assert service["command"][:2] == ["role", each.process.role]
             assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001:10001", True, ["ALL"])
             assert "privileged" not in service
             assert service["restart"] == "unless-stopped"

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support import slow_twins as naive
-from support.effort import few
 from support.kernel_oracle import find_strides, inner
 from support.planner_play import Play
 from support.planner_strategies import (
     RULES,
     STRATEGIES,
-    Job,
     Marks,
     Move,
-    happenings,
-    paces,
-    planner_configs,
     random_climb,
     random_pace,
 )
@@ -34,26 +26,6 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
-
-
-@st.composite
-def climbs(draw: st.DrawFn, shape: tuple[int, int]) -> Climb:
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return random_climb(
-        rng, GridSpec(*shape, 1.0), draw(st.sampled_from([0.0, 0.1, 0.5])), draw(st.sampled_from([0.1, 0.3, 10.0]))
-    )
-
-
-@given(paces(), planner_configs(), happenings(), st.data())
-@settings(max_examples=few(60), deadline=None)
-def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
-    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], data: st.DataObject
-) -> None:
-    play = Play(pace, config, climb=data.draw(climbs(pace.shape)))
-    play.check()
-    for event in events:
-        play.happen(event)
-        play.check()
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -135,23 +107,6 @@ def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
         driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
         assert (tree.cost[starts] + tree.offset >= driven * (1 - 1e-5)).all()
     assert visited > 100
-
-
-@pytest.mark.parametrize("strategy", ["full", "auto", "variable_range+multi_resolution"])
-@pytest.mark.parametrize("most", [0, 5])
-def test_what_is_said_of_a_route_does_not_depend_on_who_else_asks(strategy: str, most: int) -> None:
-    ground = ground_of(4, RULES[0], 24, 26)
-    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
-    play = Play(ground.pace, config, climb=ground.climb)
-    for _ in range(8):
-        play.happen(Move(*(int(step) for step in ground.rng.integers(-1, 2, 2))))
-        asked = ground.rng.choice(play.grid.cells, 40)
-        together = copy.deepcopy(play.tree).routes(asked, most)
-        alone = copy.deepcopy(play.tree)
-        for n, cell in enumerate(asked.tolist()):
-            one = alone.routes([cell], most)[0]
-            assert (one.cost_s, one.remaining_s) == (together[n].cost_s, together[n].remaining_s)
-            assert (one.lower_bound_s, one.directions) == (together[n].lower_bound_s, together[n].directions)
 
 
 class Extremes(Play):

@@ -1,4 +1,4 @@
-"""`swarm mavlink` under any events in any order: commands that are never sent to a vehicle, and those that always
+"""`gateway mavlink` under any events in any order: commands that are never sent to a vehicle, and those that always
 are."""
 
 from __future__ import annotations

@@ -29,9 +29,9 @@ WRITTEN = {ROOT / "docs" / folder for folder in ("design", "reference", "plugins
 PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|grep|journalctl|zenohd|uv|git"
 _COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
 _SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
-_HEAVY = re.compile(r"swarm (up|demo|run|simulate|study|sweep|replay|compare)\b")
+_HEAVY = re.compile(r"swarm (up|demo|runs|simulate|study)\b")
 SHELL = ("sh", "bash", "console")
-_SYNTH = "swarm terrain synth --rows 200 --cols 240 --out dem.tif --photo photo.tif"
+_SYNTH = "swarm terrain generate --rows 200 --cols 240 --out dem.tif --photo photo.tif"
 
 
 class Block(NamedTuple):

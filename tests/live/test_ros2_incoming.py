@@ -74,7 +74,7 @@ def port(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     (folder / "gateway.toml").write_text(SETTINGS)
     with ros_router() as port, (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [*SWARM, "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
+            [*SWARM, "gateway", "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
              "--ros", f"tcp/127.0.0.1:{port}", "--runs", str(live.runs)],
             stdout=log, stderr=log,
         )  # fmt: skip

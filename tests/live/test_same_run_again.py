@@ -19,13 +19,13 @@ pytestmark = pytest.mark.network
 
 
 def sets_in(store: Path) -> int:
-    done = swarm("map", "inspect", store, "--json")
+    done = swarm("marks", "show", store, "--json")
     assert done.returncode == 0, done.stderr
     return int(json.loads(done.stdout)["sets"])
 
 
 @pytest.mark.parametrize(
-    "kill", [pytest.param(os.kill, marks=pytest.mark.thorough), os.killpg], ids=["launcher", "all"]
+    "kill", [os.kill, pytest.param(os.killpg, marks=pytest.mark.thorough)], ids=["launcher", "all"]
 )
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
     tmp_path: Path, kill: Callable[[int, int], None]

@@ -69,7 +69,7 @@ def status_of_x(live: LiveSwarm) -> dict[str, Any]:
 
 def route_to_x(live: LiveSwarm, *options: str) -> str:
     return swarm(
-        "route", "--connect", live.endpoint, "--target", "x", "--row", 40, "--col", 40, "--steps", 1, *options
+        "route", "--connect", live.endpoint, "--target", "x", "--from", "cell:40,40", "--steps", 1, *options
     ).stdout
 
 

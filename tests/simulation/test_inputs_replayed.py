@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from launch_scripts.cli import app
+from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import keep, recordings_of, replay_run
 from launch_scripts.simulation.simulate import simulate

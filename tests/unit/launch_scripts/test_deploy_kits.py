@@ -239,16 +239,6 @@ def test_install_puts_files_where_the_unit_looks_for_them_and_takes_over_a_new_p
     assert f"ExecStart=/opt/swarm/bin/swarm up /{home.relative_to(root)}/scenario.toml" in unit
 
 
-@pytest.mark.parametrize("script", ["install", "run"])
-def test_scripts_are_scripts_of_a_posix_shell(script: str, tmp_path: Path) -> None:
-    plan = planned()
-    path = tmp_path / script
-    path.write_text(systemd_files(plan, plan.hosts[0])[script])
-    assert subprocess.run(["sh", "-n", path], check=False).returncode == 0
-    dash = shutil.which("dash")
-    assert dash is None or subprocess.run([dash, "-n", path], check=False).returncode == 0
-
-
 def analyze(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """`systemd-analyze` on the unit of a machine, with a program that is there in place of the swarm's."""
     if shutil.which("systemd-analyze") is None:

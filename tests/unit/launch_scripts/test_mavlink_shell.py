@@ -1,4 +1,4 @@
-"""The shell of `swarm mavlink`, turn by turn, between a link that a test plays and a swarm on a memory network."""
+"""The shell of `gateway mavlink`, turn by turn, between a link of a test and a swarm on a memory network."""
 
 from __future__ import annotations
 
@@ -152,6 +152,6 @@ def test_what_flies_is_gone_when_its_link_is_lost_and_another_life_when_it_is_ba
 
 def test_ground_without_coordinates_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match="swarm mavlink needs latitudes and longitudes: this terrain has no coordin"
+        ConfigError, match="swarm gateway mavlink needs latitudes and longitudes: this terrain has no coordin"
     ):
         check_ground(Frame(GridSpec(9, 9, 10.0)))

@@ -1,4 +1,4 @@
-"""The links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+"""The links of `swarm gateway mavlink`: bytes become checked messages of one vehicle, and nothing else."""
 
 from __future__ import annotations
 

@@ -280,18 +280,6 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
     assert bool(found) == (not fine), found
 
 
-def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
-    """docs/method/measurements.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
-    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.450, 745), (1000, 512, 0.677, 889)):
-        scenario = parse_scenario(
-            f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
-            f"[vehicles]\ntick_hz = 5\nper_agent = {min(vehicles // 4, 200)}\n"
-        )
-        found = machine.needs_of(scenario, cells_a_side**2)
-        assert found.cores == pytest.approx(cores, rel=0.15)
-        assert found.memory_bytes / 1e6 == pytest.approx(megabytes, rel=0.35)
-
-
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     scenario = parse_scenario("[[groups]]\nvehicles = 1200\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
     wanted = machine.needs_of(scenario, 512**2)

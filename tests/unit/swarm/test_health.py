@@ -19,7 +19,7 @@ from support.makers import run_info
 from swarm.bus.bus import AskEnded, Event, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
-from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
+from swarm.clock import ManualClock, MonotonicClock
 from swarm.runtime import health as health_module
 from swarm.runtime.health import BOARD_BYTES, SLOT_BYTES, Board, Health, Phase, Supervisor, Vitals, supervisor_of
 from swarm.runtime.inbox import Inbox
@@ -140,13 +140,6 @@ def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.Monke
     assert not health.board.read().hangs(1 << 62), "what ends does not turn, and does not hang"
 
 
-def test_the_limit_is_never_shorter_than_many_periods() -> None:
-    health = Health()
-    health.begins(tick_hz=0.5)
-    health.turned(())
-    assert health.board.read().limit_ns == 40 * NS_PER_S
-
-
 @pytest.fixture
 def manager(tmp_path: Path) -> Iterator[socket.socket]:
     """The socket of a service manager."""
@@ -230,15 +223,6 @@ def fill(manager: socket.socket) -> None:
 def select_ready(manager: socket.socket) -> bool:
     """True if more can be read."""
     return bool(select.select([manager], [], [], 0)[0])
-
-
-def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
-        name = f"terrain-swarm-test-{os.getpid()}"
-        listening.bind(f"\0{name}")
-        listening.settimeout(10)
-        supervisor_of({"NOTIFY_SOCKET": f"@{name}"}).turned(1)
-        assert listening.recv(100) == b"READY=1"
 
 
 @given(st.text(max_size=300))

@@ -101,11 +101,6 @@ def test_ticks_of_processes_with_successive_ids_lie_spread_over_the_period(first
     assert apart.max() < 2.0
 
 
-def test_an_id_of_any_letters_has_a_phase():
-    for id in ("", "rover", "é²", "9" * 40):
-        assert 0.0 <= tick_phase(id) == tick_phase(id) < 1.0
-
-
 @pytest.mark.parametrize("start_ms", [0, 29, 31, 99, 1_700_000_000_030])
 def test_ticks_fall_where_the_phase_says_whenever_the_process_starts_and_however_late_one_is(start_ms):
     clock, inbox = ManualClock(start_ms * 10**6), Inbox()
@@ -169,15 +164,6 @@ def test_a_service_that_raises_is_stopped_and_the_error_goes_on():
     with pytest.raises(ValueError, match="bug"):
         Process(service, Inbox(), ManualClock(), tick_hz=10).run()
     assert service.log == ["start", "stop"]
-
-
-def test_a_process_ticks_at_its_rate_and_stops_from_another_thread():
-    service = Recording()
-    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50)
-    threading.Timer(0.5, process.stop).start()
-    process.run()
-    assert 15 <= len(service.ticks) <= 27
-    assert service.log[-1] == "stop"
 
 
 def test_a_worker_gives_its_result_back_as_an_event():

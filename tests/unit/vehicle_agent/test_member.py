@@ -111,6 +111,8 @@ def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
     member.hear_standing(standing("a1", [9], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
     assert isinstance(save, Save)
+    member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
+    assert member.warden is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
     first = member.warden
     assert first is not None
