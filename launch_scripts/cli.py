@@ -6,6 +6,7 @@ import inspect
 import textwrap
 from functools import cache, reduce
 from importlib.metadata import version
+from pkgutil import resolve_name
 from typing import Annotated, Any
 
 import typer
@@ -15,16 +16,12 @@ from launch_scripts.command_line import declaring
 from launch_scripts.command_line.declaring import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family
 from launch_scripts.command_line.old_names import current
 from launch_scripts.command_line.run_command import run_command
-from launch_scripts.commands import (
-    ask_commands,
-    order_commands,
-    run_commands,
-    scenario_commands,
-    simulation_commands,
-)
 
-LEAVES = (run_commands.app, scenario_commands.app, ask_commands.app, order_commands.short, simulation_commands.app)
-"""Commands without a family."""
+LEAVES = (
+    "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
+    "simulation_commands:app",
+)  # fmt: skip
+"""Apps of commands without a family, in `launch_scripts.commands`."""
 FAMILIES = {
     "order": ("order_commands:app", "Pause a running swarm; change its zones, targets and vehicles.", ORDER),
     "order zone": ("zone_commands:app", "Close areas of a running swarm.", ORDER),
@@ -59,7 +56,8 @@ class Root(TyperGroup):
       terrain ...           Inspect and convert terrain
 
     More: swarm help --all
-    `swarm COMMAND -h` explains a command.
+    `swarm COMMAND -h` explains a command. SWARM_CONNECT and other variables
+    stand for options (docs/operate/run.md).
     """
 
     all = False
@@ -129,8 +127,9 @@ def help_(
     root.main([*current(words or ())[0], "-h"], prog_name="swarm", standalone_mode=False)
 
 
-for leaves in (*LEAVES, help_app):
-    app.add_typer(leaves)
+for leaves in LEAVES:
+    app.add_typer(resolve_name(f"launch_scripts.commands.{leaves}"))
+app.add_typer(help_app)
 
 
 @cache

@@ -12,7 +12,7 @@ _RUNS = ("demo", "up")
 """Commands that start processes."""
 _NEEDED = [package for package, extra in EXTRAS.items() if extra in ("planner", "terrain", "roles")]
 """Packages of their processes."""
-_SAYS_MORE = ("-h", "--help", "--only")
+_SAYS_MORE = ("-h", "--help", "--only", "-d", "--detach")
 """With words that begin so it is for the command to say which processes, if any."""
 
 

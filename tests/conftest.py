@@ -6,6 +6,7 @@ for new ones."""
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,11 @@ from support.effort import few, try_all
 TESTS = Path(__file__).parent
 # Processes that a test starts find this checkout and the support modules, whatever their folder.
 os.environ["PYTHONPATH"] = os.pathsep.join((str(TESTS.parent), str(TESTS)))
+# No variable of a user says where a command looks, and no run of a test is registered among a user's runs.
+for name in [name for name in os.environ if name.startswith("SWARM_")]:
+    del os.environ[name]
+_STATE = tempfile.TemporaryDirectory(prefix="swarm-state-")
+os.environ["SWARM_STATE"] = _STATE.name
 
 EXAMPLES = 100
 """Number of examples of a property that names none, with `--thorough`; each commit tries a share

@@ -50,11 +50,13 @@ def terrains(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def runs(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the runs in --runs, the newest first, and LAST."""
-    names: list[str] = []
+    """Names of the runs in --runs and of those that are registered, the newest first, and LAST."""
+    from launch_scripts.observe.run_registry import registered
+
+    names = {run.name for run in registered()}
     with contextlib.suppress(OSError):
-        names = sorted((each.name for each in _runs_folder(ctx).iterdir() if each.is_dir()), reverse=True)
-    return [name for name in names if name.startswith(incomplete)]
+        names |= {each.name for each in _runs_folder(ctx).iterdir() if each.is_dir()}
+    return [name for name in sorted(names, reverse=True) if name.startswith(incomplete)]
 
 
 def target_ids(ctx: typer.Context, incomplete: str) -> list[str]:

@@ -35,9 +35,12 @@ ADMIN = "Processes, machines and other systems"
 """The panels in which help shows commands."""
 
 NETWORK = "Where the swarm is"
-CERTIFICATES = "Certificates (all three, or none)"
+CERTIFICATES = "Certificates (a folder, or all three files)"
 PART = "A part of a swarm"
 """The panels in which help shows options."""
+
+ENVIRONMENT: dict[str, str] = {}
+"""Variable of the environment -> the option that it stands for, where the command line does not have that."""
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Settings of every command, which inherits them from the root."""
@@ -125,6 +128,12 @@ def _parameter(
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info]
     )
+
+
+def from_environment(variable: str, **more: Any) -> Any:
+    """An option whose value may be in a variable of the environment: `SWARM_NAMESPACE` for `--namespace`."""
+    ENVIRONMENT[variable] = "--" + variable.removeprefix("SWARM_").lower().replace("_", "-")
+    return typer.Option(envvar=variable, show_envvar=False, **more)
 
 
 class Family(TyperGroup):

@@ -6,26 +6,16 @@ from collections.abc import Collection, Sequence
 
 from swarm.config.explain import choice
 
-_FAMILIES = {
-    "role": ("router", "keeper", "planner", "agent", "targets", "monitor"),
-    "runs": ("compare", "report", "export", "replay"),
-    "order": ("group", "set", "zone", "target", "vehicle"),
-    "gateway": ("ros2", "mavlink"),
-}
-"""Family -> its commands which had none."""
-COMMANDS = {name: f"{family} {name}" for family, names in _FAMILIES.items() for name in names} | {
-    "orders": "order ls",
-    "zone list": "order zone ls",
-    "vehicle go": "order vehicle start",
-    "vehicle gone": "order vehicle forget",
-    "map": "marks",
-    "map inspect": "marks show",
-    "map learned": "marks factors",
-    "plugins": "plugin",
-    "plugins list": "plugin ls",
-    "sweep": "study run",
-    "terrain synth": "terrain generate",
-}
+COMMANDS = {
+    "router": "role router", "keeper": "role keeper", "planner": "role planner", "agent": "role agent",
+    "targets": "role targets", "monitor": "role monitor", "compare": "runs compare", "report": "runs report",
+    "export": "runs export", "replay": "runs replay", "group": "order group", "set": "order set",
+    "zone": "order zone", "target": "order target", "vehicle": "order vehicle", "ros2": "gateway ros2",
+    "mavlink": "gateway mavlink", "orders": "order ls", "zone list": "order zone ls",
+    "vehicle go": "order vehicle start", "vehicle gone": "order vehicle forget", "map": "marks",
+    "map inspect": "marks show", "map learned": "marks factors", "plugins": "plugin", "plugins list": "plugin ls",
+    "sweep": "study run", "terrain synth": "terrain generate",
+}  # fmt: skip
 """Old words -> new words."""
 OPTIONS = {
     "order zone add": {"--until": "--for"},
@@ -36,14 +26,13 @@ OPTIONS = {
     "order group": {"--as-scenario": "swarm order unset groups.NAME"},
 }
 """Command -> old option -> new option. In place of a whole command the option still works as it is."""
-MOVED = {"bench": "./launch_scripts/bench", "chaos": "./launch_scripts/bench chaos"}
-"""Old command -> program in a checkout of the source."""
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
     "delete": ("remove",), "rm": ("remove",), "watch": ("top",), "validate": ("check",),
+    "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
-"""Word that other programs have -> our words, the first of which that a group knows is meant."""
+"""Word that other programs have, or we had -> our words, the first of which that a group knows is meant."""
 
 
 def current(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -64,8 +53,6 @@ def current(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def meant(word: str, known: Collection[str]) -> str:
     """Returns the end of a sentence about an unknown command: the command which is meant, or all that are known."""
-    if word in MOVED:
-        return f": it is `{MOVED[word]}` in a checkout of the source"
-    synonyms = (each for each in _SYNONYMS.get(word, ()) if each in known or each.startswith("--"))
+    synonyms = (each for each in _SYNONYMS.get(word, ()) if each in known or each[0] in "-.")
     synonym = next(synonyms, None)
     return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"

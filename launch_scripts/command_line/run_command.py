@@ -13,6 +13,7 @@ from typing import Any
 import typer
 from typer.exceptions import TyperException
 
+from launch_scripts.command_line.declaring import ENVIRONMENT
 from launch_scripts.command_line.old_names import current, meant
 from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
@@ -41,13 +42,13 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             sys.stdout.flush()
     except TyperException as error:
         if said := _sentence(error):
-            print(f"swarm: {said}", file=sys.stderr)
+            print(f"swarm: {said}{_given_by(said)}", file=sys.stderr)
         return ConfigError.exit_code
     except typer.Abort:
         print("swarm: stopped; nothing is written", file=sys.stderr)
         return 1
     except SwarmError as error:
-        print(f"swarm: {error}", file=sys.stderr)
+        print(f"swarm: {error}{_given_by(str(error))}", file=sys.stderr)
         return error.exit_code
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -93,6 +94,18 @@ def _sentence(error: TyperException) -> str:
         return said
     said = re.sub(r"(?<!\.)\.$", "", said)
     return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
+
+
+def _given_by(said: str) -> str:
+    """Returns the variables of the environment whose option or value a sentence names, in words."""
+    given = {each: os.environ[each] for each in ENVIRONMENT if os.environ.get(each)}
+    named = [
+        f"{option} is {variable}"
+        for variable, value in given.items()
+        if (option := ENVIRONMENT[variable]) in said or f"'{value}'" in said
+        if not any(word == value or word.startswith(option) for word in sys.argv)
+    ]
+    return f" ({', '.join(named)} of the environment)" if named else ""
 
 
 def _fill_streams() -> None:

@@ -117,12 +117,10 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
     if watch:
         show_top(where, each=False, once=False, as_json=as_json)
-        return
-    told = ask_status(where)
-    if as_json:
-        typer.echo(json.dumps(status_fields(told), indent=2))
+    elif as_json:
+        typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:
-        print_status(told, Console(markup=False))
+        print_status(ask_status(where), Console(markup=False))
 
 
 @command(app, ASK)

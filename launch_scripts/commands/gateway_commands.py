@@ -12,7 +12,7 @@ import typer
 
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.role_commands import check_name
-from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.running_swarm import RUNS, Where
 from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
 from swarm.errors import BusError, ConfigError
 
@@ -76,7 +76,7 @@ def ros2(
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
     if where.tls_ca is None:
         where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
-    _serve_ros2(chosen, where.network(), where.runs)
+    _serve_ros2(chosen, where.network(), where.runs or RUNS)
 
 
 def _list_topics(settings: Settings, *, as_json: bool) -> None:

@@ -16,6 +16,8 @@ from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import ORDER, command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, Walk
+from swarm.config.explain import choice, explain
+from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from swarm.runtime.operator import Acknowledged
@@ -81,8 +83,6 @@ def group(
     name     The group.
     targets  The targets that it may chase.
     """
-    from swarm.errors import ConfigError
-
     chosen = list(targets or ())
     if chosen[:1] == ["targets"]:
         chosen = chosen[1:]
@@ -108,8 +108,6 @@ def set_(
     key    A key of the scenario, such as time_scale.
     value  Its new value.
     """
-    from swarm.errors import ConfigError
-
     _check_setting(key)
     if as_scenario == (value is not None):
         raise ConfigError(f"set: give a value; `swarm order unset {key}` restores that of the scenario")
@@ -134,8 +132,6 @@ def unset(key: Key, where: Where, as_json: AsJson = False) -> int:
 
 
 def _check_setting(key: str) -> None:
-    from swarm.config.explain import choice
-    from swarm.errors import ConfigError
     from swarm.runtime.order_book import SETTINGS
 
     if key not in SETTINGS:
@@ -252,8 +248,6 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
     import msgspec
 
-    from swarm.config.explain import explain
-    from swarm.errors import ConfigError
     from swarm.wire.versions import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}

@@ -38,6 +38,10 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
     """
+    if run.detach:
+        from launch_scripts.commands.runs_commands import in_background
+
+        return in_background(as_json=run.as_json)
     from launch_scripts.launcher.console import busy_loading
     from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
-from launch_scripts.command_line.declaring import NETWORK
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import NETWORK, from_environment
 from launch_scripts.commands.shared_options import Tls
 
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
     from swarm.config.scenario import NetworkConfig
 
+RUNS = Path("runs")
+"""Folder in which a command looks beside the registry: runs of earlier versions are not registered."""
+RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete.runs)]
+RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
 _CONNECT_S = 3.0
 _NEWEST = 50
 """Number of runs that are tried: each costs a connection to a port of this machine."""
@@ -31,15 +38,15 @@ class Where(Tls):
 
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
-    run        The run to ask, where several run here: its name in --runs, or its folder.
-    runs       Folder of the runs of this machine.
+    run        The run to ask, where several run here: its name, or its folder.
+    runs       Look in this folder only; if not given, all of your runs on this machine are found.
     """
 
     panel: ClassVar[str | None] = NETWORK
-    connect: str | None = None
-    namespace: str | None = None
-    run: str | None = None
-    runs: Path = Path("runs")
+    connect: Annotated[str | None, from_environment("SWARM_CONNECT")] = None
+    namespace: Annotated[str | None, from_environment("SWARM_NAMESPACE")] = None
+    run: RunOption = None
+    runs: RunsHere = None
 
     @cached_property
     def _found(self) -> NetworkConfig:
@@ -51,9 +58,7 @@ class Where(Tls):
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
         found = find_swarm(self.runs, self.run)
-        if found.others:
-            told = ", ".join(found.others[:_NAMED])
-            typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
+        say_newest(found.run, found.others)
         return found.network
 
     def network(self) -> NetworkConfig:
@@ -85,6 +90,13 @@ class Where(Tls):
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
+def say_newest(run: str | None, others: Sequence[str]) -> None:
+    """Says which run a command asks, if others run too."""
+    if others:
+        told = ", ".join(others[:_NAMED])
+        typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
+
+
 @dataclass(frozen=True, slots=True)
 class Found:
     """A router that listens, and whose it is as far as that is known.
@@ -97,9 +109,10 @@ class Found:
     others: tuple[str, ...] = ()
 
 
-def find_swarm(runs: Path, name: str | None = None) -> Found:
-    """The newest run in a folder whose router listens; a router at the usual endpoint if there is none.
+def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
+    """The newest run whose router listens; a router at the usual endpoint if there is none.
 
+    runs  folder of the runs that are looked at; None: all of this user, and those in ./runs
     name  of the run, or its folder; only that is looked at then
     Raises BusError with the places that were tried, ConfigError if there is no run of that name.
     """
@@ -108,7 +121,7 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
     from swarm.config import scenario
     from swarm.errors import BusError
 
-    folders = [find_run(name, runs)] if name is not None else _newest_first(runs)
+    folders = [find_run(name, runs or RUNS)] if name is not None else _newest_first(runs)
     networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
     tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
@@ -125,9 +138,10 @@ def find_swarm(runs: Path, name: str | None = None) -> Found:
         raise BusError(
             f"run {name} does not run here: no process listens ({'; '.join(looked) or 'it names no router'})"
         )
+    runs_in = "your runs" if runs is None else f"the runs in {runs}"
     more = f" and {len(looked) - _NAMED} more" if len(looked) > _NAMED else ""
     raise BusError(
-        f"no swarm runs here: no process listens at any router of the runs in {runs} or at the usual endpoint "
+        f"no swarm runs here: no process listens at any router of {runs_in} or at the usual endpoint "
         f"({'; '.join(looked[:_NAMED])}{more}); --connect names another"
     )
 
@@ -148,16 +162,19 @@ def _network_of(folder: Path) -> NetworkConfig | None:
         return None
 
 
-def _newest_first(runs: Path) -> list[Path]:
-    """Folders of runs: those that have left no report yet first, and of these the newest."""
+def _newest_first(runs: Path | None) -> list[Path]:
+    """Folders of runs: those whose launcher runs first, then those that have left no report, and of these the
+    newest."""
     from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE
+    from launch_scripts.observe.run_registry import registered
 
-    try:
-        folders = [each for each in runs.iterdir() if each.name != LAST and (each / RUN_FILE).is_file()]
-    except OSError:
-        return []
+    known = registered()
+    launched = {run.folder for run in known if run.launchers}
+    folders = set() if runs is not None else {run.folder for run in known}
+    with suppress(OSError):
+        folders |= {each.resolve() for each in (runs or RUNS).iterdir() if each.name != LAST}
 
-    def newness(folder: Path) -> tuple[bool, float]:
-        return not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
+    def newness(folder: Path) -> tuple[bool, bool, float]:
+        return folder in launched, not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
 
-    return sorted(folders, key=newness, reverse=True)
+    return sorted((each for each in folders if (each / RUN_FILE).is_file()), key=newness, reverse=True)

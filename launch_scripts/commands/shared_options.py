@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import typer
 
 from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import CERTIFICATES, NETWORK, PART
+from launch_scripts.command_line.declaring import CERTIFICATES, NETWORK, PART, from_environment
 from swarm.liveness import HIGHEST_RANK
 
 if TYPE_CHECKING:
@@ -36,8 +36,11 @@ ScenarioArgument = Annotated[
         autocompletion=complete.scenarios,
     ),
 ]
-Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")]
-Runs = Annotated[Path, typer.Option(help="Folder of the runs of this machine.")]
+Namespace = Annotated[
+    str | None,
+    from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet."),
+]
+Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder of the runs of this machine.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
@@ -63,7 +66,11 @@ SignalsAddress = Annotated[
 ]
 LogFormatOption = Annotated[
     Literal["text", "json"],
-    typer.Option(metavar="FORMAT", help="Logs as text, or as json: one object a line, for programs."),
+    from_environment(
+        "SWARM_LOG_FORMAT",
+        metavar="FORMAT",
+        help="Logs as text, or as json: one object a line, for programs.",
+    ),
 ]
 Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 
@@ -72,12 +79,14 @@ Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 class Tls:
     """The three files of mutual TLS: all, or none. Every option that states how a swarm is reached includes them.
 
+    tls_dir   Folder of ca.pem, certificate and key, in place of the three options below.
     tls_ca    Certificate of the authority, PEM.
     tls_cert  Our certificate, PEM.
     tls_key   Our private key, PEM.
     """
 
     panel: ClassVar[str | None] = CERTIFICATES
+    tls_dir: Annotated[str | None, from_environment("SWARM_TLS_DIR", metavar="FOLDER")] = None
     tls_ca: str | None = None
     tls_cert: str | None = None
     tls_key: str | None = None
@@ -85,7 +94,7 @@ class Tls:
     def tls(self) -> TlsConfig | None:
         from launch_scripts.launcher.options import tls_of
 
-        return tls_of(self.tls_ca, self.tls_cert, self.tls_key)
+        return tls_of(self.tls_ca, self.tls_cert, self.tls_key, self.tls_dir)
 
 
 @dataclass(frozen=True)
@@ -99,6 +108,7 @@ class RunOptions:
     metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
     follow         The camera follows this vehicle or target, as a0-07.
     plain          Plain lines instead of the live table.
+    detach         Run in the background: return once the swarm is whole. `swarm down` ends it.
     """
 
     panel: ClassVar[str | None] = None
@@ -113,6 +123,7 @@ class RunOptions:
     log_format: LogFormatOption = "text"
     follow: Annotated[str | None, typer.Option(metavar="ID")] = None
     plain: bool = False
+    detach: Annotated[bool, typer.Option("--detach", "-d")] = False
     as_json: AsJson = False
 
 

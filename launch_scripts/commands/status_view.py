@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -24,6 +24,7 @@ from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
+from launch_scripts.observe.run_registry import pids_of
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import gaps_to
 from launch_scripts.plain_text import plain, unanswered
@@ -54,6 +55,7 @@ class Status:
 
     members    processes that have answered, those of the run first; routers belong to none
     strangers  those of another run in the same namespace
+    pids       name -> pid of those on this machine
     """
 
     members: list[RunInfo]
@@ -61,6 +63,7 @@ class Status:
     latest: LatestState
     frame: MapFrame | None
     now_ns: int
+    pids: dict[str, int]
 
     @property
     def silent(self) -> list[str]:
@@ -101,7 +104,8 @@ def status_of(observer: OutsideObserver, now_ns: int) -> Status:
     """Returns the state received up to now. At least one process has replied."""
     assert observer.latest is not None
     members, strangers = observer.members()
-    return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
+    pids = pids_of(members[0].run_id)
+    return Status(members, strangers, observer.latest, frame_of_members(members), now_ns, pids)
 
 
 def print_status(status: Status, console: Console) -> None:
@@ -152,14 +156,16 @@ def _wire_versions(status: Status) -> str | None:
 
 
 def _processes(status: Status) -> Table:
-    crew = columns("process", "up", "messages out", "in", "dropped")
+    crew = columns("process", "pid", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.latest.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
         told = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
         up_s = max(status.now_ns - info.incarnation, 0) / NS_PER_S
         leading = {True: ", leads", False: ", stands by", None: ""}[status.latest.leads.get((info.role, info.id))]
-        crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
+        name = f"{info.role}-{info.id}"
+        pid = str(status.pids.get(name, "-"))
+        crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
 
 
@@ -181,6 +187,7 @@ def status_fields(status: Status) -> dict[str, Any]:
         return {
             "role": info.role,
             "id": info.id,
+            "pid": status.pids.get(f"{info.role}-{info.id}"),
             "incarnation": info.incarnation,
             "wire_version": info.wire_version,
             "leads": status.latest.leads.get((info.role, info.id)),
@@ -230,7 +237,9 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
             raise BusError(f"only routers answer {where}: is the swarm running?")
         with Live(console=console, auto_refresh=False) if moving else nullcontext() as live:
             while True:
-                state, processes = state_of(latest, clock.now_ns()), latest.loads.lines(latest.up())
+                pids = pids_of(run.run_id) if each or as_json else {}
+                state = state_of(latest, clock.now_ns())
+                processes = [replace(load, pid=pids.get(load.name)) for load in latest.loads.lines(latest.up())]
                 if as_json:
                     print(json.dumps(top_fields(run, state, processes)), flush=True)
                 elif live is None:

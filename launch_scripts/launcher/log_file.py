@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -113,7 +114,15 @@ class LogFile(RotatingFileHandler):
 def log_to(
     path: Path | None, format: LogFormat = "text", speaker: Speaker | None = None, *, takes_output: bool = False
 ) -> None:
-    """Logs to a file, or to standard error if there is none. `speaker`: who logs, where that is known."""
+    """Logs to a file, or to standard error if there is none.
+
+    speaker  author of the log, if that is known: title of this process in `ps` and `top` of the system, too
+    """
+    if speaker is not None:
+        with contextlib.suppress(ImportError):  # of a small install
+            from setproctitle import setproctitle
+
+            setproctitle(f"swarm: {speaker.role} {speaker.id} (run {speaker.run})")
     handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
     handler.setFormatter(JsonLines(speaker) if format == "json" else FORMAT)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

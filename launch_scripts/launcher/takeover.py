@@ -11,10 +11,11 @@ import contextlib
 import logging
 import os
 import signal
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.observe.run_registry import LAUNCHER_LOG, logging_into, open_logs
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
@@ -131,7 +132,7 @@ def _was_ordered(name: str, targets: Collection[str]) -> bool:
 def _launcher_of(run_dir: Path) -> int:
     """The pid of the launcher that runs a run's part from this folder. Raises ConfigError where there is none, or
     one is being taken over from already."""
-    found = [pid for pid in writing(run_dir / "launcher.log") if pid != os.getpid()]
+    found = [pid for pid in writing(run_dir / LAUNCHER_LOG) if pid != os.getpid()]
     if not found:
         raise ConfigError(f"--take-over: no launcher of this user runs in {run_dir}; start without it")
     if len(found) > 1:
@@ -144,17 +145,13 @@ def _launcher_of(run_dir: Path) -> int:
 
 def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
-    found: dict[str, int] = {}
-    for pid, path in _writes():
-        name = path.name.partition(".log")[0]
-        if path.parent == run_dir and name.startswith(_NAMES) and pid not in other_than:
-            found[name] = pid
-    return found
+    found = logging_into(run_dir)
+    return {name: pid for name, pid in found.items() if name.startswith(_NAMES) and pid not in other_than}
 
 
 def writing(file: Path) -> list[int]:
     """The processes of this user that may write to a file; one who only reads it is not among them."""
-    return [pid for pid, path in _writes() if path == file]
+    return [pid for pid, path in open_logs() if path == file]
 
 
 def has_ended(pid: int) -> bool:
@@ -165,13 +162,3 @@ def has_ended(pid: int) -> bool:
         return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
     except psutil.Error:
         return True
-
-
-def _writes() -> Iterator[tuple[int, Path]]:
-    """(pid, file) for each log that a process of this user has open so that it may write to it."""
-    import psutil
-
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
-            for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
-                yield process.pid, Path(path)

@@ -83,11 +83,15 @@ def _style(line: TargetLine) -> str | None:
 def loads_table(processes: Sequence[ProcessLoad], *, each: bool) -> Table:
     """A line for each process, or else for each role, in the order of the table of processes. At most 80 columns
     wide."""
-    table = columns("process" if each else "role", "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
+    first = ("process", "pid") if each else ("role",)
+    table = columns(*first, "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
     if each:
         for line in processes:
             up = facts.seconds(line.up_s) if line.alive else "gone"
-            table.add_row(line.name, up, *_load_row([line], [line]), style=_load_style(line.restarts, line.alive))
+            pid = "-" if line.pid is None else str(line.pid)
+            table.add_row(
+                line.name, pid, up, *_load_row([line], [line]), style=_load_style(line.restarts, line.alive)
+            )
         return table
     table.add_column("busiest", no_wrap=True, overflow="ellipsis")
     for role in dict.fromkeys([*ROLES, *(line.role for line in processes)]):

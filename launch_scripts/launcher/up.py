@@ -36,9 +36,11 @@ from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
+from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.web.live_page import LivePage
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
@@ -88,7 +90,7 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    log_to(run_dir / "launcher.log", options.log_format, Speaker(LAUNCHER, "0", run_id))
+    log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
@@ -160,14 +162,21 @@ class _Run:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        self._doing: Callable[[], str] = lambda: self._preparing
+        self._page: LivePage | None = None
+        """The live view's start page, until the monitor serves it."""
         view = options.scenario.monitor
-        if "monitor" in options.roles and view.live and view.web_port:
+        if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
+            name = f"{self._scenario.name}, run {run_id}"
+            told = {"life": "", "at_s": 0.0, "name": name}
+            self._page = LivePage(view.web_port, lambda: {**told, "state": self._doing()})
             self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
+        self._register()
         planners = any(TABLE[role].kernels for role in self._options.roles)
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
         self._warm_up.begin()
@@ -176,6 +185,7 @@ class _Run:
         finally:
             self._warm_up.close()
             self._signals.close()
+            self._leave_page()
 
     def _run(self) -> int:
         with self._terminal.busy(lambda: self._preparing):
@@ -183,6 +193,8 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
+        if self._page is not None:
+            self._page.terrain = self._terrain
         homes = load_beside(self._run_dir, "homes", scenario_key(self._scenario))
         check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
@@ -218,6 +230,7 @@ class _Run:
                 watcher.begin()
                 watcher.look_after([running.spec for running in self._swarm.running])
                 try:
+                    self._leave_page()
                     self._swarm.start()
                     log.info("all processes are started")
                     seconds = self._watch(watcher)
@@ -234,6 +247,12 @@ class _Run:
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
+
+    def _leave_page(self) -> None:
+        """Leaves the live view's port to the monitor."""
+        if self._page is not None:
+            self._page.server.close()
+            self._page = None
 
     def _stopped_early(self) -> int:
         self._terminal.say("stopped before the swarm was up: there is nothing to report", "yellow")
@@ -279,7 +298,7 @@ class _Run:
 
     def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
         """Waits for `done(timeout_s)` or a signal, and shows so if it takes long."""
-        began_s = time.monotonic()
+        began_s, self._doing = time.monotonic(), text
         with self._terminal.busy(text):
             while not self._stop_asked and not done(_TURN_S):
                 if time.monotonic() - began_s > within_s:
@@ -324,6 +343,7 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S
+                self._register()
                 began_s = now_s
                 if watcher.routes_served or not self._all_external:
                     so_far = "all processes are alive and routes are served"
@@ -373,10 +393,15 @@ class _Run:
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if watcher.web_port != self._web_port:
             self._web_port = watcher.web_port
+            self._register()
             self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
             self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
             self._show(known, watcher.now_ns())
+
+    def _register(self) -> None:
+        """Says to commands how far the run is; `begin_run` has said if that is impossible."""
+        register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S

@@ -19,6 +19,7 @@ class ProcessLoad:
 
     cpu_percent  100 is one core
     late_per_s   ticks that came later than half a period, or not at all
+    pid          of a process on this machine
     """
 
     role: str
@@ -30,6 +31,7 @@ class ProcessLoad:
     id: str
     alive: bool
     up_s: float
+    pid: int | None = None
 
     @property
     def name(self) -> str:

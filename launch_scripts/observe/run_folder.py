@@ -15,6 +15,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.observe.run_registry import register, registered
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
@@ -30,8 +31,8 @@ _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba"
 def begin_run(
     folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True, simulated: bool = False
 ) -> list[str]:
-    """Writes `scenario.toml` and `run.json`, and makes `LAST` point here. Returns what a person should know: a run
-    goes on without them, as on a full disk.
+    """Writes `scenario.toml` and `run.json`, makes `LAST` point here and registers the run. Returns what a person
+    should know: a run goes on without them, as on a full disk.
 
     recorded   whether a report follows; else another launcher of the run makes it
     simulated  the run has no router: no command can ask it
@@ -65,8 +66,8 @@ def begin_run(
             write_file(folder / name, text.encode())
         except StoreError as error:
             said.append(str(error))
-    sentence = point_last(folder)
-    return said if sentence is None else [*said, sentence]
+    sentences = (point_last(folder), register(folder, is_whole=simulated))
+    return [*said, *(sentence for sentence in sentences if sentence is not None)]
 
 
 def ended(folder: Path) -> dict[str, Any]:
@@ -110,7 +111,8 @@ def point_last(folder: Path) -> str | None:
 
 
 def find_run(name: str, runs: Path) -> Path:
-    """The folder of a run: a path, or its name in `runs`; `LAST` where it is a file, too. Raises ConfigError."""
+    """The folder of a run: a path, its name in `runs`, or else the name of one that is registered; `LAST` where it
+    is a file, too. Raises ConfigError."""
     for path in (Path(name), runs / name):
         if path.is_dir():
             return path
@@ -118,7 +120,12 @@ def find_run(name: str, runs: Path) -> Path:
             named = path.parent / read_text(path, FileKind.RUN).strip()
             if named.is_dir():
                 return named
-    raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}")
+    for run in registered():
+        if name in (run.name, LAST):
+            return run.folder
+    raise ConfigError(
+        f"there is no run {name!r}: neither a folder nor in {runs}, nor registered (`swarm ps -a` lists yours)"
+    )
 
 
 def lacks(folder: Path, file: str) -> ConfigError:

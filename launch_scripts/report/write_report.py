@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, ended
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
@@ -73,7 +74,6 @@ def write_report(
         GROUND_FILE,
         LEARNED_FILE,
         ground_picture,
-        image_bytes,
         learned_pixels,
     )
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, LiveSwarm, folders_of_runs
+from support.live_swarm import SWARM, folders_of_runs
 from support.processes import eventually, session_of
 
 from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
@@ -50,15 +48,3 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
         "planner-ghost.log",
     ):
         assert (run_dir / name).stat().st_size > 0, name
-
-
-def test_kill_9_of_the_launcher_leaves_no_process_of_the_swarm(tmp_path: Path) -> None:
-    live = LiveSwarm(tmp_path)
-    try:
-        live.wait_until_up()
-        assert len(session_of(live.process.pid)) == 11  # launcher, tracker, forkserver, eight roles
-        os.kill(live.process.pid, signal.SIGKILL)
-        live.process.wait()
-        eventually(lambda: not session_of(live.process.pid), 8, "the end of all")
-    finally:
-        live.kill()

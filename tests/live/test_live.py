@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from support.live_swarm import LiveSwarm, ask, client, swarm
 from support.processes import eventually, session_of
@@ -84,6 +85,49 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
     assert "planner-t1" in swarm("status", "--runs", live.runs).stdout, "found by its folder"
 
 
+def test_a_run_is_found_from_any_folder_with_its_page_logs_and_pids(live: LiveSwarm) -> None:
+    (run,) = json.loads(swarm("ps", "--json").stdout)
+    assert (run["folder"], run["state"], run["processes"]) == (str(live.run_dir), "running", 8)
+    eventually(lambda: swarm("open", "--print").stdout.startswith("http://127.0.0.1:"), 30, "the live page")
+    told = swarm("logs", "planner-t1", "-n", 2, "--run", run["run"])
+    assert told.stdout == "".join((live.run_dir / "planner-t1.log").read_text().splitlines(True)[-2:])
+    lines = [line.partition(" | ") for line in swarm("logs").stdout.splitlines()]
+    assert {"launcher", "agent-a0", "router-0"} < {name.strip() for name, _, _ in lines}
+    times = [text[:29] for _, _, text in lines if text.startswith("20")]
+    assert times == sorted(times)
+    status = json.loads(swarm("status", "--json").stdout)
+    pids = {f"{each['role']}-{each['id']}": each["pid"] for each in status["processes"]}
+    assert pids == {name: live.pid_of(name) for name in pids}
+    titles = {name: psutil.Process(pid).cmdline()[0] for name, pid in pids.items()}
+    assert titles["planner-t0"] == f"swarm: planner t0 (run {run['run']})"
+    for name in ("launcher", "planner-t9", "1"):
+        told = swarm("kill", name)
+        assert (told.returncode, told.stderr.count("\n")) == (2, 1)
+        assert f"has no process '{name}' on this machine; it has agent-a0, agent-a1, " in told.stderr
+
+
+def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tmp_path: Path) -> None:
+    first = live.run_dir.name
+    begun = swarm("up", live.path, "--port", 0, "--runs", tmp_path, "--no-live", "-d", timeout_s=90)
+    (second,) = {each["run"] for each in json.loads(swarm("ps", "--json").stdout)} - {first}
+    told = swarm("down")
+    ended = swarm("down", second, timeout_s=90)
+    assert begun.returncode == ended.returncode == 0, begun.stderr + ended.stderr
+    assert begun.stderr.endswith(f"run {second} goes on in the background; `swarm down` ends it\n")
+    assert (told.returncode, told.stderr) == (
+        2,
+        f"swarm: found 2 runs here, expected the name of one: {second}, {first}\n",
+    )
+    assert f"{tmp_path / second / 'report.html'}\n" in ended.stdout
+    assert swarm("open", second, "--print").stdout == (tmp_path / second / "report.html").as_uri() + "\n"
+    told = swarm("logs", "launcher", "--run", second, "-f")  # over, so it returns
+    assert "agent-a0: " not in told.stdout
+    assert "stopping" in told.stdout
+    states = {each["run"]: each["state"] for each in json.loads(swarm("ps", "-a", "--json").stdout)}
+    assert (states[first], states[second]) == ("running", "ended")
+    assert "does not run here; these do: " + first in swarm("down", second).stderr
+
+
 def test_top_tells_what_every_process_takes_up(live: LiveSwarm) -> None:
     def told_of_all() -> bool:
         """False while a process has not spoken twice, as on a machine that is busy."""
@@ -123,12 +167,6 @@ def test_a_second_swarm_in_the_namespace_is_refused_and_the_first_goes_on(live: 
     assert not live.said("starts again")
 
 
-def test_a_second_router_on_the_port_is_refused(live: LiveSwarm, tmp_path: Path) -> None:
-    told = swarm("up", live.path, "--runs", tmp_path, "--plain")
-    assert told.returncode == 4
-    assert "is taken; choose others with --port" in told.stderr
-
-
 def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: Path) -> None:
     other = tmp_path / "other.toml"
     text = live.path.read_text().replace("relief_m = 300", "relief_m = 310").replace("count = 2", "count = 3")
@@ -142,7 +180,7 @@ def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: 
 def test_a_planner_killed_with_9_serves_routes_again_within_3_s(live: LiveSwarm, bus: ZenohBus) -> None:
     row, col = served_cell(bus)
     before = incarnation(bus, row, col)
-    os.kill(live.pid_of("planner-t0"), signal.SIGKILL)
+    assert swarm("kill", "planner-t0").returncode == 0
     began_s = time.monotonic()
     eventually(lambda: incarnation(bus, row, col) not in (None, before), 10, "a route from the new planner")
     assert time.monotonic() - began_s <= 3.0
@@ -166,6 +204,7 @@ def test_an_agent_killed_with_9_goes_on_with_its_vehicles(live: LiveSwarm, bus: 
 def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> None:
     time.sleep(3.0)
     assert live.end() == 0, live.output.read_text()
+    assert "KeyboardInterrupt" not in (live.run_dir / "planner-t1.log").read_text()
     report = json.loads((live.run_dir / "report.json").read_text())
     assert report["restarts"] == 3
     assert report["startup_s"] > 0

@@ -25,7 +25,7 @@ def sets_in(store: Path) -> int:
 
 
 @pytest.mark.parametrize(
-    "kill", [pytest.param(os.kill, marks=pytest.mark.thorough), os.killpg], ids=["launcher", "all"]
+    "kill", [os.kill, pytest.param(os.killpg, marks=pytest.mark.thorough)], ids=["launcher", "all"]
 )
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
     tmp_path: Path, kill: Callable[[int, int], None]

@@ -16,7 +16,7 @@ from support.tree_lives import LAWS
 
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import TerrainError
-from swarm.wire.route_columns import NO_TARGET, OK, Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
     "auto",
@@ -122,23 +122,6 @@ def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_only_routes_that_exist_are_judged() -> None:
-    tally = Tally(frame_ms=[1.0])
-    routes = RouteBatch(
-        np.array([OK, NO_TARGET, OK], np.uint8),
-        np.array([0, 1, 2]),
-        np.empty(0, np.uint8),
-        np.zeros(3, np.int64),
-        *(np.array(values) for values in ([3.0, np.inf, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0])),
-    )
-    tally.judge(routes, np.array([3.0, np.inf, 0.0]), replace(routes, cost_s=np.array([2.0, np.inf, 0.0])))
-    row = tally.row()
-    assert row["gap_mean"] == row["gap_max"] == 1.5
-    assert row["routes_judged"] == 1
-    assert row["proven_p95"] is None, "no bound is no number"
-    assert set(row["violations"].values()) == {0}
-
-
 def test_a_violation_is_counted_and_clips_no_figure() -> None:
     tally = Tally(frame_ms=[1.0])
     one = RouteBatch.of([Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=3.3)])
@@ -178,21 +161,6 @@ def test_the_paper_s_tables_have_its_rows() -> None:
     assert exact["updates"] == {"full": 60}
 
 
-def test_scale_has_a_row_per_point_and_strategy_and_draws_them(tmp_path: Path) -> None:
-    picture = tmp_path / "scale.png"
-    report = bench(
-        *("scale", "--sizes", "32,128", "--targets", "1,3", "--vehicles", "5,20", "--frames", "5"),
-        *("--strategies", "full,variable_range", "--picture", str(picture)),
-    )
-    found = [(row["size"], row["targets"], row["vehicles"], row["strategy"]) for row in report["rows"]]
-    assert len(found) == len(set(found)) == 2 * 4
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    larger = {
-        (row["size"], row["strategy"]): row["frame_ms_p50"] for row in report["rows"] if row["vehicles"] == 20
-    }
-    assert larger[128, "full"] > larger[32, "full"]
-
-
 # --- the map and its fleets --------------------------------------------------------------------------------------
 
 
@@ -200,17 +168,6 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     without, compacted = bench("compaction", "--lives", "8")["rows"]
     assert (without["compact"], compacted["compact"]) == ("no", "yes")
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
-
-
-def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:
-    report = bench("moves", "--size", "96", "--moves", "6")
-    assert [(row["course"], row["by"]) for row in report["rows"]] == [
-        (course, by) for course in ("random", "straight") for by in ("parents", "pieces")
-    ]
-    for row in report["rows"][::2]:
-        assert row["bit_equal"] == 1
-        assert row["gave_way"] <= 0.5
-        assert row["p50_ms"] > 0
 
 
 def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:

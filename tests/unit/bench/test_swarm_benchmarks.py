@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from bench.whole_swarm import crowd, sizes
 from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
-from bench.whole_swarm.sizes import Figure, exponent, exponents
+from bench.whole_swarm.sizes import exponent
 from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
 from hypothesis import strategies as st
@@ -64,28 +64,6 @@ def test_every_size_has_a_valid_scenario_with_its_vehicles_agents_and_density(
 )
 def test_the_exponent_of_a_power_is_found(factor: float, power: float, xs: list[int]) -> None:
     assert exponent(xs, [factor * x**power for x in xs]) == pytest.approx(power, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("xs", "ys"),
-    [([], []), ([100], [3.0]), ([100, 100], [3.0, 4.0]), ([100, 300], [3.0, None]), ([1, 2], [0.0, 5.0])],
-)
-def test_there_is_no_exponent_without_two_values(xs: list[int], ys: list[float | None]) -> None:
-    assert exponent(xs, ys) is None
-
-
-def row(vehicles: int, late_share: float | None = 0.0, **figures: Any) -> dict[str, Any]:
-    size = msgspec.structs.asdict(size_of(vehicles))
-    return {**size, "ticks": {"agent": {"late_share": late_share}}, "not_measured": [], **figures}
-
-
-def test_a_run_that_is_late_is_left_out_of_exponents_and_named() -> None:
-    rows = [row(100, cpu_all_ms_per_s=100), row(200, cpu_all_ms_per_s=200), row(400, 0.8, cpu_all_ms_per_s=210)]
-    figure = Figure("cpu_all_ms_per_s", "CPU", fitted=True)
-    assert exponents([figure], rows)["cpu_all_ms_per_s"] == pytest.approx(1.0)
-    report = {"simulated": False, "rows": rows, "interrupted": False, "exponents": {}}
-    [remark] = sizes.remarks(report)
-    assert "fitted without 400 vehicles" in remark
 
 
 # --- counters ----------------------------------------------------------------------------------------------------

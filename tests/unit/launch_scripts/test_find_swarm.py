@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 from collections.abc import Iterator
@@ -11,9 +12,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from support.command import Swarm
 
 from launch_scripts.commands.running_swarm import Where, find_swarm
-from launch_scripts.observe.run_folder import begin_run
+from launch_scripts.observe.run_folder import begin_run, find_run
+from launch_scripts.observe.run_registry import register, registered
 from launch_scripts.ports import free_ports
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError, ConfigError
@@ -31,7 +34,8 @@ def listens() -> Iterator[list[int]]:
 
 
 @pytest.fixture(autouse=True)
-def _nobody_at_the_usual_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def _nobody_at_the_usual_endpoint(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SWARM_STATE", str(tmp_path / "state"))
     (port,) = free_ports(1)
     usual = NetworkConfig(connect=(f"tcp/127.0.0.1:{port}",))
     monkeypatch.setattr("swarm.config.scenario.NetworkConfig", _usual_is(usual))
@@ -107,3 +111,69 @@ def test_options_say_more_than_the_run_does(tmp_path: Path, listens: list[int]) 
     assert (given.connect, given.namespace) == (("tcp/127.0.0.1:9",), "swarm")
     with pytest.raises(ConfigError, match="--connect and --run both say which swarm"):
         Where(connect="tcp/127.0.0.1:9", run="mine", runs=tmp_path).network()
+
+
+def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
+    tmp_path: Path, listens: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, port in zip(("first", "second"), listens, strict=True):
+        make_run(tmp_path / name, name, port, "2026-11-01T00:00:00Z")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert [run.name for run in registered() if run.launchers] == ["second", "first"]
+    assert find_run("first", Path("runs")) == tmp_path / "first" / "first"
+    assert find_run("LAST", Path("runs")).name == "second"
+    assert find_swarm(name="first").network.connect == (f"tcp/127.0.0.1:{listens[0]}",)
+    assert set(find_swarm().others) | {find_swarm().run} == {"first", "second"}
+    (tmp_path / "second").rename(tmp_path / "away")
+    assert [run.name for run in registered()] == ["first"]
+    assert len(list((tmp_path / "state" / "runs").iterdir())) == 1
+
+
+@pytest.mark.parametrize("change", [{"pid": 2**30}, {"started_s": 0.5}, {"pid": os.getppid()}])
+def test_a_launcher_that_has_ended_is_not_taken_for_the_process_which_has_its_pid_now(
+    change: dict[str, float], tmp_path: Path
+) -> None:
+    make_run(tmp_path, "r", 9, "2026-11-01T00:00:00Z")
+    (file,) = (tmp_path / "state" / "runs").iterdir()
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    assert [(run.name, run.launchers, run.processes()) for run in registered()] == [("r", (), {})]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[[[", "[" * 100_000, "\xff", "5", "{}", '{"folder": "/", "pid": 0, "started_s": 0}',
+     '{"folder": "/", "pid": -1, "started_s": 0}', '{"folder": ".", "pid": 9, "started_s": 0}'],
+)  # fmt: skip
+def test_a_damaged_entry_hides_no_run(text: str, tmp_path: Path) -> None:
+    make_run(tmp_path, "r", 9, "2026-11-01T00:00:00Z")
+    (tmp_path / "state" / "runs" / "damaged.json").write_text(text, encoding="latin-1")
+    (tmp_path / "state" / "runs" / "folder.json").mkdir()
+    (tmp_path / "state" / "runs" / "loop.json").symlink_to("loop.json")
+    assert [run.name for run in registered()] == ["r"]
+
+
+def test_a_registry_that_cannot_be_written_costs_a_sentence(tmp_path: Path, swarm: Swarm) -> None:
+    (tmp_path / "state").write_text("a file takes the place of the folder")
+    assert "cannot be registered: " in str(register(tmp_path))
+    assert registered() == []
+    code, _, said = swarm("up", "synthetic", "-d")
+    assert code == 6
+    assert said.startswith("swarm: --detach: the run could not be registered")
+
+
+def test_a_sentence_about_an_option_names_the_variable_which_gave_its_value(
+    swarm: Swarm, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for line, variable, value in (
+        ("status", "SWARM_CONNECT", "nowhere"),
+        ("up synthetic", "SWARM_LOG_FORMAT", "xml"),
+        ("status --connect tcp/127.0.0.1:9", "SWARM_NAMESPACE", "a/b"),
+        ("down", "SWARM_RUN", "nix"),
+        ("status --connect tcp/127.0.0.1:9", "SWARM_TLS_DIR", str(tmp_path)),
+    ):
+        with monkeypatch.context() as environment:
+            environment.setenv(variable, value)
+            code, _, said = swarm(line)
+            assert (code, said.count("\n")) == (2, 1), said
+            assert f" is {variable} of the environment)" in said

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -134,20 +133,6 @@ def test_why_a_process_ended_is_said_and_only_one_that_refuses_is_not_started_ag
     log = (tmp_path / f"{row[0]}-{row[1]}.log").read_text()
     assert logged in log
     assert ("Traceback" in log) <= (again_s is not None)
-
-
-def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "quiet"))
-    swarm.start()
-    wait_for_line(tmp_path / "order.txt", "+planner-t0")
-    process = swarm.running[0].process
-    assert process is not None
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    (ending,) = endings_within(swarm)
-    assert ending.sentence == "killed by SIGKILL"
-    eventually(lambda: swarm.poll() or swarm.running[0].alive, 5)
-    assert swarm.restarts == 1
 
 
 def test_what_all_roles_wait_for_loads_nothing_slow() -> None:
@@ -312,21 +297,6 @@ def test_kill_9_of_the_launcher_leaves_no_process_behind(tmp_path: Path) -> None
         wait_for_line(tmp_path / "order.txt", "+planner-t0", within_s=20)
         assert len(session_of(process.pid)) == 5  # launcher, tracker, forkserver, two roles
         process.kill()
-    eventually(lambda: not session_of(process.pid), 8, "the end of all")
-
-
-def test_a_ctrl_c_that_reaches_the_whole_group_is_for_the_launcher_alone(tmp_path: Path) -> None:
-    with launcher(tmp_path, "support.dummy_roles:quiet") as process:
-        for name in ("+planner-t0", "+agent-a0"):
-            wait_for_line(tmp_path / "order.txt", name, within_s=20)
-        os.killpg(process.pid, signal.SIGINT)
-        try:
-            assert process.wait(20) == 0
-        finally:
-            process.kill()
-    order = (tmp_path / "order.txt").read_text().split()
-    assert order[2:] == ["-agent-a0", "-planner-t0"]
-    assert "KeyboardInterrupt" not in (tmp_path / "planner-t0.log").read_text()
     eventually(lambda: not session_of(process.pid), 8, "the end of all")
 
 

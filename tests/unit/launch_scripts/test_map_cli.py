@@ -14,7 +14,7 @@ from support.map_strategies import GRID, mark_sets, set_of
 from typer.testing import CliRunner
 
 from launch_scripts.commands.map_commands import app
-from shared_map.keeper.export import from_json, to_cells, to_json
+from shared_map.keeper.export import from_json, to_json
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.measurements import Measurement
 from shared_map.replication.replica import MapReplica
@@ -61,13 +61,6 @@ def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
         return msgspec.structs.replace(plain, group=each.group)
 
     assert read == [bare(each) for each in sorted(sets, key=lambda each: (each.tile, each.author))]
-
-
-def test_the_bands_show_the_winners() -> None:
-    pace, kind, _ = to_cells(GRID, SETS)
-    assert kind[0, 5:8].tolist() == [LETHAL, CLEAR, 255]
-    assert np.isinf(pace[0, 5])
-    assert np.isnan(pace[0, 6])
 
 
 def test_export_import_and_inspect_on_the_command_line(tmp_path: Path) -> None:

@@ -319,6 +319,9 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     url = sinks.page.server.url
     try:
         with urllib.request.urlopen(url, timeout=30) as reply:
+            assert b"run_banner.js" in reply.read(), "the start page, at once"
+        assert eventually(lambda: b'"view": true' in urllib.request.urlopen(f"{url}/run.json").read())
+        with urllib.request.urlopen(url, timeout=30) as reply:
             assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
             assert b"re_viewer.js" in reply.read()
             policy = reply.headers["Content-Security-Policy"]
@@ -368,7 +371,8 @@ sinks.close()
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
     ).stdout.splitlines()
-    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
+    why = f"cannot write {tmp_path}: File too large; another begins when there is space"
+    ended = f"the recording {tmp_path / 'run.rrd'} has ended: {why}"
     begun = f"True the recording goes on in {tmp_path / 'run-2.rrd'}"
     assert told == [f"5 False {ended}", f"65 False {ended}", f"76 {begun}"]
     assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 3
@@ -409,7 +413,7 @@ time.sleep(60)
 
 @pytest.mark.network
 def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.monitor.view_outputs._PORT_PATIENCE_S", 0.2)
+    monkeypatch.setattr("launch_scripts.web.live_page.PORT_PATIENCE_S", 0.2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

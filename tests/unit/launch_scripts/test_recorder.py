@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import makers
 from support.makers import fleet_of, planner_status, target_pose
+from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
@@ -25,6 +26,7 @@ from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, VehicleState
@@ -208,6 +210,19 @@ def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> Non
     lines = recorder.target_tracks.lines()
     assert lines[("t0", 0)][1].tolist() == [[100.0, 200.0], [101.0, 200.0]]
     assert lines[("t0", 1)][1].tolist() == [[102.0, 200.0], [103.0, 200.0]]
+
+
+def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        set_of("a0.1", 0, 1, {33: (MarkKind.LETHAL, 0.0, 10), 40: (MarkKind.LETHAL, 0.0, 10)}),
+        set_of("a1.1", 0, 1, {33: (MarkKind.PACE, 0.5, 20), 40: (MarkKind.CLEAR, 0.0, 20)}),
+    )
+    marked = recorder.observed.marked()
+    assert marked.cells.tolist() == [1 * GRID.cols + 1]
+    assert marked.kinds.tolist() == [MarkKind.PACE]
+    assert marked.paces.tolist() == [0.5]
+    assert recorder.report()["marked_cells"] == 1
 
 
 def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> None:

@@ -159,11 +159,6 @@ def test_a_damaged_file_of_a_run_does_not_keep_it_from_its_report(facts: str, tm
     assert ended(tmp_path) == {}
 
 
-def test_a_run_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no run 'r9': neither a folder nor in"):
-        find_run("r9", tmp_path)
-
-
 # --- results ------------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,297 @@
+"""The runs of this user on this machine, from any folder: `swarm ps`, `down`, `logs`, `open` and `kill`."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, STDOUT, Popen
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.commands.running_swarm import RUNS, RunOption, say_newest
+from launch_scripts.commands.shared_options import AsJson
+
+if TYPE_CHECKING:
+    from launch_scripts.observe.run_registry import KnownRun
+
+app = typer.Typer()
+
+RunArgument = Annotated[
+    str | None,
+    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete.runs),
+]
+_DOWN_S = 120.0
+"""A launcher that is asked to end gives each role five seconds, then writes its report."""
+_TURN_S = 0.2
+_Line = tuple[float, str, str]
+"""Time, process and text of a line of a log."""
+
+
+@command(app, RUN)
+def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJson = False) -> None:
+    """List your runs on this machine, from any folder.
+
+    swarm ps
+
+    swarm ps -a
+
+    all  Runs that are over too.
+    """
+    from rich.console import Console
+
+    from launch_scripts.launcher.terminal_tables import columns
+    from launch_scripts.observe.run_registry import registered
+    from launch_scripts.plain_text import plain
+
+    told = [_fields(run) for run in registered() if all or run.launchers]
+    if as_json:
+        typer.echo(json.dumps(told, indent=2))
+        return
+    table = columns("run", "scenario", "state", "began", "seconds", "processes", "live page", "folder")
+    for column in table.columns:
+        column.justify = "left"
+    for each in told:
+        table.add_row(*(plain("" if value is None else str(value)) for value in each.values()))
+    # A row is one line, which a narrow terminal breaks: a copied folder is whole.
+    Console(highlight=False, width=1000).print(table if told else "no run of yours runs here; see `swarm ps -a`")
+
+
+@command(app, RUN)
+def down(run: RunArgument = None) -> int:
+    """End a run of this machine as Ctrl-C does, and wait for its report.
+
+    A second `swarm down` kills what still runs.
+
+    swarm down
+
+    run  Name of the run, or its folder; if not given, the one that runs.
+    """
+    from launch_scripts.launcher.console import Terminal, what_is_left
+    from launch_scripts.observe.run_registry import registered
+    from swarm.errors import ConfigError
+
+    running = [each.name for each in registered() if each.launchers]
+    if run is None and len(running) > 1:
+        raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
+    found = _chosen(run)
+    if not found.launchers:
+        raise ConfigError(f"run {found.name} does not run here; these do: {', '.join(running) or 'none'}")
+    for pid in found.launchers:
+        with suppress(ProcessLookupError):  # it ended by itself
+            os.kill(pid, signal.SIGINT)
+    terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
+    with terminal.busy(f"run {found.name} ends"):
+        while (left := _chosen(str(found.folder)).launchers) and time.monotonic() < until_s:
+            time.sleep(_TURN_S)
+    if left:
+        terminal.say(f"run {found.name} still ends after {_DOWN_S:g} s; `swarm down` once more kills it", "red")
+        return 1
+    for line in [f"run {found.name} has ended; its folder is {found.folder}", *what_is_left(found.folder)]:
+        terminal.say(line)
+    return 0
+
+
+@command(app, RUN)
+def logs(
+    process: Annotated[str | None, typer.Argument(metavar="ROLE-ID")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f")] = False,
+    lines: Annotated[int | None, typer.Option("--lines", "-n", min=0)] = None,
+    run: RunOption = None,
+) -> None:
+    """Print the logs of a run, which may be over.
+
+    swarm logs planner-t3 -f
+
+    process  One process, such as planner-t3; if not given, all by time.
+    follow   Go on with new lines until the run ends.
+    lines    Print at most this number of lines of the past.
+    run      Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    """
+    from launch_scripts.plain_text import plain
+    from launch_scripts.stop_requests import stop_requests
+    from swarm.errors import ConfigError
+
+    found = _chosen(run)
+    names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
+    if process is not None and process not in names:
+        raise ConfigError(f"run {found.name} has no log of {process!r}; it has {', '.join(names) or 'none'}")
+    width, read = max(map(len, names), default=0), dict[int, int]()
+    told: Iterable[_Line] = _new_lines(found.folder, process, read)
+    told = told if lines is None else deque(told, maxlen=lines)
+    with suppress(KeyboardInterrupt), stop_requests():
+        while True:
+            for _, name, text in told:
+                typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
+            if not follow:
+                return
+            follow = bool(_chosen(str(found.folder)).launchers)  # once more after its end
+            time.sleep(_TURN_S)
+            told = _new_lines(found.folder, process, read)
+
+
+@command(app, RUN)
+def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--print")] = False) -> None:
+    """Open the live page of a run, or its report if it is over.
+
+    swarm open
+
+    run         Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    only_print  Print the address, and open no browser.
+    """
+    import webbrowser
+
+    from launch_scripts.ports import page_of
+    from swarm.errors import ConfigError
+
+    found = _chosen(run)
+    report = found.folder / "report.html"
+    if not (found.web_port if found.launchers else report.is_file()):
+        what = "serves no live page" if found.launchers else "is over and left no report"
+        raise ConfigError(f"run {found.name} {what}; `swarm logs --run {found.name}` says more")
+    address = page_of(found.web_port) if found.launchers else report.as_uri()
+    typer.echo(address)
+    if not only_print:
+        webbrowser.open(address)
+
+
+@command(app, RUN)
+def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOption = None) -> None:
+    """Kill one process of a run of this machine, to see that its launcher starts it again.
+
+    swarm kill planner-t3
+
+    process  The process, such as planner-t3.
+    run      Name of the run, or its folder; if not given, the newest that runs.
+    """
+    import psutil
+
+    from swarm.errors import ConfigError
+
+    found = _chosen(run)
+    running = found.processes()
+    if process not in running:
+        has = ", ".join(sorted(running)) or "none"
+        raise ConfigError(f"run {found.name} has no process {process!r} on this machine; it has {has}")
+    try:
+        psutil.Process(running[process]).kill()
+    except psutil.NoSuchProcess:
+        raise ConfigError(f"{process} has just ended by itself") from None
+    typer.echo(f"{process} of run {found.name}, pid {running[process]}, is killed: its launcher starts it again")
+
+
+def in_background(*, as_json: bool) -> int:
+    """Runs this command again in the background, without `-d`. Returns once the swarm is whole, or else the exit
+    code of the command. Raises ConfigError or StoreError if the run could not be found later."""
+    from launch_scripts.observe.run_registry import registered, registry
+    from swarm.errors import ConfigError, StoreError
+    from swarm.files import check_writable
+
+    if as_json:
+        raise ConfigError("--json prints the report at the end, and --detach does not wait for it")
+    try:
+        registry().mkdir(parents=True, exist_ok=True)
+        check_writable(registry())
+    except (OSError, RuntimeError, StoreError) as error:
+        raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
+    words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
+    words = [word for word in words if word not in ("-d", "--detach")]
+    launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, errors="replace", start_new_session=True)
+    assert launcher.stdout is not None
+    try:
+        for line in launcher.stdout:
+            typer.echo(line, nl=False, err=True)
+            mine = (run for run in registered() if launcher.pid in run.launchers)
+            if (run := next(mine, None)) is not None and run.is_whole:
+                typer.echo(f"run {run.name} goes on in the background; `swarm down` ends it", err=True)
+                return 0
+    except KeyboardInterrupt:
+        launcher.send_signal(signal.SIGINT)
+    return launcher.wait()
+
+
+def _chosen(name: str | None) -> KnownRun:
+    """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError."""
+    from launch_scripts.observe.run_folder import find_run
+    from launch_scripts.observe.run_registry import KnownRun, registered
+    from swarm.errors import ConfigError
+
+    known = registered()
+    if name is None:
+        if not known:
+            raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
+        say_newest(known[0].name, [each.name for each in known[1:] if each.launchers])
+        return known[0]
+    folder = find_run(name, RUNS).resolve()
+    return next((run for run in known if run.folder == folder), KnownRun(folder, (), 0, False))
+
+
+def _fields(run: KnownRun) -> dict[str, Any]:
+    """A row of `swarm ps`."""
+    from launch_scripts.observe.run_folder import REPORT_FILE, run_facts
+    from launch_scripts.ports import page_of
+
+    facts, report = run_facts(run.folder), run.folder / REPORT_FILE
+    over = "ended" if report.exists() or facts.get("recorded") is False else "broke off"
+    began = facts.get("began")
+    now_s = time.time() if run.launchers else max((f.stat().st_mtime for f in _log_files(run.folder)), default=0.0)
+    try:
+        lasted_s = round(max(now_s - datetime.fromisoformat(str(began)).timestamp(), 0.0))
+    except (ValueError, OverflowError):  # damaged
+        began = lasted_s = None
+    return {
+        "run": run.name,
+        "scenario": facts.get("scenario"),
+        "state": ("running" if run.is_whole else "starting") if run.launchers else over,
+        "began": began,
+        "seconds": lasted_s,
+        "processes": len(run.processes()),
+        "page": page_of(run.web_port) if run.launchers and run.web_port else None,
+        "folder": str(run.folder),
+    }
+
+
+# --- logs ---------------------------------------------------------------------------------------------------------
+
+
+def _log_files(folder: Path) -> list[Path]:
+    """Logs of a run, the earlier of two of a process first."""
+    return sorted((*folder.glob("*.log"), *folder.glob("*.log.1")), reverse=True)
+
+
+def _new_lines(folder: Path, process: str | None, read: dict[int, int]) -> Iterator[_Line]:
+    """Yields lines of all logs, or of those of one process, by time.
+
+    read  inode of a file, which keeps it under a new name -> number of bytes that have been read; grows here
+    """
+    files = [file for file in _log_files(folder) if process in (None, file.name.partition(".log")[0])]
+    return heapq.merge(*(_lines_of(file, read) for file in files), key=lambda line: line[0])
+
+
+def _lines_of(file: Path, read: dict[int, int]) -> Iterator[_Line]:
+    """Yields the lines of one log behind those which have been read. A line without a time has that of the one
+    before it, as in a traceback."""
+    at_s = -math.inf
+    with suppress(OSError), file.open("rb") as opened:  # it may have got another name
+        inode, size = (each := os.fstat(opened.fileno())).st_ino, each.st_size
+        read[inode] = opened.seek(read.get(inode, 0) if read.get(inode, 0) <= size else 0)
+        for raw in opened:
+            if not raw.endswith(b"\n"):
+                return
+            read[inode] += len(raw)
+            text = raw.decode(errors="replace").rstrip()
+            with suppress(ValueError, OverflowError):  # text, or JSON
+                at_s = datetime.fromisoformat(text[:29] if text[:1] != "{" else text[10:34]).timestamp()
+            yield at_s, file.name.partition(".log")[0], text

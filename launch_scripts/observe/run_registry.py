@@ -1,0 +1,173 @@
+"""The registry of this user's runs, by which commands find a run from any folder.
+
+Each launcher writes one small file, which names the folder of its run and the launcher's process. A file outlives
+its launcher: it goes when the folder of the run does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from swarm.config.input_files import FileKind, read_text
+from swarm.errors import StoreError, SwarmError
+from swarm.files import write_file
+from swarm.runtime.run_secret import state_folder
+
+if TYPE_CHECKING:
+    from psutil import Process
+
+LAUNCHER_LOG = "launcher.log"
+_SAME_START_S = 0.05
+"""Starts of processes are known to a hundredth of a second."""
+
+
+class _Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """File of one launcher.
+
+    started_s  when it started, in seconds since the machine did: a clock that is set changes nothing
+    """
+
+    folder: str
+    pid: Annotated[int, msgspec.Meta(ge=2, lt=1 << 31)]
+    started_s: float
+    web_port: Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)] = 0
+    is_whole: bool = False
+
+
+@dataclass(frozen=True)
+class KnownRun:
+    """A run of this user.
+
+    launchers  pids of its launchers that run on this machine, the newest first
+    web_port   of the live page; 0 as long as it has none
+    is_whole   the swarm has been whole
+    """
+
+    folder: Path
+    launchers: tuple[int, ...]
+    web_port: int
+    is_whole: bool
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    def processes(self) -> dict[str, int]:
+        """Name -> pid of the processes of this run that its launchers have started and that run now."""
+        import psutil
+
+        started: list[Process] = []
+        for pid in self.launchers:
+            with suppress(psutil.Error):
+                started += psutil.Process(pid).children(recursive=True)
+        return logging_into(self.folder, started)
+
+
+def registry() -> Path:
+    """The folder of the registry. Raises RuntimeError without a home folder."""
+    return Path(os.environ.get("SWARM_STATE") or state_folder()) / "runs"
+
+
+def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
+    """Registers this process as a launcher of the run in a folder, or changes its entry. Returns a sentence if that
+    is impossible."""
+    try:
+        entry = _Entry(
+            folder=str(folder.resolve()),
+            pid=os.getpid(),
+            started_s=_started_s(os.getpid()),
+            web_port=web_port,
+            is_whole=is_whole,
+        )
+        file = registry() / f"{folder.name}.{os.getpid()}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_file(file, msgspec.json.encode(entry))
+    except (OSError, RuntimeError, StoreError) as error:
+        return f"commands find this run in its folder only, as it cannot be registered: {error}"
+    return None
+
+
+def registered() -> list[KnownRun]:
+    """The runs whose folders are there: those that run first, and of these the newest. Removes entries of folders
+    that are not there any more."""
+    found: dict[Path, list[_Entry]] = {}
+    for file, entry in _entries():
+        folder = Path(entry.folder)
+        if not folder.is_dir() or (folder in found and not _runs(entry)):
+            with suppress(OSError):
+                file.unlink()
+        elif folder.is_absolute():
+            found.setdefault(folder, []).append(entry)
+    runs = [
+        KnownRun(
+            folder,
+            tuple(each.pid for each in entries if _runs(each)),
+            max(each.web_port for each in entries),
+            any(each.is_whole for each in entries),
+        )
+        for folder, entries in found.items()
+    ]
+    return sorted(runs, key=lambda run: not run.launchers)
+
+
+def pids_of(run_id: str) -> dict[str, int]:
+    """Name -> pid of the processes of a run on this machine, wherever its folders are."""
+    runs = (run for run in registered() if run.name == run_id)
+    return {name: pid for run in runs for name, pid in run.processes().items()}
+
+
+def _entries() -> Iterator[tuple[Path, _Entry]]:
+    """Yields the entries that can be read, the newest first."""
+    try:
+        files = sorted(registry().glob("*.json"), key=lambda file: file.lstat().st_mtime_ns, reverse=True)
+    except (OSError, RuntimeError):
+        return
+    for file in files:
+        with suppress(OSError, SwarmError, msgspec.MsgspecError, RecursionError):
+            yield file, msgspec.json.decode(read_text(file, FileKind.RUN), type=_Entry)
+
+
+def _started_s(pid: int) -> float:
+    """Start of a process, in seconds since the machine was started."""
+    import psutil
+
+    boot_s = psutil.boot_time()  # first: releases of psutil keep it for the next line
+    return float(psutil.Process(pid).create_time() - boot_s)
+
+
+def _runs(entry: _Entry) -> bool:
+    """Returns True if the launcher still runs: another process may have its pid by now."""
+    import psutil
+
+    with suppress(psutil.Error):
+        process = psutil.Process(entry.pid)
+        mine = process.uids().real == os.getuid() and process.status() != psutil.STATUS_ZOMBIE
+        return mine and abs(_started_s(entry.pid) - entry.started_s) < _SAME_START_S
+    return False
+
+
+def logging_into(folder: Path, processes: Iterable[Process] | None = None) -> dict[str, int]:
+    """Name -> pid of the processes that log into a run's folder, as `open_logs` finds them; no launcher is among
+    them."""
+    found = {path.name.partition(".log")[0]: pid for pid, path in open_logs(processes) if path.parent == folder}
+    return {name: pid for name, pid in found.items() if name + ".log" != LAUNCHER_LOG}
+
+
+def open_logs(processes: Iterable[Process] | None = None) -> Iterator[tuple[int, Path]]:
+    """Yields (pid, file) for each log that a process of this user has open so that it may write to it.
+
+    processes  those that are looked at; None: all of this machine
+    """
+    import psutil
+
+    for process in psutil.process_iter() if processes is None else processes:
+        with suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
+            for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
+                yield process.pid, Path(path)
