@@ -197,7 +197,12 @@ def test_a_long_way_around_is_found_over_several_ticks(bodies: Bodies) -> None:
     assert GRID.cell(0, 20) in vehicle.route.ahead()
 
 
-def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) -> None:
+def test_where_there_is_no_way_around_it_is_looked_for_after_pauses_that_double(
+    bodies: Bodies, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended_ns: list[int] = []
+    end = Detours._end
+    monkeypatch.setattr(Detours, "_end", lambda *what: (ended_ns.append(what[-1]), end(*what)))
     pace = np.full((40, 40), 0.1, np.float32)
     pace[:, 20] = np.inf
     pace[20, 20] = 0.1
@@ -205,6 +210,9 @@ def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) ->
     vehicle, detours = drive_around(bodies, pace)
     assert detours.found == 0
     assert vehicle.route.left == 29
+    pauses_ns = np.diff(ended_ns)
+    assert len(pauses_ns) >= 2
+    assert pauses_ns[1:] == pytest.approx(2 * pauses_ns[:-1], rel=0.2), "but for the ticks of a search"
 
 
 def test_a_body_that_drives_on_is_waited_for(bodies: Bodies) -> None:
