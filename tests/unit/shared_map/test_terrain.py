@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import msgspec
@@ -64,12 +63,10 @@ def test_the_same_scenario_gives_the_same_digest_and_another_rule_another() -> N
     assert build_terrain(msgspec.structs.replace(SMALL, seed=3)).digest != digest
 
 
-def test_a_prepared_terrain_is_the_same_and_loads_in_a_blink(tmp_path: Path) -> None:
+def test_a_prepared_terrain_is_the_same(tmp_path: Path) -> None:
     scenario = with_cost(vehicle_radius_m=40.0)
     terrain, truth = prepare(tmp_path / "run", scenario)
-    started = time.perf_counter()
     again = load_prepared(tmp_path / "run", scenario_key(scenario))
-    assert time.perf_counter() - started < 0.05
     assert again is not None
     assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
     for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
