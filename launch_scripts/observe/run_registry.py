@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from psutil import Process
 
 LAUNCHER_LOG = "launcher.log"
-_SAME_START_S = 0.05
+_SAME_START_S = 0.005
 """Starts of processes are known to a hundredth of a second."""
 
 
