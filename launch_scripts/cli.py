@@ -2,63 +2,89 @@
 
 from __future__ import annotations
 
-from functools import cache
+import inspect
+import textwrap
+from functools import cache, reduce
 from importlib.metadata import version
+from pkgutil import resolve_name
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from launch_scripts.command_line import declaring
 from launch_scripts.command_line.declaring import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family
+from launch_scripts.command_line.old_names import current
 from launch_scripts.command_line.run_command import run_command
-from launch_scripts.commands import (
-    ask_commands,
-    gateway_commands,
-    order_commands,
-    result_commands,
-    role_commands,
-    run_commands,
-    runs_commands,
-    scenario_commands,
-    simulation_commands,
-)
 
+LEAVES = (
+    "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
+    "simulation_commands:app",
+)  # fmt: skip
+"""Apps of commands without a family, in `launch_scripts.commands`."""
 FAMILIES = {
-    "terrain": ("terrain_commands", "Inspect and convert terrain; reach maps.", PREPARE),
-    "plugins": ("plugin_commands", "List and test plug-ins.", PREPARE),
-    "map": ("map_commands", "Inspect, export and import marks of a store.", LEFT),
-    "zone": ("zone_commands", "Close areas of a running swarm.", ORDER),
-    "vehicle": ("vehicle_commands", "Add, remove and stop vehicles of a running swarm.", ORDER),
-    "deploy": ("deploy_commands", "Plan several machines: archives, certificates, router.", ADMIN),
+    "order": ("order_commands:app", "Pause a running swarm; change its zones, targets and vehicles.", ORDER),
+    "order zone": ("zone_commands:app", "Close areas of a running swarm.", ORDER),
+    "order target": ("order_commands:target_app", "Add, move and remove simulated targets.", ORDER),
+    "order vehicle": ("vehicle_commands:app", "Add, remove, stop and start vehicles.", ORDER),
+    "terrain": ("terrain_commands:app", "Inspect and convert terrain; reach maps.", PREPARE),
+    "plugin": ("plugin_commands:app", "List and test plug-ins.", PREPARE),
+    "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
+    "marks": ("map_commands:app", "Inspect, export and import marks of a store.", LEFT),
+    "study": ("simulation_commands:study_app", "Run scenarios with many settings and seeds.", LEFT),
+    "role": ("role_commands:app", "Start one process of a swarm, by hand.", ADMIN),
+    "gateway": ("gateway_commands:app", "Connect a running swarm to ROS 2 and MAVLink.", ADMIN),
+    "deploy": ("deploy_commands:app", "Plan several machines: archives, certificates, router.", ADMIN),
 }
-"""Sub-command with sub-commands of its own -> (module, imported when one is called; help; panel)."""
+"""Words of a command with sub-commands -> (its app, imported when one is called; help; panel)."""
+
+
+class Root(TyperGroup):
+    """A swarm of vehicles chases moving targets over real terrain.
+
+      demo                  Run the built-in example
+      new FILE              Write a scenario
+      check SCENARIO        Check a scenario and this machine
+      up SCENARIO           Start a run
+      down [RUN]            Stop a run
+      ps [-a]               List running (all) runs
+      status [--watch]      Show a running swarm
+      logs [NAME] [-f]      Show logs of a run
+      open [RUN]            Open the live view or the report of a run
+      order ...             Pause, zones, targets, vehicles
+      route ...             Find a route
+      terrain ...           Inspect and convert terrain
+
+    More: swarm help --all
+    `swarm COMMAND -h` explains a command. SWARM_CONNECT and other variables
+    stand for options (docs/operate/run.md).
+    """
+
+    all = False
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Prints the text above, with the names of all other commands, unless `swarm help --all` is asked for."""
+        if self.all:
+            super().format_help(ctx, formatter)
+            return
+        names = [*self.commands]
+        print("Usage: swarm COMMAND ...\n")
+        for line in inspect.cleandoc(Root.__doc__ or "").splitlines():
+            if line.startswith("  "):
+                if line.split()[0] not in names:
+                    continue
+                names.remove(line.split()[0])
+            elif line.startswith("More"):
+                line = textwrap.fill(f"{line}  {', '.join(names)}", 79, subsequent_indent=" " * 24)
+            print(line)
+
 
 app = typer.Typer(
+    cls=Root,
     name="swarm",
-    help="""A swarm of vehicles chases moving targets over real terrain.
-
-For every target a planner keeps the tree of cheapest paths to it; vehicles
-follow their routes and mark hazards missing from the map; all meet on Zenoh.
-
-    swarm demo                         the whole swarm, for a minute
-
-    swarm new my.toml                  asks, and writes a scenario of your own
-
-    swarm check my.toml                reports all mistakes before it runs
-
-    swarm up my.toml --port 0          your scenario, on free ports
-
-    swarm status                       the processes of a running swarm
-
-    swarm route --target t3 --row 40 --col 200
-
-    swarm simulate jacksboro --seed 7  in one process, faster than real time
-
-Variables stand for options: SWARM_CONNECT, SWARM_NAMESPACE, SWARM_TLS_DIR,
-SWARM_RUN, SWARM_RUNS and SWARM_LOG_FORMAT (docs/operate/run.md).
-
-`swarm COMMAND -h` explains a command; `swarm --install-completion` lets the Tab key complete them.
-""",
+    help="A swarm of vehicles chases moving targets over real terrain.",
     no_args_is_help=True,
+    suggest_commands=False,
     pretty_exceptions_enable=False,
     context_settings=CONTEXT,
 )
@@ -79,27 +105,41 @@ def _root(
     pass
 
 
-for module in (
-    run_commands,
-    runs_commands,
-    simulation_commands,
-    scenario_commands,
-    result_commands,
-    role_commands,
-    ask_commands,
-    order_commands,
-    gateway_commands,
-):
-    app.add_typer(module.app)
-app.add_typer(order_commands.target_app, name="target", rich_help_panel=ORDER)
+help_app = typer.Typer()
+
+
+@declaring.command(help_app, ADMIN, "help")
+def help_(
+    words: Annotated[list[str] | None, typer.Argument(metavar="[COMMAND...]")] = None,
+    every: Annotated[bool, typer.Option("--all")] = False,
+) -> None:
+    """Explain a command, or list all of them.
+
+    swarm help --all
+
+    swarm help order zone add
+
+    words  The command to explain.
+    every  List all commands, not only the twelve for a start.
+    """
+    root = command()
+    root.all = every
+    root.main([*current(words or ())[0], "-h"], prog_name="swarm", standalone_mode=False)
+
+
+for leaves in LEAVES:
+    app.add_typer(resolve_name(f"launch_scripts.commands.{leaves}"))
+app.add_typer(help_app)
 
 
 @cache
 def command() -> Any:
     """The command with all of its sub-commands."""
     root: Any = typer.main.get_command(app)
-    for name, (module, help, panel) in FAMILIES.items():
-        root.add_command(Family(name, f"launch_scripts.commands.{module}", help, panel))
+    for words, (module, help, panel) in FAMILIES.items():
+        *above, name = words.split()
+        above_it = reduce(lambda group, word: group.commands[word], above, root)
+        above_it.add_command(Family(name, f"launch_scripts.commands.{module}", help, panel))
     return root
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
 
 from launch_scripts.web.health_probe import fast
+from swarm.errors import EXTRAS, ConfigError, require
 
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 _RUNS = ("demo", "up")
 """Commands that start processes."""
+_NEEDED = [package for package, extra in EXTRAS.items() if extra in ("planner", "terrain", "roles")]
+"""Packages of their processes."""
 _SAYS_MORE = ("-h", "--help", "--only", "-d", "--detach")
 """With words that begin so it is for the command to say which processes, if any."""
 
@@ -18,8 +20,9 @@ def main() -> int:
     if sys.argv[1:2] == ["health"] and (code := fast(sys.argv[1:])) is not None:
         return code
     try:
-        runs = sys.argv[1:2] and sys.argv[1] in _RUNS and find_spec("typer")
+        runs = sys.argv[1:2] and sys.argv[1] in _RUNS
         if runs and not any(word.startswith(_SAYS_MORE) for word in sys.argv[2:]):
+            require("the command", *_NEEDED)
             # It takes longest of all that a start waits for, so it begins before the command itself is loaded.
             from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, start_forkserver
 
@@ -30,10 +33,10 @@ def main() -> int:
             raise  # a fault of ours
         print(
             f"swarm: the command needs {error.name}, which is not installed: install the extra 'all' "
-            "(docs/start/install.md); without it there is the library swarm.client only",
+            "(docs/start/install.md has smaller ones)",
             file=sys.stderr,
         )
-        return 1
+        return ConfigError.exit_code
     except KeyboardInterrupt:
         print("swarm: stopped", file=sys.stderr)
         return 130

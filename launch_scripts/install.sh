@@ -36,7 +36,7 @@ is_current() {
     [[ $found == "$(wanted) tools" || ($1 == run && $found == "$(wanted) run") ]]
 }
 
-sync_with() { (cd "$root" && env -u VIRTUAL_ENV UV_PROJECT_ENVIRONMENT="$venv" UV_PYTHON_DOWNLOADS=never \
+sync_with() { (cd "$root" && env -u VIRTUAL_ENV UV_PROJECT_ENVIRONMENT="$venv" UV_PYTHON_DOWNLOADS=never SWARM_COMMIT= \
     "$@" sync --frozen --extra all "${groups[@]}" --inexact --quiet --python "$python"); }
 
 install() {

@@ -1,6 +1,52 @@
-"""Texts of others on the way to a terminal or a log: names, notes and sentences that may be anybody's."""
+"""The written form of texts, moments and durations for people, on a terminal, in a log and on a page.
+
+A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. They are two types, so that
+no sentence says one for the other; a time after "since" would be neither.
+"""
 
 from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+
+_UNITS = (("d", 86_400, "h", 3_600), ("h", 3_600, "min", 60), ("min", 60, "", 1))
+_SECONDS_UP_TO = 100
+"""Longer durations are in minutes, hours or days."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Duration:
+    """A length of time."""
+
+    seconds: float
+
+    def __str__(self) -> str:
+        """86 s, 19 min, 5 h 20 min"""
+        left = round(self.seconds)
+        if left < _SECONDS_UP_TO:
+            return f"{left} s"
+        unit, size, part, parts = next(each for each in _UNITS if left >= each[1])
+        many, rest = divmod(left, size)
+        return f"{many} {unit}" + (f" {rest // parts} {part}" if part and rest >= parts else "")
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Moment:
+    """An instant, in ns since 1970."""
+
+    ns: int
+
+    def __str__(self) -> str:
+        """14:22:10, by the clock on this machine's wall"""
+        return time.strftime("%H:%M:%S", time.localtime(self.ns // NS_PER_S))
+
+
+def unanswered(silent: Sequence[str], asked: int, within_s: float) -> str:
+    """8 of 17 did not answer within 2 s: agent-a0, ..."""
+    return f"{len(silent)} of {asked} did not answer within {within_s:g} s: {', '.join(silent)}"
 
 
 def plain(text: str) -> str:

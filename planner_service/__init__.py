@@ -11,7 +11,7 @@ bound of the cost of any route. The planner ensures this in six steps:
    that takes too long for the thread that answers, a worker searches the whole tree. `target_tree.Decision` is the
    decision, by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
 5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
-   with the map, and the last window adds its rim (`tree.route_bounds`, docs/certificates.md).
+   with the map, and the last window adds its rim (`tree.route_bounds`, docs/method/certificates.md).
 6. *Push.* A follower is pushed another route if its route passes a change or begins in a grown part, and the
    other differs.
 
@@ -63,6 +63,9 @@ the candidacy's. The same without a process, a network or a file:
 True
 """
 
-from planner_service.route_finder import FoundRoute, RouteFinder
+from swarm.errors import require
+
+require(__name__, "numpy", "numba")
+from planner_service.route_finder import FoundRoute, RouteFinder  # noqa: E402
 
 __all__ = ["FoundRoute", "RouteFinder"]

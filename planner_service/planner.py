@@ -70,7 +70,6 @@ class Planner:
     shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     vehicle_class   whose routes these are: what the cost map is for
-    began_ns        when it was made: the age of a pose which arrived earlier is counted from then
     target_search   while the target is unseen. All classes share it
     """
 
@@ -90,7 +89,6 @@ class Planner:
         leads: bool = True,
         target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
-        began_ns: int = 0,
     ) -> None:
         self.target = watch.target
         self.vehicle_class = vehicle_class
@@ -107,7 +105,7 @@ class Planner:
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(watch.target, self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
-        self._watch, self._began_ns = watch, began_ns
+        self._watch = watch
         # (target cell, map version) of the tree's last update.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
@@ -449,7 +447,7 @@ class Planner:
             "incarnation": self._incarnation,
             "map_version": max(self.tree.map_version, 0),
             "tree_age_ms": self._age_ms(now_ns),
-            "pose_age_s": self._watch.age_s(now_ns, self._began_ns),
+            "pose_age_s": self._watch.age_s(now_ns),
             "tracker_lost": self._watch.lost(now_ns),
         }
 

@@ -24,6 +24,7 @@ from shared_map.array_files import Bytes, Floats, open_array, private_copy, save
 from shared_map.terrain.store import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
+from swarm.errors import StoreError
 from swarm.recording.external_calls import ExternalCalls
 
 log = logging.getLogger(__name__)
@@ -94,8 +95,8 @@ class PreparedCosts:
             save_array(self._strides, np.concatenate((packed, _digest_of(packed))))
             if (kept := self._kept()) is not None:
                 keep_beside(kept, self._strides)
-        except OSError as error:
-            log.warning("cannot share networks of strides in %s: %s", self._folder, error.strerror or error)
+        except (OSError, StoreError) as error:
+            log.warning("cannot share networks of strides: %s", error)
         if self._claimed is not None:
             self._claimed.close()
             self._claimed = None
@@ -109,8 +110,8 @@ def prepared_costs(
         return None
     try:
         return PreparedCosts(folder, terrain, config, kept)
-    except OSError as error:
-        log.warning("cannot share cell costs in %s: %s", folder, error.strerror or error)
+    except (OSError, StoreError) as error:
+        log.warning("cannot share cell costs in %s: %s", folder, error)
         return None
 
 

@@ -147,7 +147,7 @@ class PlannerService:
             stopwatch=self._stopwatch or (lambda: 0),
         )
 
-    def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree, began_ns: int = 0) -> Planner:
+    def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree) -> Planner:
         """The planner of a class. Timestamps of marks and data shared by other processes go to that of "ground"."""
         scenario, is_ground = self._scenario, name == GROUND
         return Planner(
@@ -164,13 +164,12 @@ class PlannerService:
             leads=False,
             target_search=self._search,
             vehicle_class=name,
-            began_ns=began_ns,
         )
 
-    def _begin_class(self, name: str, now_ns: int) -> Planner:
+    def _begin_class(self, name: str) -> Planner:
         """Makes the planner of a class at its first query."""
         cost_map = self._maps.of[name]
-        planner = self._new_planner(name, cost_map, self._new_tree(cost_map), now_ns)
+        planner = self._new_planner(name, cost_map, self._new_tree(cost_map))
         planner.lead(self._planner.leads)
         self._pace(planner)
         log.info("target %s: a tree for the class %s", self._target, name)

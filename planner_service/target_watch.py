@@ -68,10 +68,10 @@ class TargetWatch:
         """Last position of the target; None before the first pose."""
         return self._tracking.pose
 
-    def age_s(self, now_ns: int, began_ns: int = 0) -> float | None:
-        """Time since that pose arrived, or since `began_ns` if it arrived earlier."""
+    def age_s(self, now_ns: int) -> float | None:
+        """Time since that pose arrived; None before the first."""
         age_ns = self._tracking.age_ns(now_ns)
-        return None if age_ns is None else min(age_ns, now_ns - began_ns) / NS_PER_S
+        return None if age_ns is None else age_ns / NS_PER_S
 
     def lost(self, now_ns: int) -> bool:
         """Returns True if no tracker publishes the target now."""

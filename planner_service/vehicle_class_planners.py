@@ -26,7 +26,7 @@ class ClassPlanners:
     def __init__(
         self,
         ground: Planner,
-        make: Callable[[str, int], Planner],
+        make: Callable[[str], Planner],
         known: Collection[str],
         ready: Callable[[], bool] = lambda: True,
     ) -> None:
@@ -64,7 +64,7 @@ class ClassPlanners:
         """Returns the planner of a known class that is needed; made if it is missing."""
         planner = self._by_class.get(name)
         if planner is None:
-            planner = self._by_class[name] = self._make(name, now_ns)
+            planner = self._by_class[name] = self._make(name)
             self._begun_ns[name] = now_ns
         self._used_ns[name] = now_ns
         return planner

@@ -6,12 +6,13 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import os
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from swarm.files import replacing
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -46,14 +47,9 @@ def open_array(path: Path) -> NDArray[Any]:
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Writes an array where `open_array` reads it, at once: other processes see all of it or nothing. Raises
-    OSError."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with partial.open("wb") as file:
-            np.save(file, np.ascontiguousarray(array), allow_pickle=False)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    StoreError."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.save(file, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def private_copy(array: NDArray[Any]) -> NDArray[Any]:

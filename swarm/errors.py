@@ -3,9 +3,29 @@ traceback."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from importlib.util import find_spec
+
+EXTRAS = {
+    "typer": "terrain", "rich": "terrain", "numpy": "planner", "numba": "planner", "llvmlite": "planner",
+    "PIL": "terrain", "matplotlib": "terrain", "packaging": "terrain", "rasterio": "terrain", "scipy": "terrain",
+    "yaml": "terrain", "cryptography": "roles", "jinja2": "roles", "markupsafe": "roles",
+    "prometheus_client": "roles", "psutil": "roles", "rerun": "view", "pyogrio": "vectors", "shapely": "vectors",
+    "pyproj": "wgs84", "pymavlink": "mavlink", "serial": "mavlink", "mcap": "ros2", "rosbags": "ros2",
+    "xxhash": "ros2", "dask": "sweep", "distributed": "sweep", "pyarrow": "sweep",
+}  # fmt: skip
+"""Package that the base install lacks -> the smallest extra which brings it."""
+
+
+def missing(package: str) -> str:
+    """End of a sentence about a package of `EXTRAS` which is not installed."""
+    return f"{package}, which is not installed: install the extra '{EXTRAS[package]}' (docs/start/install.md)"
+
+
+def require(module: str, *packages: str) -> None:
+    """Raises ModuleNotFoundError, with the extra to install, if a module lacks one of its packages."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"{module} needs {missing(package)}", name=package)
 
 
 class SwarmError(Exception):
@@ -43,15 +63,6 @@ class StoreError(SwarmError):
     """The keeper's store or a run folder cannot be opened or written."""
 
     exit_code = 6
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turns what the system refuses, such as a full disk, into a StoreError that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 class ProtocolError(SwarmError):

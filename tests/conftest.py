@@ -14,7 +14,7 @@ from hypothesis import settings
 from support.effort import few, try_all
 
 TESTS = Path(__file__).parent
-# What a test starts finds this checkout and what tests share, wherever it is started.
+# Processes that a test starts find this checkout and the support modules, whatever their folder.
 os.environ["PYTHONPATH"] = os.pathsep.join((str(TESTS.parent), str(TESTS)))
 # No variable of a user says where a command looks, and no run of a test is registered among a user's runs.
 for name in [name for name in os.environ if name.startswith("SWARM_")]:
@@ -23,7 +23,8 @@ _STATE = tempfile.TemporaryDirectory(prefix="swarm-state-")
 os.environ["SWARM_STATE"] = _STATE.name
 
 EXAMPLES = 100
-"""Of a property that names no number of its own, with `--thorough`; each commit tries a share (support.effort)."""
+"""Number of examples of a property that names none, with `--thorough`; each commit tries a share
+(support.effort)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

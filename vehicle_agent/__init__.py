@@ -28,3 +28,7 @@ in a planner, 19 and 20 in the agent of the other vehicle:
 19. `service.py`: `AgentService.tick` takes it from the bus.
 20. `agent.py`: `Agent.route_pushed` gives it to the vehicle (`Vehicle.give_route` in `driving/driven_vehicle.py`).
 """
+
+from swarm.errors import require
+
+require(__name__, "numpy")

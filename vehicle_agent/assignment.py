@@ -179,8 +179,8 @@ def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | N
     """Returns which target each vehicle goes for: the cheapest pairs first, to each target an even share of the
     vehicles.
 
-    If each took the cheapest, all would end up in one herd (docs/method.md): those which chase one target stand
-    together when it is caught, and have the same cheapest target again.
+    If each took the cheapest, all would end up in one herd (docs/method/paper.md): those which chase one target
+    are together when it is captured, and have the same cheapest target again.
 
     Parameters
     ----------

@@ -13,6 +13,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
+from swarm.files import writing
 from swarm.recording.external_calls import ExternalCalls
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way_core import OwnRecord
@@ -159,10 +160,8 @@ class FilePromiseStore(PromiseStore):
             elif record.table is not None:
                 self.saved[record.table.plot] = (record.promised, record.table)
             at = end
-        try:
+        with writing(self._path):
             self._file = os.open(self._path, os.O_RDWR)
-        except OSError as error:
-            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
         self._at, self._size = at, len(data)
 
     def _all(self) -> bytes:
@@ -176,14 +175,11 @@ class FilePromiseStore(PromiseStore):
         """Goes over to the spare file."""
         why = self.reserve()
         content = self._all()
-        try:
-            if why is None:
-                os.pwrite(self._spare, content + bytes(_HEAD_BYTES), 0)
-                self._spare_path.replace(self._path)
-        except OSError as error:
-            why = f"cannot write {self._path}: {error.strerror}"
         if why is not None:
             raise StoreError(why)
+        with writing(self._path):
+            os.pwrite(self._spare, content + bytes(_HEAD_BYTES), 0)
+            self._spare_path.replace(self._path)
         if self._file >= 0:
             os.close(self._file)
         self._file, self._size, self._at = self._spare, max(self._spare_size, len(content)), len(content)
@@ -195,11 +191,9 @@ class FilePromiseStore(PromiseStore):
             self._switch()  # the record is among what still counts
             self.reserve()
             return
-        try:
+        with writing(self._path):
             body = packed + bytes(_HEAD_BYTES)
             if os.pwrite(self._file, body, self._at + _HEAD_BYTES) != len(body):
-                raise StoreError(f"cannot write {self._path}: {os.strerror(errno.ENOSPC)}")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.pwrite(self._file, len(packed).to_bytes(_HEAD_BYTES, "little"), self._at)
-        except OSError as error:
-            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
         self._at += _HEAD_BYTES + len(packed)

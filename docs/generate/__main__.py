@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import typer
 from typer.cli import get_docs_for_click
@@ -27,6 +29,7 @@ from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"
+_MEASUREMENTS = Path(__file__).with_name("measurements.toml")
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
     "LATCHED": "reliable, transient local, last 1",
@@ -34,53 +37,63 @@ _QOS = {
     "TRANSFORMS": "reliable, volatile, last 100",
 }
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
-_OPTION = re.compile(r"^\* `--.*", re.MULTILINE)
-_OPTIONS = re.compile(r"(?:^\* `--.*\n)+", re.MULTILINE)
-_SHARED = 9
+_OPTION = re.compile(r"^\* `.*", re.MULTILINE)
+_OPTIONS = re.compile(r"(?:^\* `.*\n)+", re.MULTILINE)
+SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+"""The options by which a command finds the swarm."""
+_SHARED = 2
 """An option with one text in this number of commands is explained once."""
+_LEFT_OUT = re.compile(r"\*\*(?:Usage|Commands)\*\*:\n\n(?:```[^`]*```\n|(?:\* .*\n)+)\n?")
+"""Parts of Typer's text which say nothing that the examples and the next sections do not say."""
 _OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `(?:-h, )?--help`.*\n", re.MULTILINE)
 
 
 def command_line() -> str:
     """Returns the page of the command `swarm`: what Typer writes, with the examples of a command as code."""
     root = cli.command()
-    for name, each in root.commands.items():
-        if isinstance(each, Family):
-            each.group.name = name
-            root.commands[name] = each.group
+    _load(root)
     text = get_docs_for_click(obj=root, ctx=typer.Context(root, info_name="swarm"), name="swarm")
-    text = _OF_EVERY_COMMAND.sub("", text.partition("\n")[2])
+    text = _OF_EVERY_COMMAND.sub("", _LEFT_OUT.sub("", text.partition("\n")[2]))
+    text = re.sub(r"(?<=[a-z]) range(?=>)|  \[required\]|\n\*\*\w+\*\*:\n(?=\n\* )", "", text)
+    text = re.sub(r"(\n\* .*\n)\n+(?=\* )", r"\1", text)
+    text = re.sub(r"(?<=\n\* `)([^-`]\S*) <.*?>`", r"\1`", text)
     text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
     shared, text = _shared_once(text.strip())
     return filled("cli", commands=text, shared=shared)
 
 
+def _load(group: Any) -> None:
+    """Puts the groups themselves in place of families, which are loaded when one is called."""
+    for name, each in group.commands.items():
+        if isinstance(each, Family):
+            each.group.name = name
+            group.commands[name] = each.group
+            _load(each.group)
+
+
 def _shared_once(text: str) -> tuple[list[str], str]:
     """Returns the rows of options that many commands share, and the page with names in place of these rows."""
     times = Counter(_OPTION.findall(text))
-    shared = sorted(row for row, many in times.items() if many >= _SHARED)
+    usual = {row.split("`")[1].partition(" ")[0]: row for row, _ in reversed(times.most_common())}
+    shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
 
     def named(block: re.Match[str]) -> str:
         rows = block[0].splitlines()
         names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
-        link = [f"* [shared](#shared-options): {', '.join(f'`{name}`' for name in names)}"] if names else []
+        told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[the swarm](#shared-options)")
+        link = [f"* {told}"] if names else []
         return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
 
     return shared, _OPTIONS.sub(named, text)
 
 
-def land_cover() -> str:
-    """Returns the page of land-cover codes."""
-    return filled("land-cover", tables=TABLES.values())
-
-
-def ways() -> str:
-    """Returns the page of classes of roads and water."""
-    return filled("ways", kinds=BUILT_IN, columns=COLUMNS)
+def measurements() -> str:
+    """Returns the page of measurements."""
+    return filled("measurements", **tomllib.loads(_MEASUREMENTS.read_text(encoding="utf-8")))
 
 
 def ros2() -> str:
-    """Returns the page of what `swarm ros2` forwards and of its settings."""
+    """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
     incoming = incoming_rows(EXAMPLE, has_map=True)
     settings = scenario_page.settings(Settings)
     return filled("ros2", outgoing=TABLE, incoming=incoming, qos=_QOS, settings=settings)
@@ -96,11 +109,13 @@ def design() -> str:
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
+    wire_page.JSON_PATH: wire_page.json_document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
     _REFERENCE / "cli.md": command_line,
-    _REFERENCE / "land-cover.md": land_cover,
-    _REFERENCE / "ways.md": ways,
+    _REFERENCE / "land-cover.md": lambda: filled("land-cover", tables=TABLES.values()),
+    _REFERENCE / "ways.md": lambda: filled("ways", kinds=BUILT_IN, columns=COLUMNS),
+    _REFERENCE.with_name("method") / "measurements.md": measurements,
     _REFERENCE / "ros2.md": ros2,
     _DESIGN / "index.md": design,
 }

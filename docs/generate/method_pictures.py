@@ -1,4 +1,4 @@
-"""The pictures of docs/method.md, computed by the planner's own trees on small grids. They are deterministic.
+"""The pictures of docs/method/paper.md, computed by the planner's own trees on small grids. They are deterministic.
 
 python -m docs.generate.method_pictures [NAME ...]
 
@@ -149,7 +149,7 @@ def range_rule() -> Figure:
 def _draw_windows(axes: Axes) -> None:
     """Draws the three smallest windows around a target, over the blocks whose borders decide between them."""
     axes.set(xlim=(-17.5, 17.5), ylim=(-17.5, 17.5), aspect="equal", title="Windows for k_min = 2")
-    _bare(axes)
+    axes.set(xticks=[], yticks=[])
     for line in range(-16, 17, 4):
         for draw in (axes.axhline, axes.axvline):
             draw(line - 2.5, color="#c9ced4", lw=1.1 if line % 8 == 0 else 0.5, zorder=0)
@@ -300,15 +300,8 @@ def _hills(rows: int, cols: int, seed: int, strength: float) -> Pace:
 def maps(panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
     """A figure of maps side by side."""
     figure = Figure(figsize=size, layout="constrained")
-    axes = list(np.atleast_1d(figure.subplots(1, panels)))
-    for each in axes:
-        _bare(each)
-    return figure, axes
-
-
-def _bare(axes: Axes) -> None:
-    axes.grid(False)
-    axes.set(xticks=[], yticks=[])
+    axes = figure.subplots(1, panels, subplot_kw={"xticks": [], "yticks": []})
+    return figure, list(np.atleast_1d(axes))
 
 
 def draw_ground(axes: Axes, pace: Pace) -> None:

@@ -1,4 +1,4 @@
-"""What the paper prints, taken literally, where this project does something else. For docs/method.md only.
+"""What the paper prints, taken literally, where this project does something else. For docs/method/paper.md only.
 
 Wan, Zhang, Murray, Kaufman: Automatic target tracking on multi-resolution terrain.
 """

@@ -1,4 +1,4 @@
-"""The pictures of docs/pulled.md and docs/air.md: routes on terrain, found as `swarm.client`'s users find them.
+"""The pictures of docs/behaviour/any-angle.md and fly.md: routes on terrain, as users of `swarm.client` find them.
 
 python -m docs.generate.route_pictures [NAME ...]
 """
@@ -78,12 +78,8 @@ def wind() -> Figure:
         axes.set_title("Still air")
         if blown.speed_m_per_s:
             axes.set_title(f"Wind of {blown.speed_m_per_s:g} m/s from {blown.from_deg:g} degrees")
-            along = np.radians(blown.from_deg + 180)
-            east, north = 0.06 * np.sin(along), 0.06 * np.cos(along)
-            axes.annotate(
-                "", (0.88 + east, 0.07 + north), (0.88 - east, 0.07 - north), xycoords="axes fraction",
-                arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 2.5},
-            )  # fmt: skip
+            way = np.radians(blown.from_deg + 180)
+            axes.quiver(0.9, 0.07, np.sin(way), np.cos(way), pivot="middle", scale=12, transform=axes.transAxes)
     return figure
 
 

@@ -24,18 +24,21 @@ PATH = Path(__file__).parents[2] / "docs" / "reference" / "scenario.md"
 SCHEMA_PATH = PATH.with_suffix(".schema.json")
 
 _ROW = re.compile(r"\w+(, \w+)*  +\S")
-_UNITS = {
-    "_m_per_s": "m/s",
-    "_per_s": "1/s",
-    "_per_m": "1/m",
-    "_s_per_m": "s/m",
-    "_hz": "Hz",
-    "_deg": "degrees",
-    "_m": "m",
-    "_s": "s",
-    "_cells": "cells",
+_SHORT = {
+    "text in quotes, of letters, digits, '_', '.' and '-'": "id",
+    "text in quotes": "text",
+    "a whole number": "integer",
+    "a number": "number",
+    "true or false": "bool",
+    "one of ": "",
+    ", more than ": " >",
+    ", at least ": " >=",
+    ", up to ": " <=",
+    ", at most ": " <=",
+    ", less than ": " <",
 }
-"""Ending of a key -> its unit; the longer ending first."""
+"""Words of an error -> those of the page, where each is read many times."""
+_BETWEEN = re.compile(r", (\S+) to ([^\s,\]]+)")
 
 Section = type[msgspec.Struct]
 
@@ -99,13 +102,12 @@ def _sections(root: Section) -> list[tuple[str, Section]]:
 
 
 def _rows(path: str, section: Section) -> Iterator[tuple[str, ...]]:
-    """Yields key, meaning, unit, what is allowed and default of each setting."""
+    """Yields key, meaning, allowed values and default of each setting."""
     hints, said = hints_of(section), _meanings(section)
     for field in msgspec.structs.fields(section):
         key = field.encode_name
         if path or section_in(hints[key]) is None:
-            unit = next((unit for ending, unit in _UNITS.items() if key.endswith(ending)), "")
-            cells = (f"`{key}`", said[key], unit, _allowed(hints[key]), _default(field))
+            cells = (f"`{key}`", said[key], _allowed(hints[key]), _default(field))
             yield tuple(cell.replace("|", "\\|") for cell in cells)
 
 
@@ -124,7 +126,10 @@ def _meanings(section: Section) -> dict[str, str]:
 
 def _allowed(hint: Any) -> str:
     """Returns the type and its bounds in words: those of an error, and what is in a list or a table."""
-    kind, words = bare(hint), re.sub(r"'([^']+)'", r"`\1`", expected(hint))
+    kind, words = bare(hint), expected(hint)
+    for long, short in _SHORT.items():
+        words = words.replace(long, short)
+    words = _BETWEEN.sub(r" \1..\2", re.sub(r"'([^']+)'", r"`\1`", words))
     args = typing.get_args(kind)
     for note in (note for each in (hint, *typing.get_args(hint)) for note in getattr(each, "__metadata__", ())):
         if "built_in" in (note.extra or {}):

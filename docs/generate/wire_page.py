@@ -17,7 +17,7 @@ from launch_scripts.process_table import ROLES as STARTED_ROLES
 from swarm import grid
 from swarm.bus import bus
 from swarm.wire import codec
-from swarm.wire.access import OPERATOR, ROLES, Grant
+from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import MarkKind
@@ -26,21 +26,33 @@ from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import read_schemas, written_schema
 
-PATH = Path(__file__).parents[2] / "docs" / "wire.md"
+PATH = Path(__file__).parents[1] / "reference" / "wire.md"
+JSON_PATH = PATH.with_name("wire-json.md")
+_EVERY, _EVERY_OWN = MEMBERS.replace(" ", ", "), MEMBERS.replace(" ", " (role, id), ") + " (role, id)"
+REQUIRED = "required"
+"""In place of the default of a field without one."""
 
 
 def document() -> str:
-    """Returns the page."""
+    """Returns the page of keys, access and messages."""
     return filled(
-        "wire", topics=TOPICS, from_outside=put_from_outside(), outside_roles=OUTSIDE_ROLES, messages=messages(),
-        enums=(MarkKind, VehicleState, RouteStatus), version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR,
-        bus=bus, codec=codec, grid=grid, how=_how, link=_link, granted=_granted, schemas=_schemas, struct=_struct,
-        parts=parts, key_fields=key_fields, example=example,
+        "wire", topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
+        version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, bus=bus, codec=codec, grid=grid, how=_how,
+        link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts,
+    )  # fmt: skip
+
+
+def json_document() -> str:
+    """Returns the page of JSON for programs outside the swarm."""
+    return filled(
+        "wire-json", from_outside=put_from_outside(), outside_roles=OUTSIDE_ROLES, codec=codec,
+        key_fields=key_fields, example=example,
     )  # fmt: skip
 
 
 def _granted(grants: tuple[Grant, ...]) -> str:
-    return ", ".join(grant.role + (f" ({', '.join(grant.own)})" if grant.own else "") for grant in grants)
+    text = ", ".join(grant.role + (f" ({', '.join(grant.own)})" if grant.own else "") for grant in grants)
+    return text.replace(_EVERY_OWN, "every member (role, id)").replace(_EVERY, "every member")
 
 
 def _how(topic: Topic) -> str:
@@ -75,7 +87,8 @@ def _schemas(message: type[Message]) -> str:
 
 def _struct(struct: type[msgspec.Struct]) -> str:
     prose, _, listing = inspect.cleandoc(struct.__doc__ or "").partition("\n\n")
-    return filled("struct", about=prose, listing=textwrap.indent(listing, "    "), rows=rows(struct))
+    listing = textwrap.indent(listing, "    ")
+    return filled("struct", about=prose, listing=listing, rows=rows(struct), required=REQUIRED)
 
 
 def rows(struct: type[msgspec.Struct]) -> list[list[str]]:
@@ -98,26 +111,26 @@ def parts(struct: type[msgspec.Struct], kind: type[Any] = msgspec.Struct) -> lis
 
 
 def default_text(field: msgspec.structs.FieldInfo) -> str:
-    """What a reader takes where the field is absent, in words."""
+    """The value that a reader takes where the field is absent; `REQUIRED` if there is none."""
     if field.required:
-        return "refused"
+        return REQUIRED
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
-    return f"`{value!r}`"
+    return repr(value)
 
 
 def type_text(hint: Any) -> str:
-    """A type with its bounds, in words."""
+    """A type with its bounds, in the notation that the page explains."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         return _bounded(*taken_apart(hint))
     if origin in (types.UnionType, typing.Union):
-        return " or ".join("nil" if arg is type(None) else type_text(arg) for arg in args)
+        return "|".join("nil" if arg is type(None) else type_text(arg) for arg in args)
     if origin is list:
-        return f"list of {type_text(args[0])}"
+        return f"[{type_text(args[0])}]"
     if origin is tuple:
-        return f"[{', '.join(type_text(arg) for arg in args)}]"
+        return f"({', '.join(type_text(arg) for arg in args)})"
     if origin is dict:
-        return f"map of {type_text(args[0])} to {type_text(args[1])}"
+        return f"{{{type_text(args[0])}: {type_text(args[1])}}}"
     return str(hint.__name__)
 
 
@@ -127,26 +140,24 @@ def _bounded(bare: Any, notes: tuple[Any, ...]) -> str:
     if any(isinstance(note, Characters) for note in notes):
         return "id"
     for column in (note for note in notes if isinstance(note, Column)):
-        words = column.describe()
-        if column.least is not None and column.most is not None:
-            words += f", {number(column.least)} ... {number(column.most)}"
+        words = column.describe() + _range(column.least, column.most)
     for meta in (note for note in notes if isinstance(note, msgspec.Meta)):
-        least, most = meta.ge, meta.le if meta.lt is None else meta.lt - 1
-        if least is not None:
-            words += f" {number(least)} ... {'inf' if most is None else number(most)}"
+        words += _range(meta.ge, meta.le if meta.lt is None else meta.lt - 1)
         if meta.max_length is not None:
-            of = {str: "characters", bytes: "bytes"}.get(bare, "items")
-            few = f"{meta.min_length} to " if meta.min_length else "at most "
-            words += f", {few}{number(meta.max_length)} {of}"
+            words += f"<={number(meta.max_length)}"
     return words
 
 
+def _range(least: Any, most: Any) -> str:
+    return "" if least is None else f"({number(least)}..{'inf' if most is None else number(most)})"
+
+
 def number(limit: Any) -> str:
-    """A limit as one would write it: 2^62 - 1, -2^31, 1e+09, 0."""
+    """A limit as one would write it: 2^62-1, -2^31, 1e+09, 0."""
     if isinstance(limit, float) or abs(limit) < 1 << 16:
         return f"{limit:g}"
     sign, rest = ("-", -limit) if limit < 0 else ("", limit)
-    for above, words in ((0, ""), (1, " - 1")):
+    for above, words in ((0, ""), (1, "-1")):
         if int(rest + above).bit_count() == 1:
             return f"{sign}2^{int(rest + above).bit_length() - 1}{words}"
     return f"{limit}"

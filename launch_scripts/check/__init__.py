@@ -5,3 +5,7 @@ value expected and the remedy. A failure prevents the run; a warning states that
 expect. `swarm check` and `swarm up` ask the same functions of `scenario_check`, `swarm doctor` those of
 `machine_check`. `plugin_check` is the test kit for a plug-in of one's own.
 """
+
+from swarm.errors import require
+
+require(__name__, "numpy")

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check.findings import Finding, Level, failure, warning
-from launch_scripts.observe.run_folder import can_write
 from launch_scripts.process_table import processes_of
 from swarm.config.agents import plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
-from swarm.errors import SwarmError
+from swarm.errors import StoreError, SwarmError
+from swarm.files import check_writable
 
 PACKAGE = "terrain-swarm"
 _EXTRAS = ("all", "roles", "vectors")
@@ -34,8 +34,8 @@ _UNSYNCHRONISED = 5
 _TIMEX_BYTES = 256
 """Above the size of Linux's `struct timex`, 208 bytes on 64-bit machines: the kernel writes all of it."""
 
-# docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. The rule of thumb:
-# agents, vehicles and trees cost in proportion to ticks and numbers.
+# docs/method/measurements.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. The rule of
+# thumb: agents, vehicles and trees cost in proportion to ticks and numbers.
 _AGENT_CORES_AT_5_HZ = 0.022
 _VEHICLE_CORES_AT_5_HZ = 0.31 / 1000
 _PLANNER_CORES = 0.011
@@ -115,7 +115,8 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
             "vehicles",
             f"{scenario.vehicle_count:,} vehicles of {needs.agents} agents and {len(scenario.target_ids):,} targets"
             f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be"
-            f" late;{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
+            f" late;{fewer} fewer of them, a lower vehicles.tick_hz, or more machines"
+            " (docs/method/measurements.md)",
         )
     if needs.memory_bytes > here.free_bytes:
         yield warning(
@@ -146,9 +147,9 @@ def _unwritable(runs: Path) -> str | None:
     if not folder.is_dir():
         return f"{folder} is not a folder; choose another --runs"
     try:
-        can_write(folder)
-    except OSError as error:
-        return f"{folder} cannot be written: {error.strerror or error}; choose another --runs"
+        check_writable(folder)
+    except StoreError as error:
+        return f"{error}; choose another --runs"
     return None
 
 

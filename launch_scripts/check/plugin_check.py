@@ -1,6 +1,6 @@
 """The test kit of plug-ins: asks one as a run would, in awkward worlds, and says which promises it breaks.
 
-`check_plugin` is for tests of one's own, `swarm plugins check` the same as a command. A plug-in is called through
+`check_plugin` is for tests of one's own, `swarm plugin check` the same as a command. A plug-in is called through
 the guard of its kind, so what a run would refuse is refused here; each kind is held to what its page promises.
 """
 

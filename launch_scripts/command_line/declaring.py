@@ -10,8 +10,8 @@ returns the exit code.
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import pkgutil
 import re
 from collections.abc import Callable
 from copy import copy
@@ -31,8 +31,7 @@ PREPARE = "Before a run"
 ASK = "Ask a running swarm"
 ORDER = "Give a running swarm orders"
 LEFT = "Finished runs"
-ROLE = "One role, by hand"
-ADMIN = "Several machines, and figures"
+ADMIN = "Processes, machines and other systems"
 """The panels in which help shows commands."""
 
 NETWORK = "Where the swarm is"
@@ -50,11 +49,17 @@ _AS_IT_STANDS = (" ", "\b", "[", "swarm ")
 """Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
 
 
-def command(app: typer.Typer, panel: str | None = None, name: str | None = None) -> Callable[[F], F]:
-    """Adds a function to an app as a command, and returns the function as it is."""
+def command(
+    app: typer.Typer, panel: str | None = None, name: str | None = None, **settings: Any
+) -> Callable[[F], F]:
+    """Adds a function to an app as a command, and returns the function as it is.
+
+    settings  what else Typer takes of a command
+    """
 
     def added(function: F) -> F:
-        app.command(name, rich_help_panel=panel, help=_prose(function.__doc__))(_called_with_options(function))
+        made = app.command(name, rich_help_panel=panel, help=_prose(function.__doc__), **settings)
+        made(_called_with_options(function))
         return function
 
     return added
@@ -132,19 +137,19 @@ def from_environment(variable: str, **more: Any) -> Any:
 
 
 class Family(TyperGroup):
-    """A group whose commands are those of the Typer app `MODULE.app`, which is imported when one is asked for.
+    """A group whose commands are those of a Typer app, `MODULE:APP`, which is imported when one is asked for.
 
     help  the line beside its name among the other commands; the app has a longer one of its own
     """
 
     def __init__(self, name: str, module: str, help: str, panel: str) -> None:
         self.module = module
-        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel)
+        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel, suggest_commands=False)
 
     @cached_property
     def group(self) -> Any:
         """The group of the app itself."""
-        return typer.main.get_command(importlib.import_module(self.module).app)
+        return typer.main.get_group(pkgutil.resolve_name(self.module))
 
     @property
     def commands(self) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -13,14 +14,10 @@ import typer
 from typer.exceptions import TyperException
 
 from launch_scripts.command_line.declaring import ENVIRONMENT
+from launch_scripts.command_line.old_names import current, meant
+from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
-from swarm.errors import ConfigError, StoreError, SwarmError
-
-EXTRAS = {
-    "pyogrio": "vectors", "shapely": "vectors", "mcap": "ros2", "rosbags": "ros2", "xxhash": "ros2",
-    "dask": "sweep", "distributed": "sweep", "pyarrow": "sweep", "rerun": "all",
-}  # fmt: skip
-"""Package that a small install lacks -> the extra which brings it."""
+from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -37,7 +34,10 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     _fill_streams()
     try:
         try:
-            code = command().main(prog_name=name, standalone_mode=False)
+            words, told = current(sys.argv[1:])
+            for sentence in told:
+                print(f"swarm: {sentence}", file=sys.stderr)
+            code = command().main(args=words, prog_name=name, standalone_mode=False)
         finally:
             sys.stdout.flush()
     except TyperException as error:
@@ -54,8 +54,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRAS:
             raise  # a fault of ours
-        needed = f"install the extra '{EXTRAS[package]}' (docs/start/install.md)"
-        print(f"swarm: this needs {package}, which is not installed: {needed}", file=sys.stderr)
+        print(f"swarm: this needs {missing(package)}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:
         _leave_output()
@@ -86,9 +85,15 @@ def _sentence(error: TyperException) -> str:
         said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
-    elif "command" in said and "Did you mean" not in said and hasattr(ctx.command, "commands"):
-        said = f"{said} There are {', '.join(ctx.command.commands)}"
-    return said if ctx is None else f"{said.removesuffix('.')}; `{ctx.command_path} -h` explains"
+    elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
+        said = said.removesuffix(".") + meant(unknown[1], ctx.command.commands)
+    elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
+        names = [name for each in ctx.command.params if not getattr(each, "hidden", False) for name in each.opts]
+        said = f"No such option: {option}{nearest(option, names)}"
+    if ctx is None:
+        return said
+    said = re.sub(r"(?<!\.)\.$", "", said)
+    return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
 
 
 def _given_by(said: str) -> str:

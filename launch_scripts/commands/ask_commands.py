@@ -38,8 +38,8 @@ CPU without any query."""
 def route(
     where: Where,
     target: TargetId = None,
-    row: int | None = None,
-    col: int | None = None,
+    row: Annotated[int | None, typer.Option(hidden=True)] = None,
+    col: Annotated[int | None, typer.Option(hidden=True)] = None,
     steps: Annotated[int, typer.Option(min=0)] = 0,
     cost: bool = False,
     terrain: str | None = None,
@@ -52,21 +52,19 @@ def route(
 ) -> None:
     """Find the cheapest route to a target of a running swarm, or on a terrain file.
 
-    swarm route --target t3 --row 40 --col 200
+    swarm route --target t3 --from cell:40,200
 
     swarm route --target t3 --from 36.41,-84.29 --steps 1
 
-    swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
+    swarm route --target t3 --from cell:40,200 --json | jq .routes[0].cost_s
 
     swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
 
     target         The target, such as t3.
-    row            Row of the start, counted from the north.
-    col            Column of the start, counted from the west.
     steps          Most steps to show; 1 is the next, 0 is all.
     cost           Print only the cost, or that no path exists.
     terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
-    start          LAT,LON, xy:X,Y in metres or cell:ROW,COL; instead of --row and --col.
+    start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
     end            With --terrain: the destination, in the same forms as --from.
     vehicle_class  Class of the vehicle.
     out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
@@ -85,9 +83,7 @@ def route(
         raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
     by_cell = row is not None and col is not None
     if target is None or (start is None) == (not by_cell) or end is not None or (cost and out is not None):
-        raise ConfigError(
-            "give --target, --row and --col (or --from) to ask a swarm, or --terrain, --from and --to without one"
-        )
+        raise ConfigError("give --target and --from to ask a swarm, or --terrain, --from and --to without one")
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands import swarm_route
 
@@ -104,7 +100,7 @@ def route(
 
 
 @command(app, ASK)
-def status(where: Where, as_json: AsJson = False) -> None:
+def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
     """Show a running swarm: metrics, processes, targets and alarms.
 
     Without --connect it asks the newest run of this machine that runs, whatever its ports.
@@ -112,16 +108,19 @@ def status(where: Where, as_json: AsJson = False) -> None:
     swarm status
 
     swarm status --json | jq .planners
+
+    watch  Show processes once a second, as `swarm top`.
     """
     from rich.console import Console
 
-    from launch_scripts.commands.status_view import ask_status, print_status, status_fields
+    from launch_scripts.commands.status_view import ask_status, print_status, show_top, status_fields
 
-    told = ask_status(where)
-    if as_json:
-        typer.echo(json.dumps(status_fields(told), indent=2))
+    if watch:
+        show_top(where, each=False, once=False, as_json=as_json)
+    elif as_json:
+        typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:
-        print_status(told, Console(markup=False))
+        print_status(ask_status(where), Console(markup=False))
 
 
 @command(app, ASK)
@@ -153,8 +152,8 @@ def top(
 def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
     """Check if a swarm is ready: exit code 0 if it is, 1 if not, 4 without a reply.
 
-    With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
-    there in a fraction of a second. Otherwise it asks the whole swarm over its router, for two seconds.
+    With --url, put first, it asks the processes of one machine, without a router. Otherwise it asks the whole swarm
+    over its router, for two seconds.
 
     swarm health --url http://127.0.0.1:9464
 

@@ -44,7 +44,8 @@ from swarm.config.input_files import quoted
 from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
-from swarm.errors import ConfigError, writing
+from swarm.errors import ConfigError
+from swarm.files import write_file
 
 app = family_app("A plan, certificates and configurations for several machines.")
 KitName = Literal["systemd", "compose"]
@@ -53,7 +54,7 @@ _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
 _LEAST_SIDE, _MOST_SIDE = 32, 16_384
 """Cells of a side: one tile of marks (`TILE_CELLS`), and the largest terrain that a scenario may have
-(docs/operate/limits.md)."""
+(docs/reference/limits.md)."""
 
 
 @command(app)
@@ -75,11 +76,11 @@ def plan(
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
     An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
-    standbys, run on machines of their own. A second plan into
-    the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
-    archives of machines that it does not have.
+    standbys, run on machines of their own. A second plan
+    into the same folder keeps certificates that neither end soon nor are revoked, and removes archives of machines
+    that it does not have.
 
-    hosts  The machines, in TOML: see docs/deploy.md.
+    hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
     kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
@@ -171,9 +172,9 @@ def size(
 
     Machines are used to 60 % of cores and memory, and links to half. A process that is too small for its load is
     named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
-    and the density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
+    and the density of the scenario `thousand`; see docs/design/measurement.md for the table and its errors.
 
-    Exit code 1 if a process has to do more than one core can.
+    Exit code 1 if a process has to do more than one core can: more machines do not help it.
 
     vehicles   Vehicles.
     targets    Targets, each with a planner.
@@ -245,17 +246,16 @@ def certs(
     makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
     allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
 
-    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
+    swarm role router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
 
-    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
+    swarm role agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
     Copy ca.pem and the two files of a name to the machine where it runs. ca.key stays here: its holder can admit
     any process. Existing certificates are kept while more than a third of their time is left.
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Make certificates that its processes lack or that end soon, too, and replacements for those that it
-              revokes.
+    scenario  Make certificates that its processes lack, that end soon or that it revokes, too.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """
@@ -339,6 +339,5 @@ def zenohd(
         plugins=None if plugins is None else str(plugins.resolve()),
         volume=volume,
     )
-    with writing(out):
-        out.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    write_file(out, (json.dumps(config, indent=2) + "\n").encode())
     print(f"{out}: run `zenohd -c {out}`")

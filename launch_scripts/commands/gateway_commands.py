@@ -1,4 +1,4 @@
-"""`swarm ros2` and `swarm mavlink`: a running swarm meets ROS 2, and vehicles that speak MAVLink."""
+"""`swarm gateway`: a running swarm meets ROS 2, and vehicles that speak MAVLink."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
-from launch_scripts.command_line.declaring import ASK, ORDER, command
+from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.role_commands import check_name
 from launch_scripts.commands.running_swarm import RUNS, Where
 from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from swarm.client import Swarm
     from swarm.config.scenario import NetworkConfig
 
-app = typer.Typer()
+app = family_app("Connect a running swarm to ROS 2, and to vehicles that speak MAVLink.")
 _MOST_ALTITUDE_M = 10_000.0
 """Above what multicopters and small aeroplanes reach: a higher number is a mistake of units."""
 
@@ -41,7 +41,7 @@ class RosSide:
     distribution: str | None = None
 
 
-@command(app, ASK)
+@command(app)
 def ros2(
     where: Where,
     side: RosSide,
@@ -54,11 +54,11 @@ def ros2(
 
     It publishes map, transforms, odometry, plans, targets and markers. ROS need not be installed here.
 
-    swarm ros2 --ros tcp/127.0.0.1:7447
+    swarm gateway ros2 --ros tcp/127.0.0.1:7447
 
-    swarm ros2 gateway.toml --run LAST
+    swarm gateway ros2 gateway.toml --run LAST
 
-    swarm ros2 --list
+    swarm gateway ros2 --list
 
     settings  A .toml file: topics, rates, names, both sides.
     vehicles  Ids of published vehicles, with * and ?; may be given several times.
@@ -155,7 +155,7 @@ class Vehicle:
     group        Whose it is.
     radius       Metres around it that others keep clear.
     sysid        Its MAVLink system; if not given, the first autopilot.
-    lost_after   Seconds without a heartbeat or a position, after which it is left to its own fail-safe.
+    lost_after   Seconds without heartbeat or position, after which it is left to its fail-safe.
     signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
     """
 
@@ -168,7 +168,7 @@ class Vehicle:
     signing_key: Path | None = None
 
 
-@command(app, ORDER)
+@command(app)
 def mavlink(
     link: Annotated[str, typer.Argument(metavar="LINK")], where: Where, drives: Drives, vehicle: Vehicle
 ) -> None:
@@ -177,11 +177,11 @@ def mavlink(
     The swarm's vehicles avoid it. With --target it follows the swarm's routes to that target. It is armed, and its
     mode is set, with --arm only. One process for each vehicle; docs/mavlink.md has the rest.
 
-    swarm mavlink udpin:127.0.0.1:14540
+    swarm gateway mavlink udpin:127.0.0.1:14540
 
-    swarm mavlink udpin:127.0.0.1:14540 --target t0 --arm
+    swarm gateway mavlink udpin:127.0.0.1:14540 --target t0 --arm
 
-    swarm mavlink serial:/dev/ttyACM0:57600 --target t0 --drive guided --class drone --altitude 60
+    swarm gateway mavlink serial:/dev/ttyACM0:57600 --target t0 --drive guided --class drone --altitude 60
 
     link  udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
     """

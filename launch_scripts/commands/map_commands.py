@@ -1,4 +1,4 @@
-"""`swarm map`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
+"""`swarm marks`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import BusError, StoreError, writing
+from swarm.errors import BusError, StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.runtime.operator import replies_to
@@ -58,10 +59,10 @@ def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[Ma
 
 
 @command(app)
-def inspect(store: Store, as_json: AsJson = False) -> None:
+def show(store: Store, as_json: AsJson = False) -> None:
     """Show the marks in a store, by author.
 
-    swarm map inspect runs/LAST/map.sqlite
+    swarm marks show runs/LAST/map.sqlite
     """
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
@@ -106,7 +107,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if found["authors_that_learned"]:
-        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm map learned {store}")
+        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm marks factors {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
@@ -119,9 +120,9 @@ def export(store: Store, out: Path) -> None:
     JSON holds all marks and learned factors, and can be imported. Other formats hold the winning marks as pixels or
     polygons.
 
-    swarm map export runs/LAST/map.sqlite marks.json
+    swarm marks export runs/LAST/map.sqlite marks.json
 
-    swarm map export runs/LAST/map.sqlite marks.gpkg
+    swarm marks export runs/LAST/map.sqlite marks.gpkg
 
     out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
@@ -134,16 +135,15 @@ def export(store: Store, out: Path) -> None:
         shown = [each for each in sets if each.tile < grid.tiles]
         own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
         left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
-    with writing(out):
-        if ending in _TEXT:
-            with KeeperStore(store, read_only=True) as kept:
-                classes = kept.classes
-            out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
-        elif ending in _PIXELS:
-            _write_tiff(out, terrain, grid, sets)
-        else:
-            pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
-            write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
+    if ending in _TEXT:
+        with KeeperStore(store, read_only=True) as kept:
+            classes = kept.classes
+        write_file(out, stored_marks.to_json(terrain, grid, sets, classes).encode())
+    elif ending in _PIXELS:
+        _write_tiff(out, terrain, grid, sets)
+    else:
+        pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+        write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     print(f"{out}: {_counted(grid, shown)}{left_out}")
 
 
@@ -157,9 +157,9 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
 def import_(file: Path, store: Path) -> None:
     """Import exported marks into a store, which no keeper uses.
 
-    swarm map import marks.json my.sqlite
+    swarm marks import marks.json my.sqlite
 
-    file   A .json file of `swarm map export`.
+    file   A .json file of `swarm marks export`.
     store  The store; made if missing.
     """
     terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
@@ -170,7 +170,7 @@ def import_(file: Path, store: Path) -> None:
 
 
 @command(app)
-def learned(
+def factors(
     where: Where,
     store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
@@ -179,9 +179,9 @@ def learned(
 
     A row has driven over prior pace, and the factor on the prior (map.learning).
 
-    swarm map learned
+    swarm marks factors
 
-    swarm map learned runs/LAST
+    swarm marks factors runs/LAST
 
     store  A keeper's store, or the folder of its run; if not given, the running swarm is asked.
     """

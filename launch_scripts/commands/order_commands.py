@@ -1,4 +1,4 @@
-"""Orders to a running swarm: `pause`, `resume`, `group`, `set`, `orders`, `target` and `vehicle stop|go`.
+"""`swarm order`: pauses a running swarm, and changes its groups, settings and targets.
 
 Each is one `GiveOrder`, made of a subject and the fields that its command has read (`give`). A keeper stores the
 orders in force, and each process acknowledges them.
@@ -16,114 +16,133 @@ from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import ORDER, command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, Walk
+from swarm.config.explain import choice, explain
+from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from swarm.runtime.operator import Acknowledged
     from swarm.wire.messages import Message
 
 M = TypeVar("M", bound="Message")
-app = typer.Typer()
+app = family_app("Pause a running swarm, change its settings, zones, targets and vehicles.")
+short = typer.Typer()
+"""The commands which are also called without their family."""
 target_app = family_app("Add, move and remove simulated targets while the swarm runs.")
-
+Key = Annotated[
+    str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
+]
 Id = Annotated[
     str, typer.Argument(metavar="ID", help="The target, such as t3.", autocompletion=complete.target_ids)
 ]
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
-Vehicles = Annotated[
-    list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.", autocompletion=complete.vehicle_ids)
-]
+AsScenario = Annotated[bool, typer.Option(hidden=True)]
 
 
-@command(app, ORDER)
+@command(short, ORDER)
+@command(app)
 def pause(where: Where, as_json: AsJson = False) -> int:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
     Vehicles drive to the middle of the cell that they are entering and stop there. Planners go on planning.
+
+    swarm order pause
 
     swarm pause
     """
     return give(where, as_json, {"subject": "pause"})
 
 
-@command(app, ORDER)
+@command(short, ORDER)
+@command(app)
 def resume(where: Where, as_json: AsJson = False) -> int:
     """Resume all vehicles and targets after a pause.
+
+    swarm order resume
 
     swarm resume
     """
     return give(where, as_json, {"subject": "pause", "off": True})
 
 
-@command(app, ORDER)
+@command(app)
 def group(
     name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
     where: Where,
     targets: Annotated[
-        list[str] | None, typer.Argument(metavar="[targets] TARGET...", autocompletion=complete.target_ids)
+        list[str] | None, typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)
     ] = None,
-    as_scenario: bool = False,
+    as_scenario: AsScenario = False,
     as_json: AsJson = False,
 ) -> int:
     """Set the targets that the vehicles of a group may chase.
 
-    swarm group red targets t1 t2
+    swarm order group red t1 t2
 
-    swarm group red --as-scenario
-
-    name         The group.
-    targets      The targets that it may chase.
-    as_scenario  The targets of the scenario.
+    name     The group.
+    targets  The targets that it may chase.
     """
-    from swarm.errors import ConfigError
-
     chosen = list(targets or ())
     if chosen[:1] == ["targets"]:
         chosen = chosen[1:]
     if as_scenario == bool(chosen):
-        raise ConfigError("group: give either targets or --as-scenario")
+        raise ConfigError(f"group: give targets; `swarm order unset groups.{name}` restores those of the scenario")
     return give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
 
 
-@command(app, ORDER, "set")
+@command(app, name="set", context_settings={"ignore_unknown_options": True})  # a number below 0 is no option
 def set_(
-    key: Annotated[
-        str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
-    ],
+    key: Key,
     where: Where,
     value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
-    as_scenario: bool = False,
+    as_scenario: AsScenario = False,
     as_json: AsJson = False,
 ) -> int:
     """Change a setting of a running swarm.
 
     Keys: time_scale, vehicles.reassign_s, planner.cpu_budget, planner.push_s.
 
-    swarm set time_scale 5
+    swarm order set time_scale 5
 
-    swarm set time_scale --as-scenario
-
-    key          A key of the scenario, such as time_scale.
-    value        Its new value.
-    as_scenario  The value in the scenario.
+    key    A key of the scenario, such as time_scale.
+    value  Its new value.
     """
-    from swarm.config.explain import choice
-    from swarm.errors import ConfigError
-    from swarm.runtime.order_book import SETTINGS
-
+    _check_setting(key)
     if as_scenario == (value is not None):
-        raise ConfigError("set: give either a value or --as-scenario")
-    if key not in SETTINGS:
-        raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
+        raise ConfigError(f"set: give a value; `swarm order unset {key}` restores that of the scenario")
     return give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
 
 
-@command(app, ORDER)
-def orders(where: Where, as_json: AsJson = False) -> None:
-    """Print the orders in force. Zones are in `swarm zone list`.
+@command(app)
+def unset(key: Key, where: Where, as_json: AsJson = False) -> int:
+    """Restore a setting, or the targets of a group, to that of the scenario.
 
-    swarm orders --json
+    swarm order unset time_scale
+
+    swarm order unset groups.red
+
+    key  A setting, or groups. and the name of a group.
+    """
+    section, _, name = key.partition(".")
+    if section == "groups":
+        return give(where, as_json, {"subject": "group", "name": name, "off": True})
+    _check_setting(key)
+    return give(where, as_json, {"subject": "set", "name": key, "off": True})
+
+
+def _check_setting(key: str) -> None:
+    from swarm.runtime.order_book import SETTINGS
+
+    if key not in SETTINGS:
+        raise ConfigError(f"{key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
+
+
+@command(app, name="ls")
+def list_orders(where: Where, as_json: AsJson = False) -> None:
+    """Print the orders in force. Zones are in `swarm order zone ls`.
+
+    swarm order ls --json
     """
     import msgspec
 
@@ -152,9 +171,9 @@ def add(
 ) -> int:
     """Add a target. A launcher starts its planner; groups that may chase every target chase it.
 
-    swarm target add x --at 36.41,-84.29 --walk evade
+    swarm order target add x --at 36.41,-84.29 --walk evade
 
-    swarm target add x --at cell:40,200
+    swarm order target add x --at cell:40,200
 
     walk   still, random, waypoints or evade, as in a scenario.
     speed  Metres per second on level open ground.
@@ -167,7 +186,7 @@ def add(
 def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> int:
     """Move a target to another cell; it goes on from there.
 
-    swarm target move t3 --at cell:40,200
+    swarm order target move t3 --at cell:40,200
     """
     return give(where, as_json, {"subject": "target", "name": id}, at=at)
 
@@ -176,25 +195,9 @@ def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> int:
 def remove(id: Id, where: Where, as_json: AsJson = False) -> int:
     """Remove a target. Its planner ends, and the vehicles that chased it chase others.
 
-    swarm target remove t3
+    swarm order target remove t3
     """
     return give(where, as_json, {"subject": "target", "name": id, "off": True})
-
-
-def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
-    """Stop vehicles in the middle of their cells until `swarm vehicle go`. Others drive around them.
-
-    swarm vehicle stop a0-03 a0-04
-    """
-    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
-
-
-def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
-    """Start stopped vehicles again.
-
-    swarm vehicle go a0-03
-    """
-    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
 
 
 # --- how an order is given --------------------------------------------------------------------------------------
@@ -208,6 +211,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     """
     import msgspec
 
+    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
     from swarm.runtime.operator import Operator
@@ -226,7 +230,8 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
                 cell = cell_of(place, frame, "--at")
                 order = msgspec.structs.replace(order, cell=cell)
                 said = {"at": fields_of(frame, cell)}
-            given, acknowledged = Operator(bus).give(order)
+            with progress("waiting until all processes obey"):
+                given, acknowledged = Operator(bus).give(order)
             told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
             printed.append({"given": msgspec.to_builtins(given), **told, **said})
             silent |= bool(acknowledged.silent)
@@ -243,8 +248,6 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
     import msgspec
 
-    from swarm.config.explain import explain
-    from swarm.errors import ConfigError
     from swarm.wire.versions import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}
@@ -259,9 +262,13 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
 def print_obeyed(acknowledged: Acknowledged) -> int:
     """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
+    from launch_scripts.plain_text import unanswered
+    from swarm.runtime.operator import OBEY_S
+
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
     typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
     if acknowledged.silent:
-        names = ", ".join(acknowledged.silent)
-        typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)
+        asked = len(acknowledged.silent) + len(acknowledged.obeyed)
+        said = unanswered(acknowledged.silent, asked, OBEY_S)
+        typer.echo(f"{said}; they obey as soon as they hear a keeper", err=True)
     return int(bool(acknowledged.silent))

@@ -1,4 +1,4 @@
-"""`swarm plugins`: which plug-ins there are, and whether one keeps what its kind promises."""
+"""`swarm plugin`: which plug-ins there are, and whether one keeps what its kind promises."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from swarm.errors import ConfigError
 app = family_app("List plug-ins, and check one of your own.")
 
 
-@command(app, name="list")
+@command(app, name="ls")
 def list_plugins() -> None:
     """List plug-ins by kind: built-in ones, and those of installed packages.
 
-    swarm plugins list
+    swarm plugin ls
     """
     for kind in PLUGIN_KINDS.values():
         typer.echo(f"{kind.name} ({kind.group})")
@@ -43,7 +43,7 @@ def check(
 ) -> int:
     """Test a plug-in against the contract of its kind. This runs its code.
 
-    swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
+    swarm plugin check sensor camera:Camera --options '{"misses": 0.5}'
 
     kind     sensor, walk, cost_layer, assignment, strategy or dynamics.
     name     Name as in a scenario: module:Name, or that of an installed plug-in.

@@ -1,4 +1,4 @@
-"""`swarm compare`, `report`, `export` and `replay`: what runs have left."""
+"""`swarm runs compare`, `report`, `export` and `replay`: what runs have left."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import LEFT, command
+from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
 from launch_scripts.plain_text import plain
 from swarm.config.explain import choice
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from launch_scripts.report.compare import LeftRun
     from launch_scripts.simulation.replay import Replayed
 
-app = typer.Typer()
+app = family_app("Compare, export and replay finished runs, and write their reports again.")
 RunArgument = Annotated[
     str,
     typer.Argument(
@@ -34,7 +34,7 @@ _SHOWN = 300
 """Characters of an output."""
 
 
-@command(app, LEFT)
+@command(app)
 def compare(
     run: Annotated[list[str], typer.Argument(metavar="RUN...", autocompletion=complete.runs)],
     runs: Runs = Path("runs"),
@@ -44,7 +44,7 @@ def compare(
 
     Endpoints of a run are left out: free ports differ each time.
 
-    swarm compare 20261122-154115-44bb LAST
+    swarm runs compare 20261122-154115-44bb LAST
 
     run  Folders of runs, or their names in --runs.
     """
@@ -104,14 +104,13 @@ def _left(name: str, runs: Path) -> LeftRun:
     return LeftRun(folder.resolve().name, report, settings)
 
 
-@command(app, LEFT)
+@command(app)
 def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
     """Write the report of a run again: report.html, one file for any browser.
 
-    It has the run's metrics and their meaning, its map, plots over time, tables per target, group and vehicle, the
-    scenario as it ran, machine and versions. Every run writes it at its end.
+    It has metrics, map, plots, tables, the scenario as it ran, machine and versions. Every run writes it.
 
-    swarm report LAST
+    swarm runs report LAST
     """
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_page import write_page
@@ -119,7 +118,7 @@ def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
     typer.echo(write_page(find_run(run, runs)))
 
 
-@command(app, LEFT)
+@command(app)
 def export(
     run: RunArgument = "LAST",
     what: Annotated[
@@ -127,11 +126,10 @@ def export(
         typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "WHAT")),
     ] = None,
     format: Annotated[
-        str, typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "ENDINGS"))
-    ] = "geojson",
+        str | None, typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "ENDINGS"))
+    ] = None,
     out: Path | None = None,
     force: bool = False,
-    mcap: bool = False,
     runs: Runs = Path("runs"),
 ) -> None:
     """Export a run for a GIS, a spreadsheet or Foxglove.
@@ -140,54 +138,60 @@ def export(
     their certified gaps, and marks as areas of equal kind and pace. GeoJSON and the columns lat and lon of CSV are
     in WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
 
-    swarm export LAST
+    swarm runs export LAST
 
-    swarm export LAST --format gpkg --what tracks --what marks
+    swarm runs export LAST --out run.gpkg --what tracks --what marks
 
-    swarm export LAST --mcap
+    swarm runs export LAST --format mcap
 
     what    tracks, targets, captures, routes or marks; may be given several times; all by default.
-    format  geojson, csv or gpx, a file per layer; gpkg or kml, one file with all layers.
-    out     Folder to write to; by default export/ in the run's folder.
+    format  geojson, csv or gpx: a file per layer; gpkg or kml: one file; mcap: ROS 2 messages.
+    out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     force   Replace files that are there.
-    mcap    Write a recording with ROS 2 messages instead, for Foxglove.
     """
+    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
-    for option, given, allowed in (("--what", what or (), tuple(WHAT)), ("--format", [format], ENDINGS)):
+    ending = "" if out is None or out.is_dir() else out.suffix.lower().removeprefix(".")
+    chosen = format or (ending if ending in ENDINGS else ENDINGS[0])
+    for option, given, allowed in (("--what", what or (), tuple(WHAT)), ("--format", [chosen], ENDINGS)):
         for each in given:
             if each not in allowed:
                 raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
+    if ending in ENDINGS and ending != chosen:
+        raise ConfigError(f"--format: found {chosen!r} with --out {out}, expected {ending!r}, or a folder")
     folder = find_run(run, runs)
-    if mcap:
-        from launch_scripts.report.mcap_export import export_mcap
+    with progress(f"exporting {folder}"):
+        if chosen == "mcap":
+            from launch_scripts.report.mcap_export import export_mcap
 
-        typer.echo(export_mcap(folder, out, force))
-        return
-    for line in export_run(folder, what or (), format, out, force):
+            lines = [export_mcap(folder, out, force)]
+        else:
+            lines = export_run(folder, what or (), chosen, out, force)
+    for line in lines:
         typer.echo(line)
 
 
-@command(app, LEFT)
+@command(app)
 def replay(
     run: RunArgument = "LAST",
     process: str | None = None,
-    until: Annotated[float | None, typer.Option(min=0)] = None,
+    until_s: Annotated[float | None, typer.Option(min=0)] = None,
     keep: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> int:
     """Replay recorded inputs of a run, and report the first output that differs.
 
-    swarm demo --record-inputs, then swarm replay
+    swarm demo --record-inputs, then swarm runs replay
 
-    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
+    swarm runs replay LAST --process planner-t3 --until-s 34.5 --keep my-case
 
     A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
 
     process  Only this process, such as planner-t3.
-    until    Stop at this time (s) of the run's own clock.
+    until_s  Stop at this time (s) of the run's own clock.
     keep     Copy the replayed files into a folder: a test case.
     """
     from launch_scripts.observe.run_folder import find_run
@@ -198,7 +202,7 @@ def replay(
     folder = find_run(run, runs)
     if keep is not None:
         for recorded in recordings_of(folder, process):
-            typer.echo(f"kept {keep_recorded(recorded, keep, until)}", err=as_json)
+            typer.echo(f"kept {keep_recorded(recorded, keep, until_s)}", err=as_json)
         folder = keep
     refused = unreadable(folder, process)
     others = {
@@ -209,7 +213,7 @@ def replay(
             typer.echo(f"recorded with {package} {then}, replayed with {now}")
         typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
     rows: list[Replayed] = []
-    for row in replay_run(folder, process, until):
+    for row in replay_run(folder, process, until_s):
         rows.append(row)
         if not as_json:
             typer.echo("\n".join(map(plain, _lines(row))))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 
 from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import ROLE, command
+from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     LogFormatOption,
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from swarm.runtime.health import Health
     from swarm.wire.messages.processes import RunInfo
 
-app = typer.Typer()
+app = family_app("Run one process of a swarm, by hand, on any machine.")
 
 
 @dataclass(frozen=True)
 class Place(Tls):
     """Locations of a process's scenario, router and files.
 
-    connect      The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.
+    connect      The router's endpoint, such as tls/HOST:7447; by default that of the run.
     health_port  Answer probes on this port, at /healthz and /readyz; 0 picks one.
     """
 
@@ -74,13 +74,13 @@ class Joins:
     at: str | None
 
 
-@command(app, ROLE)
+@command(app)
 def router(place: Place, listen: str | None = None, id: str = "0") -> None:
     """Run the Zenoh router of a swarm. `--connect` links it to another router.
 
-    With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
+    With certificates, each process may do what its name allows and nothing else: see docs/operate/access.md.
 
-    swarm router my.toml --listen tcp/127.0.0.1:7447
+    swarm role router my.toml --listen tcp/127.0.0.1:7447
 
     listen  Endpoint to listen at, such as tls/0.0.0.0:7447.
     id      Router id. Needed only with several linked routers.
@@ -88,13 +88,13 @@ def router(place: Place, listen: str | None = None, id: str = "0") -> None:
     run_role("router", id, place, listen=listen)
 
 
-@command(app, ROLE)
+@command(app)
 def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str = "0") -> None:
     """Store the marks of the shared map on disk.
 
     It also serves the terrain to machines without its files. Several keepers hold the same marks:
 
-    swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
+    swarm role keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
 
     store    The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.
     rebuild  Move a damaged store aside and fill a new one from the swarm.
@@ -103,13 +103,13 @@ def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str
     run_role("keeper", id, part, store_path=store, rebuild=rebuild)
 
 
-@command(app, ROLE)
+@command(app)
 def planner(
     target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, rank: Rank = 0
 ) -> None:
     """Run the planner of one target, or a standby of it.
 
-    swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+    swarm role planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert . --tls-key .
 
     target  The target whose tree this planner keeps, such as t0.
     rank    0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
@@ -117,33 +117,33 @@ def planner(
     run_role("planner", ranked_id(target, rank), part)
 
 
-@command(app, ROLE)
+@command(app)
 def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part) -> None:
     """Drive the vehicles of one agent process.
 
-    swarm agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
+    swarm role agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
 
     id  Agent id, such as a0, which selects its part of the vehicles.
     """
     run_role("agent", id, part)
 
 
-@command(app, ROLE)
+@command(app)
 def targets(part: Part, rank: Rank = 0) -> None:
     """Move the simulated targets and count collisions, or stand by.
 
-    swarm targets jacksboro --rank 1
+    swarm role targets jacksboro --rank 1
 
     rank  0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
     run_role("targets", ranked_id("0", rank), part)
 
 
-@command(app, ROLE)
+@command(app)
 def monitor(part: Part) -> None:
     """Record a run and serve its live view.
 
-    swarm monitor jacksboro --connect tcp/127.0.0.1:7447
+    swarm role monitor jacksboro --connect tcp/127.0.0.1:7447
     """
     run_role("monitor", "0", part)
 

@@ -17,8 +17,9 @@ app = typer.Typer()
 def demo(run: RunOptions) -> int:
     """Run the built-in example: 99 rovers and a drone chase 10 targets.
 
-    The same as `swarm up demo`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
-    report.html, report.json, report.png and a log file per process.
+    The same as `swarm up demo`. Ends a minute after the swarm is whole, or later, once no live view is open any
+    more; after --seconds in any case; or on Ctrl-C. Leaves runs/RUN/ with run.rrd, report.html, report.json,
+    report.png and a log file per process.
 
     swarm demo --seconds 20 --port 0
     """
@@ -36,8 +37,6 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
     swarm up my.toml --only router.1 --only planner.t3 --only planner.t0.r1 --only agent
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
-
-    swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
     if run.detach:
         from launch_scripts.commands.runs_commands import in_background
@@ -91,6 +90,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
             began_s=_began_s(),
             record_inputs=run.record_inputs,
             takes_over=part.take_over,
+            stays_watched=scenario == "demo" and run.seconds is None,
         )
     )
 

@@ -36,8 +36,8 @@ _NAMED = 3
 class Where(Tls):
     """Router, namespace and certificates of the swarm that a command asks.
 
-    connect    The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447.
-    namespace  Prefix of all keys; if not given, that of the run, or `swarm`.
+    connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
+    namespace  Prefix of all keys: runs in different ones do not meet.
     run        The run to ask, where several run here: its name, or its folder.
     runs       Look in this folder only; if not given, all of your runs on this machine are found.
     """

@@ -195,16 +195,16 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
 def in_background(*, as_json: bool) -> int:
     """Runs this command again in the background, without `-d`. Returns once the swarm is whole, or else the exit
     code of the command. Raises ConfigError or StoreError if the run could not be found later."""
-    from launch_scripts.observe.run_folder import can_write
     from launch_scripts.observe.run_registry import registered, registry
     from swarm.errors import ConfigError, StoreError
+    from swarm.files import check_writable
 
     if as_json:
         raise ConfigError("--json prints the report at the end, and --detach does not wait for it")
     try:
         registry().mkdir(parents=True, exist_ok=True)
-        can_write(registry())
-    except (OSError, RuntimeError) as error:
+        check_writable(registry())
+    except (OSError, RuntimeError, StoreError) as error:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
     words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
     words = [word for word in words if word not in ("-d", "--detach")]

@@ -23,7 +23,8 @@ from launch_scripts.commands.shared_options import (
     Seconds,
     Walk,
 )
-from swarm.errors import BusError, ConfigError, SwarmError, writing
+from swarm.errors import BusError, ConfigError, SwarmError
+from swarm.files import write_file
 
 if TYPE_CHECKING:
     from launch_scripts.check.findings import Finding
@@ -105,8 +106,7 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
     if is_terminal():
         choices = _asked(file, choices)
     text = _text(file, choices)
-    with writing(file), file.open("x", encoding="utf-8") as opened:
-        opened.write(text)
+    write_file(file, text.encode())
     typer.echo(f"{file} is written; `swarm check {file}` looks at it, `swarm up {file}` runs it")
 
 

@@ -40,7 +40,7 @@ Namespace = Annotated[
     str | None,
     from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet."),
 ]
-Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder in which each run gets a folder of its own.")]
+Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder of the runs of this machine.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
@@ -104,7 +104,7 @@ class RunOptions:
     seconds        How long the run lasts once the swarm is up.
     seed           Seed of everything random.
     no_live        Serve no live view. The run is recorded all the same.
-    record_inputs  Record what every process hears, so that `swarm replay` can repeat it.
+    record_inputs  Record what every process hears, so that `swarm runs replay` can repeat it.
     metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
     follow         The camera follows this vehicle or target, as a0-07.
     plain          Plain lines instead of the live table.
@@ -145,12 +145,10 @@ class Meeting(Tls):
 class SomeProcesses:
     """Part of a swarm that a launcher starts, and its run.
 
-    only       Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.
-    rank       Of planners and the targets process, start those of this rank: 0 leads, 1 is the first standby, and
-               so on.
+    only       Start only this role or process: planner, planner.t0.r1; may be given several times.
+    rank       Start planners and targets processes of this rank only; 0 leads, 1 is the first standby.
     run_id     Take part in this run; by default a new one, or the one in the namespace.
-    take_over  Take over from the launcher that runs this part of the run here, as for an upgrade: it is ended once
-               successors are ready.
+    take_over  Take over from the launcher that runs this part here, as for an upgrade.
     """
 
     panel: ClassVar[str | None] = PART

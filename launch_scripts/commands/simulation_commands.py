@@ -1,4 +1,4 @@
-"""`swarm simulate` and `swarm sweep`: a swarm in one process, with many seeds, and over many machines."""
+"""`swarm simulate` and `swarm study`: a swarm in one process, with many seeds, and over many machines."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.command_line.declaring import RUN, command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
-from swarm.errors import ConfigError, StoreError, writing
+from swarm.errors import ConfigError, StoreError
+from swarm.files import writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from launch_scripts.simulation.study.trials import Result, Trial
 
 app = typer.Typer()
+study_app = family_app("Run scenarios with many settings and seeds, on many processes and machines.")
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
 _SHOWN_FAILURES = 20
 """Commands that replay a failure. A terminal of 24 lines shows this number and the last sentence; results.parquet
@@ -52,17 +54,15 @@ def simulate(
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
-    With --seeds, processes crash and hang, links are cut, also one way, clocks are set, agents run twice, messages
-    are lost, late, repeated and out of order. Exit code 1 if a law broke in any seed: a collision, a lethal entry,
-    an acknowledged mark lost, replicas that differ, a wait of ten seconds without a reason, a vehicle without a
-    route.
+    With --seeds, processes crash and hang, links are cut, clocks are set, messages are lost, late and repeated.
+    Without a name each seed takes the next of the small worlds. Exit code 1 if a law broke in any seed, such as by
+    a collision, a lost mark or a vehicle without a route.
 
     swarm simulate --seeds 0:100 --jobs 2
 
     swarm simulate doors --seeds 17:18
 
-    scenario  A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, corridor,
-              maze. With --seeds and without a name each seed takes the next of these worlds.
+    scenario  A .toml file or a built-in name; with --seeds also small, wide, open, doors, corridor or maze.
     seed      Seed of everything random.
     seeds     Try the seeds A to B - 1, each with faults of every kind.
     seconds   Simulated seconds.
@@ -86,7 +86,7 @@ def _simulate_once(
     import msgspec
 
     from launch_scripts.check.scenario_check import check_places
-    from launch_scripts.launcher.console import Terminal
+    from launch_scripts.launcher.console import Terminal, progress
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
@@ -113,7 +113,8 @@ def _simulate_once(
         folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")
-        result = run_to_end(done)
+        with progress() as tell:
+            result = run_to_end(done, tell)
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))
@@ -192,8 +193,8 @@ def _total(verdicts: Sequence[Verdict], wall_s: float) -> dict[str, Any]:
     }
 
 
-@command(app, RUN)
-def sweep(
+@command(study_app)
+def run(
     study: Annotated[str, typer.Argument(metavar="STUDY", autocompletion=complete.studies)],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
@@ -206,9 +207,9 @@ def sweep(
     also with other seeds or settings, runs only the missing trials. Exit code 1 if a law broke in any trial. It
     needs the extra "sweep" (Dask, pyarrow).
 
-    swarm sweep study.toml
+    swarm study run study.toml
 
-    swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
+    swarm study run study.toml --scheduler tcp://127.0.0.1:8786 --out results
 
     study      A .toml file with scenarios, settings and seeds, or a built-in name.
     scheduler  An existing cluster of Dask, such as tcp://127.0.0.1:8786.

@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.console import make_output_outlive_readers
+from launch_scripts.launcher.console import Tell, make_output_outlive_readers, progress
 from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
@@ -27,7 +27,7 @@ from launch_scripts.observe.run_observer import OutsideObserver, frame_of_member
 from launch_scripts.observe.run_registry import pids_of
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import gaps_to
-from launch_scripts.plain_text import plain
+from launch_scripts.plain_text import plain, unanswered
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
 from swarm.clock import NS_PER_S, MonotonicClock
@@ -66,16 +66,27 @@ class Status:
     pids: dict[str, int]
 
     @property
+    def silent(self) -> list[str]:
+        """Processes that the run needs, or that are alive, and have not answered."""
+        latest = self.latest
+        expected = dict.fromkeys((*latest.plan.crew_now(latest.plan.targets_now(latest.book)), *latest.up()))
+        answered = {(info.role, info.id) for info in (*self.members, *self.strangers)}
+        return [f"{role}-{id}" for role, id in expected if (role, id) not in answered]
+
+    @property
     def state(self) -> RunState:
         return state_of(self.latest, self.now_ns)
 
 
-def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObserver:
+def observed(
+    bus: Bus, where: Where, least_s: float = _LISTEN_S, tell: Tell = lambda what, share: None
+) -> OutsideObserver:
     """Context of an observer that has received the state of all processes which reply in time. Raises BusError if
     no process replies."""
     clock, observer = MonotonicClock(), OutsideObserver(bus)
     began_s = time.monotonic()
     while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
+        tell(f"asking the swarm: {len(observer.answers)} processes have answered", spent_s / _MOST_S)
         observer.listen(clock, 0.1)
     if observer.latest is None:
         admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
@@ -85,8 +96,8 @@ def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObser
 
 def ask_status(where: Where) -> Status:
     """A running swarm as it is now. Raises BusError if no process replies."""
-    with where.bus() as bus:
-        return status_of(observed(bus, where), MonotonicClock().now_ns())
+    with progress(f"asking the swarm {where}") as tell, where.bus() as bus:
+        return status_of(observed(bus, where, tell=tell), MonotonicClock().now_ns())
 
 
 def status_of(observer: OutsideObserver, now_ns: int) -> Status:
@@ -113,6 +124,8 @@ def print_status(status: Status, console: Console) -> None:
             say(f"terrain: {extent_of(frame, 'latlon')}")
         for line in facts.lines(state):
             say(line)
+    if silent := status.silent:
+        say(unanswered(silent, len(silent) + len(status.members), _MOST_S), "yellow")
     console.print(_processes(status))
     if (spoken := _wire_versions(status)) is not None:
         say(spoken)
@@ -197,6 +210,7 @@ def status_fields(status: Status) -> dict[str, Any]:
         "planners": [planner_fields(planner) for _, planner in sorted(latest.status.items())],
         "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(latest).items()},
         "orders": list(status.state.orders),
+        "silent": status.silent,
         "strangers": [f"{info.role}-{info.id}" for info in status.strangers],
     }
 

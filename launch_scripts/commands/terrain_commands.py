@@ -34,7 +34,8 @@ from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
 from swarm.config.write import toml_value
-from swarm.errors import ConfigError, writing
+from swarm.errors import ConfigError
+from swarm.files import replacing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -42,16 +43,13 @@ if TYPE_CHECKING:
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
-    See what a file holds, what a scenario costs on it, what a photo shows;
-    correct the scenario, and look again. Without files: synth, jacksboro.
-
     swarm terrain info dem.tif
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
     swarm terrain rules --picture rules.png
-    swarm terrain synth --out dem.tif --photo photo.tif
+    swarm terrain generate --out dem.tif --photo photo.tif
 
-    Where to get an elevation model, and the rule for cost: docs/terrain.md.
+    Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()
 _TIFF = (".tif", ".tiff")
@@ -82,8 +80,8 @@ def info(
     these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
     Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
     ROS map_server .yaml or .yml, and .png with --resolution-m and
-    --height-scale. The lines after the table state the processing steps of the file, and notes about it; those with
-    a ! look wrong. Costs are those of the scenario, of a file those of an empty one or of a preset.
+    --height-scale. Lines after the table
+    state processing steps and notes; those with a ! look wrong.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
@@ -177,9 +175,8 @@ def cost(
         seconds = time.perf_counter() - started
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
-            write_raster(
-                out, [pace], terrain.grid, descriptions=["pace, seconds per metre; -1 lethal"], nodata=-1.0
-            )
+            bands = ["pace, seconds per metre; -1 lethal"]
+            write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", nodata=-1.0)
             tell("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
     _draw(terrain, picture, name)
@@ -224,7 +221,7 @@ def rules(
 
 
 @command(app)
-def synth(
+def generate(
     out: Annotated[Path, typer.Option()],
     rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
     cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
@@ -238,7 +235,7 @@ def synth(
 ) -> None:
     """Make a synthetic landscape: mountains, rivers, forest, roads.
 
-    swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
+    swarm terrain generate --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
 
     out           Write the heights: .tif (in UTM 32) or .npz.
@@ -269,8 +266,8 @@ def synth(
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix.lower() == ".npz":
-        with writing(out):
-            np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
+        with replacing(out) as half:
+            np.savez_compressed(half, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
     else:
         write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
@@ -293,9 +290,8 @@ def reach(
     """Compute the driving time to a location from everywhere, as GeoTIFF or areas.
 
     With --from: the corridor of near-optimal paths between two locations. Each of
-    its cells has the time of a good path that passes it, which can be driven
-    and may take a little longer than the best one there; areas state the
-    seconds lost against the best path of all.
+    its cells has the time of a good path
+    that passes it; areas state the seconds lost against the best path.
 
     swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300

@@ -357,7 +357,8 @@ def write_reach(found: Reach, path: Path, every_s: float) -> None:
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        write_raster(path, [seconds], found.grid, descriptions=["seconds of driving, -1 no way"], nodata=-1.0)
+        told, tags = ["seconds of driving, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
+        write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
     many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
     if many > _MOST_BANDS:

@@ -1,4 +1,4 @@
-"""`swarm vehicle`: vehicles join a running swarm, leave it, stop and go."""
+"""`swarm order vehicle`: vehicles join a running swarm, leave it, stop and go."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
-from launch_scripts.commands.order_commands import go, stop
+from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Joins, Part, run_role
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, GroupName
@@ -38,8 +38,27 @@ _AGAIN_S, _ANSWERS_S = 0.2, 1.0
 """Waits between two questions, and for the answer to one. An agent takes several ticks of 0.1 s to give cells back,
 and one that is silent for a second is asked five times within `_WITHIN_S`."""
 app = family_app("Let vehicles join a running swarm and leave it; stop vehicles, and let them go again.")
-command(app)(stop)
-command(app)(go)
+Vehicles = Annotated[
+    list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.", autocompletion=complete.vehicle_ids)
+]
+
+
+@command(app)
+def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
+    """Stop vehicles in the middle of their cells until `swarm order vehicle start`. Others drive around them.
+
+    swarm order vehicle stop a0-03 a0-04
+    """
+    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
+
+
+@command(app)
+def start(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
+    """Start stopped vehicles again.
+
+    swarm order vehicle start a0-03
+    """
+    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
 
 
 @command(app)
@@ -55,7 +74,7 @@ def add(
     They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
     process is killed they stay where they are; the same command finds them again.
 
-    swarm vehicle add my.toml --group all --count 5 --at 36.41,-84.29
+    swarm order vehicle add my.toml --group all --count 5 --at 36.41,-84.29
 
     group  The group of the scenario to which they belong.
     count  How many vehicles.
@@ -77,7 +96,7 @@ def remove(
 
     An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
 
-    swarm vehicle remove extra a0-03
+    swarm order vehicle remove extra a0-03
 
     names  Agents, such as extra, or vehicles, such as a0-03.
     """
@@ -104,13 +123,13 @@ def remove(
 
 
 @command(app)
-def gone(name: str, where: Where) -> None:
+def forget(name: str, where: Where) -> None:
     """Release the cells of vehicles of a dead process. Use only if they are gone.
 
     Only a person can know that: a robot whose program has died is still in its cell. Never use it for such a robot.
     Between machines the command needs the guest's own certificate.
 
-    swarm vehicle gone extra
+    swarm order vehicle forget extra
 
     name  The guest, such as extra or rover7.
     """

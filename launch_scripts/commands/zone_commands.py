@@ -1,4 +1,4 @@
-"""`swarm zone`: areas that operators close or slow down while the swarm runs."""
+"""`swarm order zone`: areas that operators close or slow down while the swarm runs."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from launch_scripts.commands.order_commands import checked, print_obeyed
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
+from launch_scripts.plain_text import Duration
 from swarm.errors import ConfigError
 from swarm.places import FORMS, corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator
@@ -44,39 +45,38 @@ def add(
     layer: str | None = None,
     crs: str | None = None,
     kind: str = "lethal",
-    until: str | None = None,
+    for_: Annotated[str | None, typer.Option("--for")] = None,
     name: str = "",
     vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Close an area, or set its pace. Returns once all maps and trees include it.
 
-    swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
+    swarm order zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --for 10m --name bridge
 
-    swarm zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
+    swarm order zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
 
-    swarm zone add --file quarry.geojson --name quarry --class truck
+    swarm order zone add --file quarry.geojson --name quarry --class truck
 
     Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
 
-    polygon        Corners as 'LAT,LON LAT,LON ...', each of them also xy:X,Y or cell:ROW,COL; cell:0,0 is the
-                   north-west corner of the terrain.
+    polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
     polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
     file           A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.
     layer          Layer of a file that has several.
     crs            Coordinate system, if the file names none: EPSG:32632, or local.
     kind           lethal, or pace:X for X seconds per metre.
-    until          Duration: 90s, 10m, 2h. Until it is removed, if not given.
+    for_           Duration: 90s, 10m, 2h. Until it is removed, if not given.
     name           Zone name. Replaces a zone of the same name.
     vehicle_class  Vehicle class; if not given, all vehicles.
     """
-    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(until)}
+    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(for_)}
     fields["vehicle_class"] = vehicle_class
     if file is None:
         if layer is not None or crs is not None:
             raise ConfigError("zone add: --layer and --crs go with --file")
         if polygon is None and polygon_m is None:
-            raise ConfigError("zone add: give --polygon, --polygon-m or --file; `swarm zone add -h` shows examples")
+            raise ConfigError("give --polygon, --polygon-m or --file; `swarm order zone add -h` shows examples")
         places = [read_place(word, "--polygon") for word in _words("--polygon", polygon, f", each {FORMS}")]
         fields["polygon"] = [(0.0, 0.0) for _ in places]
         fields["polygon_m"] = [_corner(word) for word in _words("--polygon-m", polygon_m, " such as 40,200")]
@@ -110,7 +110,7 @@ def add(
 def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, as_json: AsJson = False) -> int:
     """Remove a zone.
 
-    swarm zone remove bridge
+    swarm order zone remove bridge
 
     name  The zone.
     """
@@ -118,11 +118,11 @@ def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, a
     return _give(lambda frame: [order], where, as_json)
 
 
-@command(app, name="list")
+@command(app, name="ls")
 def list_zones(where: Where, as_json: AsJson = False) -> None:
     """List active zones.
 
-    swarm zone list
+    swarm order zone ls
     """
     with where.bus() as bus:
         zones, frame = Operator(bus).zones(), frame_of_run(bus, where)
@@ -167,7 +167,7 @@ def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
 def _line(zone: Zone, frame: MapFrame) -> str:
     row0, col0, row1, col1 = zone.window
     kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
-    left = "" if zone.until_ns is None else f", ends in {max(zone.until_ns / 1e9 - time.time(), 0):.0f} s"
+    left = "" if zone.until_ns is None else f", ends in {Duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
     within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
     whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"
@@ -202,7 +202,7 @@ def _lasts_s(text: str | None) -> float | None:
         return None
     match = _LASTS.fullmatch(text)
     if match is None or not float(match[1]) > 0:
-        raise ConfigError(f"--until: {text!r} is no time such as 90s, 10m, 2h or 1d")
+        raise ConfigError(f"--for: {text!r} is no time such as 90s, 10m, 2h or 1d")
     return float(match[1]) * _SECONDS[match[2]]
 
 

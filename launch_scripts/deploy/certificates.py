@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from launch_scripts.observe.run_folder import replacing
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
+from swarm.files import replacing, write_file, writing
 from swarm.wire.fields import check_id
 
 CA = "ca"
@@ -220,20 +220,16 @@ def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.Ellip
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with private_file(folder / f"{name}.key") as file:
-            file.write(secret)
-        with replacing(folder / f"{name}.pem") as partial:
-            partial.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    except OSError as error:
-        raise StoreError(f"cannot write to {folder}: {error.strerror or error}") from error
+    with private_file(folder / f"{name}.key") as file:
+        file.write(secret)
+    write_file(folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM))
 
 
 @contextlib.contextmanager
 def private_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, readable by its owner only, which then takes the place of another. Raises OSError."""
-    with replacing(path) as partial:
-        partial.unlink(missing_ok=True)  # one that was left may be open to others
-        with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            yield file
+    """A file to write, readable by its owner only, which then takes the place of another. Raises StoreError."""
+    exclusive = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    with replacing(path) as partial, open(os.open(partial, exclusive, 0o600), "wb") as file:
+        yield file

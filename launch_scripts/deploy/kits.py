@@ -19,12 +19,12 @@ from launch_scripts.deploy.hosts import HostName
 from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
-from launch_scripts.observe.run_folder import write_file
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
+from swarm.files import write_file, writing
 
 Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
 """Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
@@ -89,13 +89,11 @@ def keep_plan(plan: Plan, out: Path) -> None:
     hold keys. Raises StoreError where it cannot."""
     names = {host.name for host in plan.hosts}
     gone = [_archive_of(out, host.name) for host in _before(out).hosts if host.name not in names]
-    try:
+    with writing(out / PLAN):
         for archive in filter(Path.exists, gone):
             archive.unlink()
             print(f"{archive}: removed, as the plan has no machine of this name", file=sys.stderr)
         write_file(out / PLAN, _shown(plan).encode())
-    except OSError as error:
-        raise _unwritable(out / PLAN, out, error) from error
 
 
 def keepers_before(out: Path, run_id: str) -> dict[str, str]:
@@ -148,24 +146,16 @@ def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Pa
         return made
 
     texts[CONTENTS] = "".join(f"{place}\n" for place in (*texts, *files))
-    try:
-        with private_file(path) as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
-            for place, text in texts.items():
-                is_script = "." not in place and "/" not in place and place != CONTENTS
-                data = text.encode()
-                archive.addfile(entry(place, len(data), 0o755 if is_script else 0o644), io.BytesIO(data))
-            for place, source in files.items():
-                with source.open("rb") as content:
-                    size = os.fstat(content.fileno()).st_size
-                    archive.addfile(entry(place, size, 0o600 if place.endswith(".key") else 0o644), content)
-    except OSError as error:
-        raise _unwritable(path, out, error) from error
+    with private_file(path) as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
+        for place, text in texts.items():
+            is_script = "." not in place and "/" not in place and place != CONTENTS
+            data = text.encode()
+            archive.addfile(entry(place, len(data), 0o755 if is_script else 0o644), io.BytesIO(data))
+        for place, source in files.items():
+            with source.open("rb") as content:
+                size = os.fstat(content.fileno()).st_size
+                archive.addfile(entry(place, size, 0o600 if place.endswith(".key") else 0o644), content)
     return path
-
-
-def _unwritable(path: Path, out: Path, error: OSError) -> StoreError:
-    where = "" if error.filename == str(path) else f"{error.filename or out}: "
-    return StoreError(f"cannot write {path}: {where}{error.strerror or error}")
 
 
 def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:

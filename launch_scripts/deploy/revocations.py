@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.observe.run_folder import write_file
 from swarm.config.scenario import NetworkConfig
 from swarm.config.setting_types import CommonName
-from swarm.errors import ConfigError, StoreError, writing
+from swarm.errors import ConfigError, StoreError
+from swarm.files import write_file
 
 FILE = "revoked"
 _MOST_BYTES = 1 << 20
@@ -50,8 +50,7 @@ def revoke(folder: Path, names: list[str]) -> Path:
     path = folder / FILE
     checked = [_checked(name, "a name to revoke") for name in names]
     every = dict.fromkeys((*revoked_in(folder), *checked))
-    with writing(path):
-        write_file(path, "".join(f"{name}\n" for name in every).encode())
+    write_file(path, "".join(f"{name}\n" for name in every).encode())
     return path
 
 

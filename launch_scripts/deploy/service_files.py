@@ -116,7 +116,7 @@ def _words(process: PlannedProcess, run_id: str) -> list[str]:
     }.get(process.role, ["--id", process.id])
     run = [] if process.role == ROUTER else ["--run-id", run_id]
     told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]
-    return [process.role, f"/etc/swarm/{_SCENARIO}", *which, *run, "--runs", "/var/lib/swarm/runs", *told]
+    return ["role", process.role, f"/etc/swarm/{_SCENARIO}", *which, *run, "--runs", "/var/lib/swarm/runs", *told]
 
 
 def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Sequence[str] = ()) -> dict[str, str]:
@@ -170,7 +170,7 @@ def zenohd_config(network: NetworkConfig, *, plugins: str | None = None, volume:
 
     plugins  folder of `libzenoh_plugin_storage_manager.so`; without one marks are passed on, not stored
     volume   of the storage: "memory", or one whose backend is installed
-    With certificates the names in `network.admit` may take part, under the rules of `swarm router`. Raises
+    With certificates the names in `network.admit` may take part, under the rules of `swarm role router`. Raises
     ConfigError on one that no process can have.
     """
     secured = network.tls is not None

@@ -129,14 +129,17 @@ class Terminal:
             self._live.update(table, refresh=True)
 
     def report(self, numbers: Mapping[str, Any]) -> None:
-        """Prints the numbers of a finished run, for people: programs find them in its report."""
-        if self._lines is not None:
-            return
+        """Prints the verdict on a finished run, and its numbers but those that are zero or were not measured, for
+        people: programs find them in its report."""
+        from launch_scripts.observe.fact_table import WELL
         from launch_scripts.observe.summed_counts import gap_text  # not before there is a report
 
+        self.say(numbers["verdict"], "green" if WELL in numbers["verdict"] else "yellow")
+        if self._lines is not None:
+            return
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
-            if name in REPORTED and value != {}:  # without learned factors there is no line
+            if name in REPORTED and _counts(value):
                 table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
         self.print(table)
 
@@ -146,6 +149,11 @@ class Terminal:
             with contextlib.suppress(OSError):
                 self._live.stop()
             self._live = None
+
+
+def _counts(value: Any) -> bool:
+    """Returns True of what was measured and is not zero, of a table if any part of it is so."""
+    return any(map(_counts, value.values())) if isinstance(value, dict) else bool(value)
 
 
 def _plain(value: Any) -> str:
@@ -203,9 +211,12 @@ def _busy_line(
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Tell]:
-    """Yields a function that reports progress, on a terminal only and after the first second."""
-    console, now = Console(stderr=True), ["working"]
+def progress(what: str = "working") -> Iterator[Tell]:
+    """Yields a function that reports progress, on a terminal only and after the first second.
+
+    what  the work, until that function says more
+    """
+    console, now = Console(stderr=True), [what]
 
     def tell(what: str, share: float) -> None:
         now[0] = f"{what}, {share:.0%}"

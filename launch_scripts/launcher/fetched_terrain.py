@@ -18,7 +18,8 @@ from shared_map.terrain.terrain import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
-from swarm.errors import StoreError, TerrainError
+from swarm.errors import TerrainError
+from swarm.files import writing
 from swarm.plugins.find import source_of
 from swarm.wire.messages.processes import RunInfo
 
@@ -94,10 +95,8 @@ def fetch_if_missing(
 @contextlib.contextmanager
 def _locked(run_dir: Path) -> Iterator[None]:
     """Makes one process at a time fetch into a run's folder."""
-    try:
+    with writing(run_dir):
         lock = (run_dir / "terrain.lock").open("wb")
-    except OSError as error:
-        raise StoreError(f"cannot write to {run_dir}: {error.strerror or error}") from error
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -37,6 +37,7 @@ from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
+from swarm.files import writing
 from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 
@@ -233,7 +234,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
     A restart is therefore the later one even if the clock was set back meanwhile.
     """
     path = run_dir / "lives" / f"{role}-{id}"
-    try:
+    with writing(path):
         path.parent.mkdir(exist_ok=True)
         file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
         try:
@@ -248,8 +249,6 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
             os.fsync(file)
         finally:
             os.close(file)
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return incarnation
 
 
@@ -264,8 +263,9 @@ class UpOptions:
     metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
     log_format     of all logs of this machine
-    record_inputs  of every process, for `swarm replay`
+    record_inputs  of every process, for `swarm runs replay`
     takes_over     from the launcher that runs this part of the run here
+    stays_watched  goes on beyond the scenario's seconds while a viewer is connected
     """
 
     scenario: Scenario
@@ -279,6 +279,7 @@ class UpOptions:
     record_inputs: bool = False
     metrics_port: int | None = None
     takes_over: bool = False
+    stays_watched: bool = False
     signals_address: str = LOOPBACK
     log_format: LogFormat = "text"
 

@@ -30,8 +30,8 @@ from swarm.wire.messages.processes import RunInfo
 log = logging.getLogger(__name__)
 
 _OPEN_WITHIN_S = 5.0
-"""Ten times what it takes: links end and are back within half a second (docs/deploy.md). A port that is taken for
-longer belongs to another program."""
+"""Ten times what it takes: links end and are back within half a second (docs/operate/access.md). A port that is
+taken for longer belongs to another program."""
 
 
 class RouterService:

@@ -138,7 +138,8 @@ class MachineSignals:
 
             run = Run(*self._run, started_ns) if up is None else None
             alive = observed.up() if up is None else up
-            self._metrics.answer(lambda: families(Figures(run, observed, observed.status, alive)))
+            status = observed.status if up is None else {}  # a part hears it until a route is served
+            self._metrics.answer(lambda: families(Figures(run, observed, status, alive)))
 
     def ends(self) -> None:
         """The run ends from now on; figures are answered no more."""

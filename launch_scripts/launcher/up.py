@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -39,6 +40,7 @@ from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.web.live_page import LivePage
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
@@ -50,7 +52,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
-from swarm.liveness import job_of
+from swarm.liveness import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
@@ -64,6 +66,8 @@ _CALM_TURN_S = 0.1
 """Once all processes are up: each turn takes a third of a millisecond."""
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
+_RELOADED_WITHIN_S = 10.0
+"""A viewer that leaves may be a page that is loaded again."""
 _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {RECORDED_BESIDE}"
 """Said by all others."""
 
@@ -100,6 +104,12 @@ def run_swarm(options: UpOptions) -> int:
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
     """The processes that are started here, in words."""
     return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
+
+
+def _how_busy() -> str:
+    """The load of this machine, in words."""
+    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    return f"the machine is {'' if load > cores else 'not '}overloaded: load {load:.1f} on {cores} cores"
 
 
 def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
@@ -144,12 +154,23 @@ class _Run:
         self._up_at_s: float | None = None
         """Time when the swarm was whole, on the run's clock."""
         self._web_port = 0
+        self._outlasts = False
+        """True while the run goes on for a viewer only."""
         self._known: Recorder | OwnPart | None = None
         self._take_over: TakeOver | None = None
         if options.takes_over:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        self._doing: Callable[[], str] = lambda: self._preparing
+        self._page: LivePage | None = None
+        """The live view's start page, until the monitor serves it."""
+        view = options.scenario.monitor
+        if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
+            name = f"{self._scenario.name}, run {run_id}"
+            told = {"life": "", "at_s": 0.0, "name": name}
+            self._page = LivePage(view.web_port, lambda: {**told, "state": self._doing()})
+            self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
 
@@ -164,6 +185,7 @@ class _Run:
         finally:
             self._warm_up.close()
             self._signals.close()
+            self._leave_page()
 
     def _run(self) -> int:
         with self._terminal.busy(lambda: self._preparing):
@@ -171,6 +193,8 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
+        if self._page is not None:
+            self._page.terrain = self._terrain
         homes = load_beside(self._run_dir, "homes", scenario_key(self._scenario))
         check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
@@ -206,6 +230,7 @@ class _Run:
                 watcher.begin()
                 watcher.look_after([running.spec for running in self._swarm.running])
                 try:
+                    self._leave_page()
                     self._swarm.start()
                     log.info("all processes are started")
                     seconds = self._watch(watcher)
@@ -214,12 +239,20 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        code = self._end(known, seconds)
         if self._startup_s is None and not self._stop_asked:
-            failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
+            missing = ", ".join(self._missing(watcher)) or "routes"
+            failures.append(f"the swarm was never whole: missing {missing}; {_how_busy()}")
+        has_run = isinstance(known, OwnPart) or known.routed or not failures
+        code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
+
+    def _leave_page(self) -> None:
+        """Leaves the live view's port to the monitor."""
+        if self._page is not None:
+            self._page.server.close()
+            self._page = None
 
     def _stopped_early(self) -> int:
         self._terminal.say("stopped before the swarm was up: there is nothing to report", "yellow")
@@ -247,12 +280,15 @@ class _Run:
         scenario = as_process(self._options.scenario, spec.role, spec.id)
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
+        incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
+        if self._known is not None and self._take_over is None:  # else the lives before are its own, too
+            self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
-            incarnation=next_incarnation(self._run_dir, spec.role, spec.id),
+            incarnation=incarnation,
             started_ns=self._started_ns,
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
@@ -262,7 +298,7 @@ class _Run:
 
     def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
         """Waits for `done(timeout_s)` or a signal, and shows so if it takes long."""
-        began_s = time.monotonic()
+        began_s, self._doing = time.monotonic(), text
         with self._terminal.busy(text):
             while not self._stop_asked and not done(_TURN_S):
                 if time.monotonic() - began_s > within_s:
@@ -289,7 +325,7 @@ class _Run:
 
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
-        began_s = time.monotonic()
+        began_s = watched_s = time.monotonic()
         self._book = watcher.known.observed.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
@@ -318,7 +354,10 @@ class _Run:
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
-            if now_s - began_s >= limit_s:
+            watched_s = now_s if watcher.viewers else watched_s
+            stays = self._options.stays_watched and self._startup_s is not None
+            self._outlasts = stays and now_s - began_s >= limit_s and now_s - watched_s < _RELOADED_WITHIN_S
+            if now_s - began_s >= limit_s and not self._outlasts:
                 break
         return time.monotonic() - began_s
 
@@ -380,8 +419,9 @@ class _Run:
         if self._up_at_s is None:
             return f"{self._scenario.name}: starting, {up} processes are up, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
-        of = "" if seconds >= UNTIL_STOPPED_S else f" of {self._up_at_s + seconds:.0f}"
-        live = f", live view {page_of(self._web_port)}" if self._web_port else ""
+        of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
+        until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
+        live = f"{until}, live view {page_of(self._web_port)}" if self._web_port else ""
         return f"{self._scenario.name}: {elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
@@ -411,11 +451,11 @@ class _Run:
         alive = sum(running.alive for running in self._swarm.running)
         return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
-    def _end(self, known: Recorder | OwnPart, seconds: float) -> int:
+    def _end(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds))
+                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds, failures))
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code
@@ -437,7 +477,7 @@ class _Run:
         else:
             self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
 
-    def _report(self, known: Recorder | OwnPart, seconds: float) -> bool:
+    def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""
         measured: dict[str, Any] = {"run_id": self._run_id, "seconds": seconds, "startup_s": self._startup_s}
         as_json = self._options.as_json
@@ -447,7 +487,7 @@ class _Run:
             else:
                 self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
             return True
-        report = make_report(known, self._terrain, **measured)
+        report = make_report(known, self._terrain, failures=failures, **measured)
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
         if as_json:
             self._terminal.print_json(json.dumps(numbers, indent=2))

@@ -17,12 +17,13 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import alarms_of
 from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
 from launch_scripts.process_table import TABLE, ProcessSpec
-from swarm.bus.bus import Bus, Event, Heard
+from swarm.bus.bus import Bus, Disappeared, Event, Heard
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
-from swarm.liveness import job_of
+from swarm.liveness import Peer, job_of
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed
@@ -40,6 +41,8 @@ _OTHER_LINES = 4
 
 class OwnPart(LatestState):
     """The processes that a launcher has started, and who else is there. They are all of its plan."""
+
+    hears = (STATS,)
 
     def __init__(self, grid: GridSpec, started_ns: int) -> None:
         super().__init__(RunPlan((), (), 0, started_ns), grid)
@@ -112,6 +115,8 @@ class Watcher(RunObserver):
         self.notes: list[Note] = []
         self.web_port = 0
         """Port of the live view's page; 0 until it is known."""
+        self.viewers = 0.0
+        """Connections to it, as its monitor last said."""
         self.routes_served = False
         self._clock = clock
         self._inbox = Inbox()
@@ -165,8 +170,11 @@ class Watcher(RunObserver):
         match event:
             case Heard(message=Note() as note):
                 self.notes.append(note)
-            case Heard(message=Stats(role="monitor", web_port=port)) if port:
-                self.web_port = port
+            case Heard(message=Stats(role="monitor", web_port=port, gauges=gauges)):
+                self.web_port = port or self.web_port
+                self.viewers = gauges.get(VIEWERS, 0.0)
+            case Disappeared(Peer(role="monitor")):
+                self.viewers = 0.0
             case Heard(message=Followed()):
                 self._served(now_ns)
             case Heard(message=PlannerStatus(routes_served=served)) if served:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import cast
 
+from launch_scripts.web.live_page import LivePage, when_free
 from shared_map.terrain.store import load_terrain
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.bus.zenoh_bus import open_bus
@@ -29,12 +30,18 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     terrain = load_terrain(setup)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:
+        view, page = setup.scenario.monitor, None
+        if view.live:
+            name = f"{setup.scenario.name}, run {setup.run_id}"
+            told = {"life": "", "at_s": 0.0, "name": name, "state": "its processes have begun"}
+            page = when_free(lambda: LivePage(view.web_port, lambda: told, terrain))
+            stack.callback(page.server.close)
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
 
         def load() -> _Make:
             from launch_scripts.monitor.service import load_view  # takes as long as a whole planner's start
 
-            return load_view(setup, terrain, bus, inbox.post, stack)
+            return load_view(setup, terrain, bus, inbox.post, stack, page)
 
         info = setup.info(terrain.grid, terrain.digest)
         service = LoadingMonitor(Member(info, bus, inbox.post, setup.before), inbox.post, load)

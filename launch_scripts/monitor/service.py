@@ -22,8 +22,10 @@ from launch_scripts.monitor.live_layout import (
 )
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
+from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
+from launch_scripts.web.live_page import LivePage
 from launch_scripts.web.server import Audience
 from shared_map.array_files import give_back_memory
 from shared_map.cost_map import CostMap
@@ -39,7 +41,7 @@ from swarm.config.vehicle_classes import aloft_classes
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import VIEWERS, Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
@@ -90,6 +92,8 @@ class MonitorService:
         self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
+        self.said: list[str] = []
+        """The newest figures in lines, for the start page. Read by other threads, too."""
         self._setup, self._bus, self._post, self._pen = setup, bus, post, scene.pen
         self._recording, self._audience = recording, audience
         self._joins = member is None
@@ -147,6 +151,7 @@ class MonitorService:
         self._member.tick(now_ns)
         self._turn += 1
         audience = self._audience()
+        self.counters.gauge(VIEWERS, float(audience.now))
         if self._watched != (watched := audience.now > 0):
             self._watched = watched
             self._observer.pace(FOLLOWED, _ROUTES_SEEN_S if watched else ROUTES_S, now_ns)
@@ -235,16 +240,25 @@ class MonitorService:
             summary = self.figures.shown(now_ns)
             self._movers.summarised(summary)
             self._panel.summary(summary_markdown(self._setup, summary))
+            self.said = [facts.fact("elapsed_s").said(summary), *facts.lines(summary)]
 
 
 def load_view(
-    setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, closing: contextlib.ExitStack
+    setup: RoleSetup,
+    terrain: Terrain,
+    bus: Bus,
+    post: Post,
+    closing: contextlib.ExitStack,
+    page: LivePage | None = None,
 ) -> Callable[[Member], MonitorService]:
     """Prepares drawing, opens the recording and the live view's ports, and returns the factory of the service.
 
     Called on a thread of its own, so what it returns is called by the thread that owns the service.
 
-    closing  closes what it opens. Raises SwarmError where a file or a port cannot be opened
+    closing  closes what it opens
+    page     of the live view, which is served already
+
+    Raises SwarmError where a file or a port cannot be opened
     """
     scenario, config = setup.scenario, setup.scenario.monitor
     seen = load_terrain(setup)  # mapped once more: of what the mesh has read most is not read again
@@ -255,7 +269,7 @@ def load_view(
     layers = shown_layers(scenario, knows_truth=knows_truth)
     blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
-    sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint)
+    sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint, page)
     closing.callback(sinks.close)
     truth = load_truth(setup, terrain) if knows_truth else None
     scene = Scene(Pen(sinks.streams, mesh), layers, truth, scenario_areas(scenario, terrain.grid))
@@ -266,7 +280,8 @@ def load_view(
         service = served(setup, terrain, bus, post, scene, recording=watch, member=member)
         give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
         life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
-        sinks.tell_page(lambda: {"life": life, "at_s": service.at_s, "over": service.over, "recording": command})
+        told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
+        sinks.tell_page(lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said})
         return service
 
     return make

@@ -15,7 +15,6 @@ import re
 import secrets
 import socket
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -27,18 +26,17 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.observe.run_folder import SAY_EVERY_S, can_write
+from launch_scripts.observe.run_folder import SAY_EVERY_S
 from launch_scripts.web import LOOPBACK
-from launch_scripts.web.live_page import LivePage
+from launch_scripts.web.live_page import LivePage, when_free
 from launch_scripts.web.server import Audience, Server
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig
-from swarm.errors import BusError, StoreError
+from swarm.errors import StoreError
+from swarm.files import check_writable, writing
 
 log = logging.getLogger(__name__)
 
-_PORT_PATIENCE_S = 3.0
-"""A port that is in use is waited for so long: after a restart the one before may still have it."""
 _MEMORY = "64MiB"
 """Limit of the stream's store for later viewers; the oldest goes first. The process grows by twice as much."""
 _PACK_S = 1.0
@@ -194,13 +192,9 @@ def new_recording_path(folder: Path) -> Path:
     """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: no file is overwritten."""
     for n in range(1, 10_000):
         path = folder / ("run.rrd" if n == 1 else f"run-{n}.rrd")
-        try:
+        with writing(path), contextlib.suppress(FileExistsError):
             path.open("xb").close()
             return path
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     raise StoreError(f"{folder} is full of recordings")
 
 
@@ -208,8 +202,14 @@ class Sinks:
     """A recording stream and its sinks. `close` takes seconds at most, even if a disk or a viewer hangs."""
 
     def __init__(
-        self, recording_id: str, path: Path | None, config: MonitorConfig, blueprint: rrb.Blueprint
+        self,
+        recording_id: str,
+        path: Path | None,
+        config: MonitorConfig,
+        blueprint: rrb.Blueprint,
+        page: LivePage | None = None,
     ) -> None:
+        """page  one that is served already; None: one is opened here"""
         self._recording_id = recording_id
         self._blueprint = blueprint
         self.rec = self._stream()
@@ -223,8 +223,9 @@ class Sinks:
         live: list[rr.GrpcServerSink] = []
         if config.live:
             host, port = behind = _hidden_address()
-            self.gate = _when_free(lambda: Server("grpc_port", config.grpc_port, {}, behind=behind))
-            self.page = _when_free(lambda: LivePage(config.web_port, behind))
+            self.gate = when_free(lambda: Server("grpc_port", config.grpc_port, {}, behind=behind))
+            self.page = page or when_free(lambda: LivePage(config.web_port))
+            self.page.opens(behind)
             self._servers = [self.page.server, self.gate]
             live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))
         try:
@@ -246,9 +247,10 @@ class Sinks:
         return 0 if self.page is None else self.page.server.port
 
     def audience(self) -> Audience:
-        """Viewers of the stream."""
+        """Viewers of the stream, and one whose page has not come to it yet."""
         each = [server.audience() for server in self._servers]
-        return Audience(sum(one.now for one in each), sum(one.ever for one in each))
+        waits = self.page is not None and self.page.is_open
+        return Audience(sum(one.now for one in each) or int(waits), sum(one.ever for one in each))
 
     def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
         """Sets the page's information about the run beside the view, asked once a second for each open page."""
@@ -339,7 +341,7 @@ class RecordingWatch:
         if self._limit.due("say", now_ns):
             return f"the recording {self._path} has ended: {self._why()}; another begins when there is space", False
         if self._limit.due("try", now_ns):
-            with contextlib.suppress(OSError, StoreError):
+            with contextlib.suppress(StoreError):
                 check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
                 self._begin(self._path)
@@ -358,18 +360,19 @@ class RecordingWatch:
     def _why(self) -> str:
         try:
             check_space(self._path.parent)
-        except OSError as error:
-            return error.strerror or str(error)
+        except StoreError as error:
+            return str(error)
         return "it does not grow"
 
 
 def check_space(folder: Path) -> None:
-    """Raises OSError if there is no space for a recording. It is tried by writing, as there are quotas and limits
-    that nothing else shows; but only where that does not fill the disk for everybody else meanwhile."""
-    left = os.statvfs(folder)
-    if left.f_bavail * left.f_frsize < 2 * _SPACE_BYTES:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    can_write(folder, _SPACE_BYTES)
+    """Raises StoreError if there is no space for a recording. It is tried by writing, as there are quotas and
+    limits that nothing else shows; but only where that does not fill the disk for all others meanwhile."""
+    with writing(folder):
+        left = os.statvfs(folder)
+        if left.f_bavail * left.f_frsize < 2 * _SPACE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    check_writable(folder, _SPACE_BYTES)
 
 
 def _files(path: Path | None) -> list[rr.FileSink]:
@@ -385,20 +388,6 @@ def _in_time(work: Callable[[], None], within_s: float) -> bool:
     thread.start()
     thread.join(within_s)
     return not thread.is_alive()
-
-
-def _when_free(listen: Callable[[], T]) -> T:
-    """Listens on a port, and waits for one which is still in use. Raises BusError."""
-    deadline_s = time.monotonic() + _PORT_PATIENCE_S
-    while True:
-        try:
-            return listen()
-        except BusError as error:
-            if time.monotonic() > deadline_s:
-                raise BusError(
-                    f"no live view: monitor.{error}; choose another, 0 for any, or monitor.live = false"
-                ) from error
-        time.sleep(0.1)
 
 
 def _hidden_address() -> tuple[str, int]:

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from launch_scripts.observe.run_alarms import Alarm
+from launch_scripts.observe.run_alarms import Alarm, is_serious
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
+from launch_scripts.plain_text import Duration
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 
@@ -60,8 +61,8 @@ def count(value: float | None) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """34 s"""
-    return NONE if value is None else f"{value:,.0f} s"
+    """34 s, 19 min"""
+    return NONE if value is None else str(Duration(value))
 
 
 def distance(value_m: float | None) -> str:
@@ -247,7 +248,7 @@ def together(alarms: Sequence[Alarm]) -> str:
     first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
     others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    lasting = "the first " if first.lasts else "over, the first "
+    lasting = "the longest " if first.lasts else "over, the first "
     return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when}"
 
 
@@ -257,6 +258,45 @@ def for_report(state: RunState) -> dict[str, Any]:
         **{each.name: _plain(each.value(state)) for each in FACTS},
         "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
     }
+
+
+def left_behind(report: Mapping[str, Any]) -> list[str]:
+    """Returns unfinished business of vehicles, in sentences without a full stop, from the report of a run."""
+    vehicles, routed = report["vehicles"], report.get("vehicles_routed")
+    found = (
+        (report.get("lost"), "lost at the end"),
+        (report.get("stranded"), "stranded at the end"),
+        (0 if routed is None else vehicles - routed, "without any route"),
+    )
+    return [f"{count(number)} of {count(vehicles)} vehicles {words}" for number, words in found if number]
+
+
+def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
+    """The outcome of a run: what it reached, and whether all went well or what did not, from its report.
+
+    failures  what its launcher says of processes, in sentences without a full stop
+    """
+    captures, collisions = report.get("captures"), report.get("collisions")
+    reached = [f"{count(report.get('vehicles_routed') or 0)} of {count(report['vehicles'])} vehicles routed"]
+    reached += [] if captures is None else [_many(captures, "capture")]
+    reached += [] if collisions is None else [_many(collisions, "collision")]
+    forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
+    serious = [
+        alarm["text"]
+        for alarm in report.get("alarms") or []
+        if is_serious(alarm["kind"]) and alarm["over_s"] is None
+    ]
+    wrong = list(dict.fromkeys([*failures, *forbidden, *serious, *left_behind(report)]))
+    more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
+    how = f"Not all went well: {'; '.join(wrong[:_NAMED])}{more}." if wrong else WELL
+    return f"{', '.join(reached)}. {how}"
+
+
+WELL = "All went well."
+
+
+def _many(number: float, thing: str) -> str:
+    return f"{count(number) if number else 'no'} {thing}{'s' * (number > 1)}"
 
 
 def _plain(value: Any) -> Any:

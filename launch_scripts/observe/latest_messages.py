@@ -31,6 +31,7 @@ from swarm.wire.messages.orders import Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Beat, RunInfo, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 _VEHICLES_LAST_NS = 3 * NS_PER_S
 """A vehicle whose agent raises no liveliness token is there for this long after its last word."""
@@ -176,7 +177,11 @@ class LatestState(Counts):
     poses   target -> its newest pose that counts
     leads   (role, id) -> whether the process leads, where there are standbys
     loads   what each process takes up
+    hears   topics that are heard as long as the run lasts, from all whom this is about: only they are evidence of
+            an alarm
     """
+
+    hears: Collection[Topic] = (STATS, STATUS, POSE)
 
     def __init__(self, plan: RunPlan, grid: GridSpec) -> None:
         super().__init__()
@@ -203,6 +208,8 @@ class LatestState(Counts):
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._alive: dict[tuple[str, str], set[int]] = {}
         """(role, id) of every process that has ever been seen alive -> incarnations whose token is up."""
+        self._started: dict[tuple[str, str], set[int]] = {}
+        """(role, id) -> incarnations of the processes that the observer itself has started."""
         self._told_ns: dict[tuple[str, str], int] = {}
         """(role, id) -> time of the process's last counts, or of its first token."""
         self._fleet_told_ns: dict[str, int] = {}
@@ -246,10 +253,17 @@ class LatestState(Counts):
                 self.book.merge(message.orders, now_ns)
         return message
 
+    def started(self, peer: Peer) -> None:
+        """Notes a life that the observer itself has started. A token under the same name that is none of these is
+        of another run, as at the port that all have by default."""
+        self._started.setdefault((peer.role, peer.id), set()).add(peer.incarnation)
+
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         self.touch(now_ns)
         key = (peer.role, peer.id)
+        if peer.incarnation not in self._started.get(key, (peer.incarnation,)):
+            return
         if up:
             self._alive.setdefault(key, set()).add(peer.incarnation)
             self._told_ns[key] = now_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.terrain.pyramid import Level, level_of
+from shared_map.terrain.terrain import Terrain
 from swarm.wire.messages.vehicles import VehicleState
 
 # Okabe and Ito's colours: safe for colour-blind readers, and of different lightness.
@@ -84,6 +87,34 @@ def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[
     light = (-east * sun[0] - south * sun[1] + sun[2]) / np.sqrt(1 + east**2 + south**2)
     shade: NDArray[np.float32] = np.nan_to_num(np.clip(light, 0, 1), nan=0.7).astype(np.float32)
     return shade
+
+
+def photo_of(seen: Level) -> NDArray[np.uint8]:
+    """The photo with hillshade, paled so that tracks stand out."""
+    shade = hillshade(seen.elevation_m, seen.grid.resolution_m)
+    photo = seen.photo.astype(np.float32) / 255
+    grey = photo.mean(axis=2, keepdims=True)
+    paled = 0.55 * (0.65 * photo + 0.35 * grey) + 0.45
+    lit: NDArray[np.uint8] = (255 * np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1)).astype(np.uint8)
+    return lit
+
+
+def image_bytes(pixels: NDArray[np.uint8], format: str) -> bytes:
+    """Pixels as "WEBP" or "PNG"."""
+    from PIL import Image  # takes time to import
+
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format, quality=88, method=2)
+    return file.getvalue()
+
+
+def terrain_picture(terrain: Terrain) -> bytes:
+    """A picture of the ground as WEBP, before anything has moved on it."""
+    return image_bytes(photo_of(level_of(terrain, _MOST_CELLS)), "WEBP")
+
+
+_MOST_CELLS = 1 << 18
+"""Cells of the ground that a page shows at most."""
 
 
 def said_length(length_m: float) -> str:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from launch_scripts.observe import history
-from launch_scripts.observe.fact_table import for_report
+from launch_scripts.observe.fact_table import for_report, verdict
 from launch_scripts.observe.history import BegunRoute, Sample, Thinned, TrackKey, Tracks
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
@@ -204,8 +204,10 @@ class Recorder(RunFigures):
         run_id: str | None = None,
         seconds: float | None = None,
         startup_s: float | None = None,
+        failures: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """The numbers of the run, None where not measured. The caller gives what it knows better."""
+        """The numbers of the run, None where not measured, and the verdict in a sentence. The caller gives what it
+        knows better, such as failures of processes."""
         observed = self.observed
         if seconds is None and observed.first_ns is not None and observed.last_ns is not None:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
@@ -235,7 +237,8 @@ class Recorder(RunFigures):
             "messages_per_s": _mean(rates),
             **results(observed, self.driven, self.scenario),
         }
-        return {name: _rounded(value) for name, value in fields.items()}
+        numbers = {name: _rounded(value) for name, value in fields.items()}
+        return {"verdict": verdict(numbers, failures), **numbers}
 
     def series(self, points: int = 120) -> dict[str, list[Any]]:
         """The run over time, at about `points` instants at most: lists with one value per `t_s`."""

@@ -5,6 +5,9 @@ know it. Alarms that a process cannot raise itself are found here: that it has e
 is lost.
 
 An old tree is no alarm: later changes are repaired in it.
+
+An observer opens an alarm only if it also hears what closes it, for as long as the run lasts (`EVIDENCE`). Else a
+launcher that hears a part of the run would say for ever what was so when it last heard of it.
 """
 
 from __future__ import annotations
@@ -13,11 +16,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from launch_scripts.observe.latest_messages import LatestState
-from launch_scripts.plain_text import plain
+from launch_scripts.plain_text import Duration, Moment, plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import job_of
 from swarm.wire.messages.processes import Alarm as Told
+from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 SILENT_NS = 4 * NS_PER_S
 """Every process tells its counts once a second: one that has not for so long hangs, or cannot be heard."""
@@ -41,6 +45,8 @@ KINDS: Mapping[str, str] = {
     "restarted": "restarted",  # a process was started again after it had ended
 }
 """The word on the wire -> what people call it. Serious is what must not be, or stops a part of the run."""
+EVIDENCE: Mapping[str, tuple[Topic, ...]] = {"down": (), "target-lost": (STATUS, POSE)}
+"""Kind -> the topics that open and close it, beside liveliness tokens; `STATS` of all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +60,9 @@ class Alarm:
     cell        where it is; None if it has no place
     since_s     time of the run at which it began; None if the watcher came later
     over_s      time of the run at which it was over; None while it lasts
+    heard_s     time of the run of its last evidence
+    began_ns    time when the run began, from which these count; None if it is not known
+    is_old      whether the last evidence is older than that of a process which is well
     """
 
     kind: str
@@ -63,6 +72,9 @@ class Alarm:
     over_s: float | None = None
     cell: int | None = None
     target: str | None = None
+    heard_s: float | None = None
+    began_ns: int | None = None
+    is_old: bool = False
 
     @property
     def lasts(self) -> bool:
@@ -70,7 +82,7 @@ class Alarm:
 
     @property
     def serious(self) -> bool:
-        return self.kind in _SERIOUS
+        return is_serious(self.kind)
 
     @property
     def label(self) -> str:
@@ -78,14 +90,20 @@ class Alarm:
 
     @property
     def when(self) -> str:
-        """In words: `since 34 s`, `at 34 s`, `from 34 s to 50 s`."""
-        if self.since_s is None:
-            return "now" if self.lasts else f"until {self.over_s:.0f} s"
-        if self.over_s is None:
-            return f"since {self.since_s:.0f} s"
-        if self.over_s == self.since_s:
-            return f"at {self.since_s:.0f} s"
-        return f"from {self.since_s:.0f} s to {self.over_s:.0f} s"
+        """In words: `for 19 min`, `at 14:22:10`, `at 14:22:10, for 86 s`."""
+        end_s = self.heard_s if self.over_s is None else self.over_s
+        lasted = None if self.since_s is None or end_s is None else Duration(max(end_s - self.since_s, 0.0))
+        if self.over_s is not None:
+            if self.since_s is None:
+                return f"until {self._at(self.over_s)}"
+            return f"at {self._at(self.since_s)}" + (f", for {lasted}" if self.over_s > self.since_s else "")
+        last = f", last heard of at {self._at(end_s)}" if self.is_old and end_s is not None else ""
+        return ("now" if lasted is None else f"for {lasted}") + last
+
+    def _at(self, run_s: float) -> str:
+        if self.began_ns is None:
+            return f"{Duration(run_s)} of the run"
+        return str(Moment(self.began_ns + round(run_s * NS_PER_S)))
 
     def place(self, grid: GridSpec) -> tuple[int, int] | None:
         """Row and column; None if it has no place, or names one that is not in the grid, as a tracker may."""
@@ -107,8 +125,13 @@ class Alarm:
         row, col = self.place(grid) or (None, None)
         return {
             "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
-            "over_s": self.over_s, "row": row, "col": col, "target": self.target,
+            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "target": self.target,
         }  # fmt: skip
+
+
+def is_serious(kind: str) -> bool:
+    """Returns True of what must not be, or stops a part of the run."""
+    return kind in _SERIOUS
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
@@ -116,10 +139,13 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
     first."""
     began_ns, wanted = latest.plan.started_ns or 0, list(targets)
     found = [
-        *_missing(latest, wanted, now_ns),
-        *_silent(latest, now_ns),
-        *_lost(latest, wanted, now_ns),
-        *_told(latest),
+        (told, heard_ns)
+        for told, heard_ns in (
+            *((each, now_ns) for each in (*_missing(latest, wanted, now_ns), *_silent(latest, now_ns))),
+            *_lost(latest, wanted, now_ns),
+            *_told(latest),
+        )
+        if set(EVIDENCE.get(told.kind, (STATS,))) <= set(latest.hears)
     ]
 
     def seconds(stamp_ns: int | None) -> float | None:
@@ -134,8 +160,11 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
             seconds(told.over_ns),
             told.cell,
             told.target,
+            seconds(heard_ns),
+            began_ns,
+            is_old=now_ns - heard_ns > SILENT_NS,
         )
-        for told in found
+        for told, heard_ns in found
     ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
@@ -146,12 +175,13 @@ _UNKNOWN_NS = -1
 """Beginning of an alarm whose beginning is unknown. No message can say so."""
 
 
-def _told(latest: LatestState) -> Iterator[Told]:
-    """Returns alarms published by processes. Alarms that were open when a process ended are left out."""
+def _told(latest: LatestState) -> Iterator[tuple[Told, int]]:
+    """Returns alarms published by processes, each with the time of its last evidence. Alarms that were open when a
+    process ended are left out."""
     for (role, id), stats in latest.newest().items():
         for alarm in stats.alarms:
             if alarm.over_ns is not None or latest.is_well(role, id):
-                yield alarm
+                yield alarm, stats.stamp_ns
 
 
 def starts(latest: LatestState, role: str, id: str, now_ns: int) -> bool:
@@ -167,7 +197,8 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
             continue
         leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
-        yield _of_process("down", role, id, f"is gone{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
+        lives = "is gone" if latest.knows(role, id) else "has not come up"
+        yield _of_process("down", role, id, f"{lives}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
@@ -186,14 +217,15 @@ def _of_process(kind: str, role: str, id: str, what: str, since_ns: int) -> Told
     return Told(kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, target=target)
 
 
-def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Told]:
+def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[Told, int]]:
     for id in sorted(latest.lost(now_ns).intersection(targets)):
         status, pose = latest.told_by_planner(id), latest.poses.get(id)
-        since_ns, cell = _UNKNOWN_NS, None if pose is None else pose.cell
+        since_ns, cell, heard_ns = _UNKNOWN_NS, None if pose is None else pose.cell, now_ns
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.
             since_ns, cell = status.stamp_ns - int(status.pose_age_s * NS_PER_S), status.target_cell
+            heard_ns = status.stamp_ns
         elif pose is not None:
             since_ns = pose.stamp_ns
         text = f"nobody knows where {id} is; routes lead to where it was"
-        yield Told(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id)
+        yield Told(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id), heard_ns

@@ -1,6 +1,6 @@
 """The folder of a run: its scenario, versions and machine from its first second on, its report at its end.
 
-Files are written whole or not at all (`write_file`), and a `DiskWatch` says when the folder takes no more data.
+A `DiskWatch` says when the folder takes no more data.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.observe.run_registry import register, registered
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
 from swarm.errors import ConfigError, StoreError
+from swarm.files import check_writable, write_file
 
 SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
 LAST = "LAST"
@@ -63,10 +64,8 @@ def begin_run(
     for name, text in texts.items():
         try:
             write_file(folder / name, text.encode())
-        except OSError as error:
-            said.append(f"cannot write {folder / name}: {error.strerror or error}")
-    from launch_scripts.observe.run_registry import register  # which writes its files as this module does
-
+        except StoreError as error:
+            said.append(str(error))
     sentences = (point_last(folder), register(folder, is_whole=simulated))
     return [*said, *(sentence for sentence in sentences if sentence is not None)]
 
@@ -94,29 +93,26 @@ def point_last(folder: Path) -> str | None:
     cannot be a link, and whenever it cannot be at all."""
     last = folder.parent / LAST
     partial = folder.parent / f".{LAST}.{os.getpid()}"
+    was_file = last.is_file()
     try:
-        try:
-            partial.unlink(missing_ok=True)
-            partial.symlink_to(folder.name, target_is_directory=True)
-        except (OSError, NotImplementedError):
-            was_file = last.is_file()
-            partial.write_text(f"{folder.name}\n", encoding="utf-8")
-            partial.replace(last)
-            if was_file:
-                return None
-            return f"no links can be made in {folder.parent}: {LAST} is a file there that holds the run's name"
-        partial.replace(last)
-    except OSError as error:
         partial.unlink(missing_ok=True)
-        return f"{last} still means another run: {error.strerror or error}"
+        partial.symlink_to(folder.name, target_is_directory=True)
+        partial.replace(last)
+    except (OSError, NotImplementedError):
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        try:
+            write_file(last, f"{folder.name}\n".encode())
+        except StoreError as error:
+            return f"{error}; it still means another run"
+        if not was_file:
+            return f"no links can be made in {folder.parent}: {LAST} is a file there that holds the run's name"
     return None
 
 
 def find_run(name: str, runs: Path) -> Path:
     """The folder of a run: a path, its name in `runs`, or else the name of one that is registered; `LAST` where it
     is a file, too. Raises ConfigError."""
-    from launch_scripts.observe.run_registry import registered
-
     for path in (Path(name), runs / name):
         if path.is_dir():
             return path
@@ -183,40 +179,11 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-# --- writing ------------------------------------------------------------------------------------------------------
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Replaces a file at one instant. Raises OSError."""
-    with replacing(path) as partial, partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space.
-    An OSError names the file that the caller wants to write."""
-    partial = path.with_name(path.name + ".part")
-    try:
-        yield partial
-        partial.replace(path)
-    except OSError as error:
-        error.filename = str(path) if error.filename == str(partial) else error.filename
-        raise
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
 LOOK_EVERY_S = 5.0
 """A full disk is reported within seconds, and a try is 64 kB, which no disk feels at this rate."""
 SAY_EVERY_S = 60.0
 """A full disk is named once a minute (docs/operate/failures.md): often enough to be seen, and the log stays
 readable."""
-_PROBE_BYTES = 1 << 16
-"""A whole block of any usual file system, whose blocks have 64 KiB at most: less may find room on a full disk."""
 
 
 class DiskWatch:
@@ -234,23 +201,13 @@ class DiskWatch:
             return None
         self._due_s = now_s + LOOK_EVERY_S
         try:
-            can_write(self._folder)
-        except OSError as error:
+            check_writable(self._folder)
+        except StoreError as error:
             if self._said_s is not None and now_s - self._said_s < SAY_EVERY_S:
                 return None
             self._said_s = now_s
-            return f"cannot write to {self._folder}: {error.strerror or error}; all goes on but logs and recording"
+            return f"{error}; all goes on but logs and recording"
         if self._said_s is None:
             return None
         self._said_s = None
         return f"{self._folder} can be written again"
-
-
-def can_write(folder: Path, size: int = _PROBE_BYTES) -> None:
-    """Writes a file of some bytes and removes it. Raises OSError."""
-    probe = folder / ".space"
-    try:
-        probe.write_bytes(bytes(size))
-    finally:
-        with contextlib.suppress(OSError):
-            probe.unlink()

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from launch_scripts.observe.run_folder import write_file
 from swarm.config.input_files import FileKind, read_text
-from swarm.errors import SwarmError
+from swarm.errors import StoreError, SwarmError
+from swarm.files import write_file
 from swarm.runtime.run_secret import state_folder
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str 
         file = registry() / f"{folder.name}.{os.getpid()}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         write_file(file, msgspec.json.encode(entry))
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, StoreError) as error:
         return f"commands find this run in its folder only, as it cannot be registered: {error}"
     return None
 

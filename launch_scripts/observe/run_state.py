@@ -11,7 +11,7 @@ import numpy as np
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm, alarms_of, starts
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gaps_to
-from launch_scripts.plain_text import plain
+from launch_scripts.plain_text import Duration, plain
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
@@ -51,7 +51,7 @@ class TargetLine:
         """The id, and exceptional states of its tracker and its planner."""
         unusual = []
         if self.lost:
-            unusual.append("lost" if self.pose_age_s is None else f"lost {self.pose_age_s:.0f} s")
+            unusual.append("lost" if self.pose_age_s is None else f"lost for {Duration(self.pose_age_s)}")
         if not self.planner_up:
             unusual.append("planner starting" if self.starting else "planner down")
         elif self.rank:

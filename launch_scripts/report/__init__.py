@@ -12,6 +12,6 @@ Commands and the ends of runs and studies write it; nothing else imports it. Mat
 | terrain_figure.py | figures of a terrain, of a route on it, of slope rules                                  |
 | compare.py        | what differs between runs                                                               |
 | exporter.py       | the one exporter of layers and rasters: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF     |
-| run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm export`                   |
+| run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm runs export`              |
 | mcap_export.py    | a run as MCAP with ROS 2 messages, in order of time                                     |
 """

@@ -15,7 +15,6 @@ in the description of the layer, where the format has one. All formats but CSV a
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import datetime
 import json
@@ -31,6 +30,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.map_frame import MapFrame
 from swarm.errors import ConfigError, StoreError
+from swarm.files import check_writable, replacing
 from swarm.grid import GridSpec
 
 COSTS = (
@@ -101,7 +101,7 @@ FORMATS: Mapping[str, Format] = {
 
 
 def check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Raises ConfigError now, not after the work, if a file cannot be written."""
+    """Raises ConfigError or StoreError now, not after the work, if a file cannot be written."""
     if path is None:
         return
     if path.is_dir():
@@ -110,6 +110,7 @@ def check_target(path: Path | None, option: str, *endings: str) -> None:
         raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
+    check_writable(path.parent, file=path)
 
 
 def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
@@ -129,24 +130,14 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
         raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
     if form.driver == "GPX" and any(layer.shape == "Polygon" for layer in layers):
         raise ConfigError(f"--out {path}: GPX has no areas; write .geojson, .gpkg or .kml")
-    half = path.with_name(f"{path.stem}.part{path.suffix}")
-    try:
-        half.unlink(missing_ok=True)
+    with replacing(path) as half:
         if not form.driver:
             _write_csv(half, layers[0], frame)
-        else:
-            timed = [layer for layer in layers if any(each.time_ns is not None for each in layer.features)]
-            extra = map(_places_of, timed) if form.driver == "GPKG" else ()
-            for number, layer in enumerate([*layers, *extra]):
-                _write_layer(half, layer, frame, form, append=number > 0)
-        half.replace(path)
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
-    except StoreError as error:
-        raise StoreError(str(error).replace(half.name, path.name)) from error  # GDAL names it, too
-    finally:
-        with contextlib.suppress(OSError):
-            half.unlink(missing_ok=True)
+            return
+        timed = [layer for layer in layers if any(each.time_ns is not None for each in layer.features)]
+        extra = map(_places_of, timed) if form.driver == "GPKG" else ()
+        for number, layer in enumerate([*layers, *extra]):
+            _write_layer(half, layer, frame, form, append=number > 0)
 
 
 # --- by GDAL ------------------------------------------------------------------------------------------------------
@@ -377,13 +368,15 @@ def write_raster(
     grid: GridSpec,
     *,
     descriptions: Sequence[str] = (),
+    unit: str = "",
     tags: Mapping[str, str] | None = None,
     **profile: Any,
 ) -> None:
     """Writes a tiled, compressed GeoTIFF with overviews (its tile pyramid). A terrain without a place gets none.
 
     bands         (rows, cols) each, of one dtype
-    descriptions  what each band holds, with its unit
+    descriptions  meaning of each band
+    unit          unit of the first band, as a GIS shows it: s, s/m
     profile       as rasterio takes it, such as nodata
 
     Raises StoreError if it cannot be written.
@@ -398,16 +391,20 @@ def write_raster(
     crs = None if grid.crs == "local" else grid.crs
     where = {"crs": crs, "transform": transform_of(grid)}
     try:
-        with rasterio.open(
-            path, "w", driver="GTiff", compress="deflate", **where, **side, **size, **profile
-        ) as file:
+        with (
+            replacing(path) as half,
+            rasterio.open(
+                half, "w", driver="GTiff", compress="deflate", **where, **side, **size, **profile
+            ) as file,
+        ):
             for number, band in enumerate(bands, 1):
                 file.write(band, number)
             for number, text in enumerate(descriptions, 1):
                 file.set_band_description(number, text)
+            file.set_band_unit(1, unit)
             file.update_tags(**(tags or {}))
             factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
             if factors:
                 file.build_overviews(factors, Resampling.nearest)
-    except (RasterioError, CPLE_BaseError, OSError) as error:
+    except (RasterioError, CPLE_BaseError) as error:
         raise StoreError(f"cannot write {path}: {error.__cause__ or error}") from error

@@ -1,4 +1,4 @@
-"""`swarm export --mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`.
+"""`runs export --format mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`.
 
 A viewer that jumps to an instant shows the last message of each topic. Each message therefore holds all of its
 topic: all vehicles, all routes, all marks; large topics are written less often. One message is made at a time.
@@ -40,13 +40,14 @@ from launch_scripts.gateways.ros2.ros_messages import (
 from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
 from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.run_folder import REPORT_FILE, read_report, replacing
+from launch_scripts.observe.run_folder import REPORT_FILE, read_report
 from launch_scripts.report.exporter import turns_of
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, GroundPace, RunTracks, Track, read_ground
 from launch_scripts.report.run_layers import free_places, groups_of, tracks_of_run
 from shared_map.terrain.map_frame import middles_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, StoreError
+from swarm.files import replacing
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
 
@@ -96,22 +97,19 @@ def _write(path: Path, timeline: Iterable[Told], types: RosTypes, facts: Mapping
     counts: Counter[str] = Counter()
     channels: dict[str, int] = {}
     schemas: dict[str, int] = {}
-    try:
-        with replacing(path) as half, half.open("wb") as file:
-            writer = Writer(file, compression=CompressionType.ZSTD)
-            writer.start(_PROFILE, f"terrain-swarm {importlib.metadata.version('terrain-swarm')}")
-            writer.add_metadata("run", dict(facts))
-            for now_ns, topic, message in timeline:
-                name = message.__msgtype__
-                if name not in schemas:
-                    schemas[name] = writer.register_schema(name, _SCHEMAS, types.definition_of(name).encode())
-                if topic not in channels:
-                    channels[topic] = writer.register_channel(topic, _MESSAGES, schemas[name])
-                writer.add_message(channels[topic], now_ns, types.pack(message, name), now_ns, counts[topic])
-                counts[topic] += 1
-            writer.finish()  # type: ignore[no-untyped-call]
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    with replacing(path) as half, half.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(_PROFILE, f"terrain-swarm {importlib.metadata.version('terrain-swarm')}")
+        writer.add_metadata("run", dict(facts))
+        for now_ns, topic, message in timeline:
+            name = message.__msgtype__
+            if name not in schemas:
+                schemas[name] = writer.register_schema(name, _SCHEMAS, types.definition_of(name).encode())
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, _MESSAGES, schemas[name])
+            writer.add_message(channels[topic], now_ns, types.pack(message, name), now_ns, counts[topic])
+            counts[topic] += 1
+        writer.finish()  # type: ignore[no-untyped-call]
     return counts
 
 

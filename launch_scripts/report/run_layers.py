@@ -1,4 +1,4 @@
-"""The layers of a run for a GIS: tracks, captures, routes and marks; and the files of `swarm export`."""
+"""The layers of a run for a GIS: tracks, captures, routes and marks; and the files of `swarm runs export`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from launch_scripts.report.exporter import (
 )
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
+from swarm.files import check_writable, writing
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 
@@ -154,10 +155,10 @@ WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {
 """Name of an export -> its layers."""
 
 
-ENDINGS = tuple(ending.removeprefix(".") for ending in FORMATS)
-"""The words of `swarm export --format`."""
+ENDINGS = (*(ending.removeprefix(".") for ending in FORMATS), "mcap")
+"""The words of `swarm runs export --format`."""
 
-# --- files of `swarm export` --------------------------------------------------------------------------------------
+# --- files of `swarm runs export` ---------------------------------------------------------------------------------
 
 
 def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None, force: bool) -> list[str]:
@@ -165,7 +166,7 @@ def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None,
 
     what    keys of `WHAT`; all if empty, of GPX all but areas
     format  an ending of `FORMATS` without its dot
-    out     folder to write to; one in the run's folder by default
+    out     folder to write to, or the file; a folder in the run's folder by default
     force   replace files that are there
     """
     tracks = tracks_of_run(folder)
@@ -197,16 +198,19 @@ def tracks_of_run(folder: Path) -> RunTracks:
 def free_places(folder: Path, names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
     """The paths of files of these names. Raises ConfigError before anything is written if one is there already."""
     to = folder / EXPORTED if out is None else out
+    if to.suffix.lower() == Path(names[0]).suffix and not to.is_dir():
+        if len(names) > 1:
+            raise ConfigError(f"--out {to}: found one file for {len(names)} layers; expected a folder, or --what")
+        to, names = to.parent, [to.name]
     if to.exists() and not to.is_dir():
         raise ConfigError(f"--out {to} is a file; expected a folder")
     paths = [to / name for name in names]
     there = [path for path in paths if path.exists()]
     if there and not force:
         raise ConfigError(f"{there[0]} is there already; --force replaces it, --out FOLDER writes elsewhere")
-    try:
+    with writing(to):
         to.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot make the folder {to}: {error.strerror or error}") from error
+    check_writable(to)
     return paths
 
 

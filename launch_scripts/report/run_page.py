@@ -6,6 +6,7 @@ import base64
 import io
 import re
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from launch_scripts.observe.fact_table import count, grouped
+from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
 from launch_scripts.report.run_picture import (
@@ -33,8 +34,10 @@ from launch_scripts.report.run_picture import (
 )
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
+from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text
-from swarm.errors import StoreError, writing
+from swarm.errors import StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 
 PAGE_FILE = "report.html"
@@ -54,8 +57,7 @@ def write_page(folder: Path) -> Path:
         text = page_of(folder, report)
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, ArithmeticError, TemplateError) as error:
         raise StoreError(f"{folder / REPORT_FILE} is damaged: {type(error).__name__}: {error}") from error
-    with writing(path):
-        write_file(path, text.encode())
+    write_file(path, text.encode())
     return path
 
 
@@ -80,8 +82,10 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         facts=headline(report, folder.resolve().name),
         cards=cards(report),
+        verdict=(said := str(report.get("verdict") or "")),
+        well=WELL in said,
         alarms=_alarms(report),
-        left_behind=_left_behind(report),
+        left_behind=left_behind(report),
         map=_map(folder, report),
         slower=SLOWER,
         quicker=QUICKER,
@@ -101,10 +105,13 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
     size = report.get("terrain") or {}
     grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
+    began = (report.get("made") or {}).get("began")
+    began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
     told = [
         Alarm(
             row["kind"], row["about"], row["text"], row["since_s"], row["over_s"],
-            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"],
+            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"], row.get("heard_s"),
+            began_ns,
         )
         for row in report.get("alarms") or []
     ]  # fmt: skip
@@ -113,18 +120,6 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
         for line, alarms in grouped(told, grid)
     ]
     return sorted(groups, key=lambda group: not group[1])
-
-
-def _left_behind(report: Mapping[str, Any]) -> list[str]:
-    """Returns unfinished business of vehicles, in sentences."""
-    vehicles, routed = report["vehicles"], report.get("vehicles_routed")
-    unrouted = 0 if routed is None else vehicles - routed
-    told = (
-        (report.get("lost"), "are lost at the end"),
-        (report.get("stranded"), "are stranded at the end"),
-        (unrouted, "never had a route"),
-    )
-    return [f"{count(number)} of {count(vehicles)} vehicles {words}" for number, words in told if number]
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:

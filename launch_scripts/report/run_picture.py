@@ -6,7 +6,6 @@ and switched: `vehicle:ID`, `target:ID`, `captures`; the one image in it is that
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.fact_table import count, duration, fact
-from launch_scripts.observe.palette import colours_of_groups, hillshade, rgb, round_length, said_length
+from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.run_arrays import RunTracks, Track
 from launch_scripts.report.run_layers import groups_of
@@ -165,13 +164,6 @@ def _draw_scale(axes: Axes, width_km: float, height_km: float) -> None:
     axes.text(0.968, 0.985, "↑\nN", transform=axes.transAxes, ha="center", va="top", fontsize=12, **look)
 
 
-def image_bytes(pixels: Pixels, format: str) -> bytes:
-    """Pixels as "WEBP" or "PNG"."""
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format, quality=88, method=2)
-    return file.getvalue()
-
-
 # --- the ground ---------------------------------------------------------------------------------------------------
 
 GROUND_FILE = "ground.webp"
@@ -207,7 +199,7 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: Floats | None) -
     seen = level_of(terrain, _MOST_CELLS)
     scale = _LONG_SIDE_PX / max(seen.grid.rows, seen.grid.cols)
     size = max(round(seen.grid.cols * scale), 1), max(round(seen.grid.rows * scale), 1)
-    photo = np.asarray(Image.fromarray(_photo(seen)).resize(size, Image.Resampling.BILINEAR), np.float32)
+    photo = np.asarray(Image.fromarray(palette.photo_of(seen)).resize(size, Image.Resampling.BILINEAR), np.float32)
     pixels = photo.copy()
     down, along = np.mgrid[: size[1], : size[0]]
     rising, falling = (down + along) % _HATCH_PX == 0, (down - along) % _HATCH_PX == 0
@@ -256,16 +248,6 @@ def hidden_cells(scenario: Scenario, terrain: Terrain, truth: NDArray[np.float32
     if scenario.terrain.hidden.class_factor:
         hidden &= np.isinf(truth)
     return hidden
-
-
-def _photo(seen: Level) -> Pixels:
-    """The photo with hillshade, paled so that tracks stand out."""
-    shade = hillshade(seen.elevation_m, seen.grid.resolution_m)
-    photo = seen.photo.astype(np.float32) / 255
-    grey = photo.mean(axis=2, keepdims=True)
-    paled = 0.55 * (0.65 * photo + 0.35 * grey) + 0.45
-    lit: Pixels = (255 * np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1)).astype(np.uint8)
-    return lit
 
 
 # --- learned factors ----------------------------------------------------------------------------------------------

@@ -23,8 +23,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from launch_scripts.observe import palette
-from launch_scripts.observe.run_folder import replacing
 from swarm.errors import StoreError
+from swarm.files import replacing
 
 Report = Mapping[str, Any]
 Values = NDArray[np.float64]
@@ -210,8 +210,8 @@ def saved(path: Path | io.BytesIO, size_in: tuple[float, float], dpi: int = 120,
         try:
             with contextlib.nullcontext(path) if isinstance(path, io.BytesIO) else replacing(path) as target:
                 figure.savefig(target, format="png", pil_kwargs={"compress_level": 4})
-        except (OSError, ValueError) as error:
-            raise StoreError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
+        except ValueError as error:  # too many pixels
+            raise StoreError(f"cannot write {path}: {error}") from error
 
 
 # --- of a study ---------------------------------------------------------------------------------------------------

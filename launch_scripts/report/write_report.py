@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, ended, write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, ended
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
-from swarm.errors import writing
+from swarm.files import write_file
 
 PICTURE_FILE = "report.png"
 
@@ -73,7 +74,6 @@ def write_report(
         GROUND_FILE,
         LEARNED_FILE,
         ground_picture,
-        image_bytes,
         learned_pixels,
     )
 
@@ -91,8 +91,7 @@ def write_report(
     if (factors != 1).any():
         contents[LEARNED_FILE] = lambda: image_bytes(learned_pixels(terrain, factors), "PNG")
     for name, content in contents.items():
-        with writing(folder / name):
-            write_file(folder / name, content())
+        write_file(folder / name, content())
     from launch_scripts.report.run_page import write_page
     from launch_scripts.report.run_picture import save_picture
 

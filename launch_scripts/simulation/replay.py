@@ -23,6 +23,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
+from swarm.files import write_file
 from swarm.recording.recording import path_of, versions
 from swarm.recording.records import FOLDER, SUFFIX, Called, Cut, Handled, Head, RecordReader, RecordWriter
 from swarm.recording.replaying import Outcome, Replaying, replay
@@ -192,7 +193,7 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
 
 
 def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
-    """Copies a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
+    """Copies a recording, up to a time, into a folder which `swarm runs replay` and a test can replay. Raises
     StoreError."""
     head, scenario = recorded.head, folder / SCENARIO_FILE
     path = path_of(folder, head.role, head.id, head.incarnation)
@@ -214,10 +215,8 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
         if writer.cut is not None:
             raise StoreError(writer.cut)
         if reader.damaged is not None:
-            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
-        scenario.write_bytes(head.scenario.encode())
-    except OSError as error:
-        raise StoreError(f"cannot write {scenario}: {error.strerror or error}") from error
+            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until-s")
+        write_file(scenario, head.scenario.encode())
     except StoreError:
         path.unlink(missing_ok=True)
         raise

@@ -76,6 +76,8 @@ class EventLog:
 
 
 BOOT_SPREAD_S = 0.3
+_STEPS_PER_S = 10
+"""Reports of progress in a simulated second."""
 BACKOFF_S = 0.5
 """Seconds from a crash to the next start; each further crash of the same process doubles them."""
 _STOP_S = 0.1
@@ -250,11 +252,19 @@ def simulate(
     return run_to_end(Simulation(scenario, faults=faults, trace=trace, record_to=record_to))
 
 
-def run_to_end(simulation: Simulation) -> SimulationResult:
-    """Runs a simulation for the seconds of its scenario."""
+def run_to_end(
+    simulation: Simulation, tell: Callable[[str, float], None] = lambda what, share: None
+) -> SimulationResult:
+    """Runs a simulation for the seconds of its scenario.
+
+    tell  called after each tenth of a second with what is done, and the share of it
+    """
     seconds = simulation.scenario.seconds
     began_s = time.perf_counter()
     with collected_rarely():
+        for step in range(1, round(seconds * _STEPS_PER_S)):
+            simulation.run_until(step / _STEPS_PER_S)
+            tell("simulating", step / _STEPS_PER_S / seconds)
         simulation.run_until(seconds)
         simulation.finish()
     simulation.log.flush()

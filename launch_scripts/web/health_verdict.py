@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+from launch_scripts.plain_text import Duration
 from launch_scripts.web import Page, Reply
 from swarm.clock import NS_PER_S
 from swarm.runtime.health import Phase, Vitals
@@ -35,7 +36,7 @@ class Process(NamedTuple):
         if self.vitals is None:
             return "starts", None, ("its start",)
         if self.vitals.hangs(now_ns):
-            wrong = f"its loop hangs for {(now_ns - self.vitals.stamp_ns) / NS_PER_S:.0f} s"
+            wrong = f"its loop hangs for {Duration((now_ns - self.vitals.stamp_ns) / NS_PER_S)}"
             return "hangs", wrong, (wrong,)
         return self.vitals.phase.name.lower(), None, self.vitals.lacks
 

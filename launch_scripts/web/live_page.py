@@ -1,4 +1,4 @@
-"""The page of the live view: the files of rerun's web viewer, and what they show of the run beside it.
+"""The page of the live view: a start page at once, then rerun's web viewer, and beside both how the run is.
 
 rerun's own function serves to the whole network, and its page calls home, for usage data among other things; the
 policy of our server stops that. The page's files are found only inside the viewer program, so it is started for a
@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import logging
+import math
 import os
 import socket
 import subprocess
@@ -23,32 +24,42 @@ from collections.abc import Callable, Mapping
 from email.message import Message
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from launch_scripts import parent_death
 from launch_scripts.web import LOOPBACK, Page, Reply
 from launch_scripts.web.server import Server
-from swarm.errors import StoreError
+from shared_map.terrain.terrain import Terrain
+from swarm.errors import BusError, StoreError
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 _FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
 _BANNER = "/run_banner.js"
+_START_PAGE = f'<!doctype html><title>terrain swarm</title><body><script src="{_BANNER}"></script>'.encode()
+_POLLED_WITHIN_S = 5.0
+"""Pages poll once a second; a machine that draws without a graphics card is late at times."""
 _READY_WITHIN_S = 20.0
+PORT_PATIENCE_S = 3.0
+"""A port that is in use is waited for so long: after a restart the one before may still have it."""
 _LASTS_S = 120.0
 """The page has 40 MB, and a tunnel may be slow."""
 
 
 class LivePage:
-    """Serves the page of the web viewer, and its stream; a visit to `/` leads to both. Raises BusError if it cannot
-    listen on the port; 0 is any.
+    """Serves a start page, and once a stream is there the page of the web viewer, to which the start page leads.
+    Raises BusError if it cannot listen on the port; 0 is any.
 
-    stream  address of rerun's server
+    run      information about the run that pages poll, see `run_banner.js`
+    terrain  of which the start page shows a picture; None while there is none
     """
 
-    def __init__(self, port: int, stream: tuple[str, int]) -> None:
-        self.run: Callable[[], Mapping[str, Any]] = dict
-        """Information about the run that the page polls, see `run_banner.js`."""
+    def __init__(
+        self, port: int, run: Callable[[], Mapping[str, Any]] = dict, terrain: Terrain | None = None
+    ) -> None:
+        self.run, self.terrain = run, terrain
+        self._asked_s = -math.inf
         self._files: dict[str, Reply] = {}
         self._fetching = threading.Lock()
         banner = Path(__file__).with_name("run_banner.js").read_bytes()
@@ -56,15 +67,43 @@ class LivePage:
         pages |= {
             "/": self._entrance,
             _BANNER: lambda query, headers: Reply(200, "text/javascript", banner),
-            "/run.json": lambda query, headers: Reply(200, "application/json", json.dumps(self.run()).encode()),
+            "/run.json": self._told,
+            "/terrain.webp": self._picture,
         }
-        self.server = Server("web_port", port, pages, behind=stream, lasts_s=_LASTS_S)
+        self.server = Server("web_port", port, pages, lasts_s=_LASTS_S)
+
+    def opens(self, stream: tuple[str, int]) -> None:
+        """Passes requests for the stream on to rerun's server from now on."""
+        self.server.behind = stream
+
+    @property
+    def is_open(self) -> bool:
+        """True while a page polls, be it before its viewer has a stream."""
+        return time.monotonic() - self._asked_s < _POLLED_WITHIN_S
+
+    def _told(self, query: str, headers: Message) -> Reply:
+        self._asked_s = time.monotonic()
+        if self.server.behind is not None and not self._files and not self._fetching.locked():
+            threading.Thread(
+                target=self._file, args=("/", query, headers), name="viewer-files", daemon=True
+            ).start()
+        told = {**self.run(), "view": bool(self._files), "picture": self.terrain is not None}
+        return Reply(200, "application/json", json.dumps(told).encode())
+
+    def _picture(self, query: str, headers: Message) -> Reply:
+        from launch_scripts.observe.palette import terrain_picture  # NumPy, and PIL
+
+        if self.terrain is None:
+            return Reply(404, "text/plain", b"the terrain is not prepared yet\n")
+        return Reply(200, "image/webp", terrain_picture(self.terrain))
 
     def _entrance(self, query: str, headers: Message) -> Reply:
         """Leads a visit without a query to the stream, which comes through the page's own port: so a tunnel needs
         one port, and may begin at any."""
         if query:
             return self._file("/", query, headers)
+        if not self._files:
+            return Reply(200, "text/html; charset=utf-8", _START_PAGE)
         told = {"url": f"rerun+http://{headers['host']}/proxy", "theme": "dark", "hide_welcome_screen": "1"}
         return Reply(302, "text/plain", b"", {"Location": f"/?{urllib.parse.urlencode(told)}"})
 
@@ -78,6 +117,20 @@ class LivePage:
                     told = b"the viewer program cannot be started; see the monitor's log\n"
                     return Reply(503, "text/plain", told)
         return self._files[path]
+
+
+def when_free(listen: Callable[[], T]) -> T:
+    """Listens on a port, and waits for one which is still in use. Raises BusError."""
+    deadline_s = time.monotonic() + PORT_PATIENCE_S
+    while True:
+        try:
+            return listen()
+        except BusError as error:
+            if time.monotonic() > deadline_s:
+                raise BusError(
+                    f"no live view: monitor.{error}; choose another, 0 for any, or monitor.live = false"
+                ) from error
+        time.sleep(0.1)
 
 
 def viewer_program() -> Path:

@@ -1,5 +1,6 @@
 // Says on the live page what the viewer does not: that it is behind, that the run is over, that the view was begun
-// anew. Asks /run.json once a second.
+// anew. Before the viewer has anything to show it covers the page by another: the run, its terrain and figures, and how
+// far the 3D view is. Asks /run.json once a second.
 (() => {
   const BEHIND_S = 4;
   const LOOKS = 3; // in a row, so that a moment's delay is not told
@@ -9,6 +10,16 @@
     "position:fixed;left:50%;top:40px;transform:translateX(-50%);z-index:10;display:none;max-width:90vw;" +
     "padding:8px 14px;border-radius:6px;background:#e0a030;color:#111;font:14px/1.4 sans-serif;text-align:center";
   document.body.appendChild(banner);
+  const start = document.createElement("div");
+  start.id = "run-start";
+  start.style.cssText =
+    "position:fixed;inset:0;z-index:9;overflow:auto;padding:32px;background:#0d1011;color:#e8eaed;" +
+    "font:16px/1.5 sans-serif;white-space:pre-line";
+  const parts = {};
+  for (const name of ["h1", "p", "img", "pre"]) start.appendChild((parts[name] = document.createElement(name)));
+  parts.img.style.cssText = "display:block;max-width:min(900px,100%);max-height:60vh;border-radius:6px";
+  parts.pre.style.cssText = "font:14px/1.5 sans-serif;white-space:pre-line";
+  document.body.appendChild(start);
   let run = null, failures = 0, late = 0;
 
   // The fields of a protobuf message: [[number, value], ...]; a value is a BigInt or the bytes of what is inside.
@@ -58,6 +69,26 @@
     }
   }
 
+  // How far the 3D view is. The viewer's own page says in an element how much of its program has come.
+  function waits_for(run, viewer) {
+    const own = viewer && document.getElementById("center_text");
+    if (own && own.querySelector("a")) return ""; // it cannot go on, and says why
+    if (window._handle) return "3D view: waiting for its first picture";
+    if (viewer) return `3D view: its program is loading ${document.getElementById("status")?.textContent.trim() ?? ""}`;
+    return run.view ? "3D view: opening" : "3D view: not begun yet";
+  }
+
+  function cover(run) {
+    const viewer = document.querySelector("canvas") !== null, text = waits_for(run, viewer);
+    start.style.display = text && taken_s() === null ? "block" : "none";
+    parts.h1.textContent = run.name ?? "";
+    parts.p.textContent = [run.over ? "The run is over." : run.state, text].filter(Boolean).join("\n");
+    parts.pre.textContent = (run.figures ?? []).join("\n");
+    if (run.picture && !parts.img.src) parts.img.src = "/terrain.webp";
+    if (!viewer && run.view)
+      location.replace(`/?url=rerun%2Bhttp%3A%2F%2F${encodeURIComponent(location.host)}%2Fproxy&theme=dark&hide_welcome_screen=1`);
+  }
+
   function say(text) {
     if (banner.textContent !== text) banner.textContent = text;
     banner.style.display = text ? "block" : "none";
@@ -86,8 +117,9 @@
       const reply = await fetch("/run.json", { cache: "no-store", signal: AbortSignal.timeout(4000) });
       const now = await reply.json();
       failures = 0;
-      if (run !== null && now.life !== run.life) return say("The view was started anew: reload this page.");
+      if (run?.life && now.life !== run.life) return say("The view was started anew: reload this page.");
       run = now;
+      cover(run);
       tell(run.over ? "The run is over, at" : "");
     } catch (error) {
       failures += 1;
@@ -96,4 +128,5 @@
   }
 
   setInterval(look, 1000);
+  look();
 })();

@@ -1,4 +1,4 @@
-"""Lower bounds on the optimum, for many cells at once; docs/certificates.md proves them.
+"""Lower bounds on the optimum, for many cells at once; docs/method/certificates.md proves them.
 
 `_by_heuristic` is the landmark bound of ALT (A. V. Goldberg, C. Harrelson, "Computing the shortest path: A* search
 meets graph theory", SODA 2005) with one landmark, an earlier root: its exact costs are a consistent heuristic, so

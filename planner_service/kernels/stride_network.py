@@ -5,7 +5,7 @@ At stride s the map is cut into blocks of s x s cells. A *node* is a connected c
 that legal steps inside the block join, so that a wall through a block makes two nodes of it. Each has a centre, one
 of its cells. A *link* joins two nodes where a legal step leads from one to the other, and has the cheapest way
 between their centres through that step and otherwise inside the two. Cut so, no wall is jumped, and whatever single
-steps connect is connected at every stride: `docs/certificates.md` has the proof.
+steps connect is connected at every stride: `docs/method/certificates.md` has the proof.
 
 Arrays, beside those of `layout`:
     node    int32  (size,)   which node of a stride each cell belongs to; -1 where it is lethal

@@ -83,7 +83,7 @@ _LETHAL = 0x7F8
 class Rounding:
     """Bound on the error of float32 in the labels of trees, on a map with the current cell costs.
 
-    docs/certificates.md says why that is enough. It is immutable, so that snapshots share it.
+    docs/method/certificates.md says why that is enough. It is immutable, so that snapshots share it.
 
     classes  how many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide
     """

@@ -1,4 +1,4 @@
-"""Proven lower bounds on the time to the target: docs/certificates.md says why they hold."""
+"""Proven lower bounds on the time to the target: docs/method/certificates.md says why they hold."""
 
 from __future__ import annotations
 

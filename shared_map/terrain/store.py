@@ -36,7 +36,8 @@ from swarm.config.input_files import FileKind, read_text
 from swarm.config.load import BUILT_IN_TERRAINS
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
-from swarm.errors import TerrainError
+from swarm.errors import StoreError, TerrainError
+from swarm.files import write_file, writing
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
@@ -125,18 +126,12 @@ def save_ground(meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[
         notes=terrain.notes,
     )
     folder = meta_file.parent
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         meta_file.unlink(missing_ok=True)
-        for name, array in every.items():
-            save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
-        partial = meta_file.with_name(f"{meta_file.name}.part")
-        partial.write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
-        partial.rename(meta_file)
-    except OSError as error:
-        raise TerrainError(
-            f"cannot write the prepared {meta_file.stem} to {folder}: {error.strerror or error}"
-        ) from error
+    for name, array in every.items():
+        save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
+    write_file(meta_file, msgspec.json.format(msgspec.json.encode(meta), indent=1))
 
 
 def read_ground(meta_file: Path, meta: Description, heights_m: Floats) -> dict[str, Any]:
@@ -329,11 +324,11 @@ def keep(key: str, files: Iterable[Path]) -> None:
         for path in files:
             _link(path, partial / path.name)
         sums = {path.name: _sum(path) for path in files}
-        (partial / _SUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
+        write_file(partial / _SUMS, json.dumps(sums, indent=1).encode())
         partial.rename(root / key)
         _evict(root)
-    except OSError as error:
-        log.info("the terrain is not kept in %s: %s", root, error.strerror or error)
+    except (OSError, StoreError) as error:
+        log.info("the terrain is not kept in %s: %s", root, error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -345,10 +340,8 @@ def keep_beside(key: str, file: Path) -> None:
         with _locked(folder):
             sums = json.loads((folder / _SUMS).read_text(encoding="utf-8")) | {file.name: _sum(file)}
             _link(file, folder / file.name)
-            partial = folder / f"{_SUMS}.part"
-            partial.write_text(json.dumps(sums, indent=1), encoding="utf-8")
-            partial.replace(folder / _SUMS)
-    except (OSError, ValueError, TypeError) as error:
+            write_file(folder / _SUMS, json.dumps(sums, indent=1).encode())
+    except (OSError, StoreError, ValueError, TypeError) as error:
         log.info("%s is not kept in %s: %s", file.name, folder, error)
 
 

@@ -82,12 +82,12 @@ def _why_silent(endpoint: str, encrypted: bool) -> str:
     except TimeoutError:
         return f"no answer within {_KNOCK_S:g} s (is a firewall between?)"
     except ConnectionRefusedError:
-        return "no process listens there (is `swarm router` running there?)"
+        return "no process listens there (is `swarm role router` running there?)"
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)
     if encrypted:
         return (
             "a process listens there, but refuses us or is not a router "
-            "(is `swarm router` running there, with certificates of the same authority?)"
+            "(is `swarm role router` running there, with certificates of the same authority?)"
         )
-    return "a process listens there, but does not reply as a router (is `swarm router` running there?)"
+    return "a process listens there, but does not reply as a router (is `swarm role router` running there?)"

@@ -1,4 +1,4 @@
-"""Orders to a running swarm, as `swarm pause`, `swarm zone` and the other commands give them."""
+"""Orders to a running swarm, as `swarm pause`, `swarm order zone` and the other commands give them."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, missing
 from swarm.grid import GridSpec
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
@@ -140,7 +140,7 @@ class Frame:
             from pyproj import CRS, Transformer
             from pyproj.exceptions import CRSError
         except ModuleNotFoundError as error:
-            raise ConfigError("latitudes and longitudes need pyproj: install the extra 'wgs84'") from error
+            raise ConfigError(f"latitudes and longitudes need {missing('pyproj')}") from error
         try:
             system = CRS.from_user_input(self.crs)
             degrees = _degrees_of(system)

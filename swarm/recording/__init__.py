@@ -14,3 +14,7 @@ A service is deterministic but for what it reads, so a recording is enough to re
 Results of a worker's jobs are not recorded, only when they were taken and what the job read: the job runs again.
 Outputs are recorded as digests: a recording shows that an output differs, but not its content.
 """
+
+from swarm.errors import require
+
+require(__name__, "numpy")

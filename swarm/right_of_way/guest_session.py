@@ -223,7 +223,7 @@ class GuestSession:
 
     The vehicle drives into a cell only while `may_enter` of it is true, and says which it has left. At its end the
     session leaves. A program that dies leaves its cells shut, until the next one of the same name and file enters,
-    or an operator removes the vehicle (`swarm vehicle gone`).
+    or an operator removes the vehicle (`swarm order vehicle forget`).
 
     name   of the vehicle, unlike all agents of the scenario
     grid   of the run's map
@@ -399,7 +399,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     while (now_ns := clock.now_ns()) < until_ns:
         match inbox.take(_TICK_S):
             case Appeared(peer) if peer.id == name:
-                raise ConfigError(f"{name} is alive: end its program, or let it leave with `swarm vehicle remove`")
+                raise ConfigError(f"{name} is alive: end its program, or use `swarm order vehicle remove`")
             case Replied(message=Known() as known) if known.agents:
                 if name in known.agents:
                     raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
+from swarm.files import write_file
 
 BEAT_NS = NS_PER_S // 5
 """Period at which an unchanged statement is repeated: by it members know of a warden, and a warden of its hosts."""
@@ -77,12 +78,7 @@ class LifeFile(MemoryLives):
 
     def save(self, lives: Sequence[int]) -> None:
         super().save(lives)
-        draft = self._path.with_name(f"{self._path.name}.draft")
-        try:
-            draft.write_text("".join(f"{life}\n" for life in lives))
-            draft.replace(self._path)
-        except OSError as error:
-            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
+        write_file(self._path, "".join(f"{life}\n" for life in lives).encode())
 
     def close(self) -> None:
         if self._lock >= 0:

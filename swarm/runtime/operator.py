@@ -27,7 +27,7 @@ _FIND_S = 3.0
 """Longest wait for all members to say who they are: some ticks of a process that is behind."""
 _ORDER_S = 5.0
 """Longest wait for a keeper, which answers once the order is on its disk."""
-_OBEY_S = 3.0
+OBEY_S = 3.0
 """Longest wait for all to obey. An order reaches who misses it with the next word of a keeper, a second later."""
 _LEAVE_S = 0.3
 """After the last answer, time for tokens of those who leave to fall: Zenoh takes 3 to 8 ms for a killed process."""
@@ -56,7 +56,7 @@ class Operator:
     patience_s  how long to wait for processes to obey
     """
 
-    def __init__(self, bus: Bus, patience_s: float = _OBEY_S) -> None:
+    def __init__(self, bus: Bus, patience_s: float = OBEY_S) -> None:
         self._bus = bus
         self._patience_s = patience_s
         self._roster: Roster | None = None

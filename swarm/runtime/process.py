@@ -19,8 +19,6 @@ from contextlib import contextmanager, suppress
 from typing import Protocol
 from zlib import crc32
 
-import psutil
-
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.health import Health
@@ -240,6 +238,8 @@ class Process:
                 if now_ns >= usage_due_ns:
                     usage_due_ns = now_ns + NS_PER_S
                     counters.gauge(CPU_S, time.process_time())
+                    import psutil
+
                     counters.gauge(RSS_BYTES, float(psutil.Process().memory_info().rss))
                 self._service.tick(now_ns)
                 if self._health is not None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET
+from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET, np
 from swarm.wire.messages.processes import Stats
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 CAPTURES_OF = "captures_of"
 """Per target, by the process that moves the targets."""
@@ -30,6 +32,8 @@ LEARNED = "learned."
 """Gauges, each followed by a class of ground: by what its prior pace is multiplied, as vehicles have measured."""
 CPU_S = "cpu_s"
 """Gauge: seconds of CPU that a process has used since it began."""
+VIEWERS = "viewers"
+"""Gauge of a monitor: connections of people who look at the live view now."""
 RSS_BYTES = "rss_bytes"
 """Gauge: memory that a process has in use, with what it shares."""
 ENDED = "ended"

@@ -9,5 +9,5 @@
 - `route_columns` has routes one by one, as arrays and as columns.
 
 A value is bounded where it enters and trusted inside. A new message needs a struct and a row of the table;
-`docs/wire.md` and `docs/wire.lock` are made of both.
+`docs/reference/wire.md` and `docs/wire.lock` are made of both.
 """

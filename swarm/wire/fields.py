@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, missing
 from swarm.grid import MOST_PLOTS
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ else:
             try:
                 import numpy
             except ModuleNotFoundError as error:
-                raise ConfigError("this needs NumPy: install the extra 'all' (docs/start/install.md)") from error
+                raise ConfigError(f"this needs {missing('numpy')}") from error
             value = getattr(numpy, name)
             setattr(self, name, value)
             return value
@@ -83,10 +83,9 @@ class Column:
     checked: bool = True
 
     def describe(self) -> str:
-        """Returns the text for the reference of the wire: "column of float32, 0 ... inf"."""
+        """Returns the text for the reference of the wire: "float32[ids]"."""
         dtype = self.dtype
-        name = f"column of {name_of(dtype)}" if isinstance(dtype, str) else f"rows of {width_of(dtype)} bytes"
-        return name + (f", one for each of `{self.per}`" if self.per else "")
+        return f"{name_of(dtype) if isinstance(dtype, str) else f'row{width_of(dtype)}'}[{self.per}]"
 
 
 @dataclass(frozen=True, slots=True)

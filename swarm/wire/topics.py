@@ -1,5 +1,6 @@
-"""The topics: every key of the wire with its message, rate and quality of service. `docs/wire.md` is made of
-them."""
+"""The topics: every key of the wire with its message, rate and quality of service.
+
+`docs/reference/wire.md` is made of them."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ class Topic:
 
     key        template below the namespace; `{name}` stands for one chunk
     message    the published message, or the reply to a query
-    what       its meaning, for `docs/wire.md`
-    rate       how often it is put or asked, for `docs/wire.md`
+    what       its meaning, for `docs/reference/wire.md`
+    rate       how often it is put or asked, for `docs/reference/wire.md`
     access     which roles may put, serve, ask and hear it
     request    for a queryable: the query; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it

@@ -10,6 +10,6 @@ from bench.harness import BENCHMARKS, load
 from launch_scripts.command_line.run_command import run_command
 
 if __name__ == "__main__":
-    # Only what is asked for is imported: kernels, Zenoh and rasterio take seconds.
+    # Imports are lazy: kernels, Zenoh and rasterio take seconds to import.
     asked = [word for word in sys.argv[1:2] if word in BENCHMARKS]
     sys.exit(run_command(lambda: typer.main.get_command(load(asked or BENCHMARKS)), "./launch_scripts/bench"))

@@ -1,4 +1,4 @@
-"""What all benchmarks share: their command, progress, tables, pictures, pages, JSON, the machine and repetition.
+"""The base of all benchmarks: their command, progress, tables, pictures, pages, JSON, the machine and repetition.
 
 A benchmark is a function which measures and returns its figures: values by name, and rows (dictionaries with the
 same names) in lists. `@benchmark` makes a command of it, whose options are the function's parameters, and adds
@@ -336,7 +336,8 @@ def _command_line(context: typer.Context) -> str:
 
 
 def _replace_section(page: Path, heading: str, text: str) -> None:
-    """Puts the text under the heading of a page, in place of what is there, or at the end. Raises StoreError."""
+    """Puts the text under the heading of a page: it replaces the old section, or is added at the end. Raises
+    StoreError."""
     try:
         whole = page.read_text(encoding="utf-8") if page.exists() else "# Figures\n"
         before, _, rest = f"{whole.rstrip()}\n".partition(f"\n## {heading}\n")

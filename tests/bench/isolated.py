@@ -24,8 +24,8 @@ TESTS = Path(__file__).parents[1]
 
 
 def isolated(work: Callable[..., Any], *arguments: Any, environment: dict[str, str] | None = None) -> Any:
-    """What a function returns in a process of its own. Arguments and result are such as JSON has. Raises
-    SwarmError, with the last line that the process wrote, if it fails or hangs."""
+    """Returns the result of a function that runs in its own process. Arguments and result are such as JSON has.
+    Raises SwarmError, with the last line that the process wrote, if it fails or hangs."""
     from swarm.errors import SwarmError
 
     name = f"{work.__module__}:{work.__name__}"
@@ -57,9 +57,10 @@ class TimeLimit:
 
 def peak_bytes(work: Callable[[], object]) -> int:
     """By how much the resident memory of this process rises at most. Raises OSError where it is not known."""
-    with suppress(OSError, AttributeError):  # only glibc has it: what was freed before is not to be taken again
+    with suppress(OSError, AttributeError):  # only glibc has it: freed memory shall not be reused
         ctypes.CDLL(None).malloc_trim(0)
-    # The kernel alone keeps the highest mark, and psutil does not read it. It starts again at what is resident now.
+    # The kernel alone keeps the highest mark, and psutil does not read it. It starts again at the memory that is
+    # resident now.
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     before = status_bytes("VmRSS")
     kept = work()

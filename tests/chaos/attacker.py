@@ -21,7 +21,7 @@ _KEYS = 5000
 
 
 class Attacker:
-    """A session of its own. What it says itself it does not hear, so what it hears is genuine."""
+    """A session of its own. It does not hear its own messages, so everything it hears is genuine."""
 
     def __init__(self, network: NetworkConfig) -> None:
         # The router may be dead for a while: an attacker waits longer than a process.
@@ -64,7 +64,7 @@ class Attacker:
             ear.undeclare()
 
     def say(self, key: str, payload: bytes, code: bytes | None) -> None:
-        # As our own processes put: to block would wait for the slowest reader of the run.
+        # Like the puts of our own processes: to block would wait for the slowest reader of the run.
         dropping = zenoh.CongestionControl.DROP
         self._bus.session.put(key, payload, congestion_control=dropping, attachment=code)
 

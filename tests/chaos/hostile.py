@@ -1,4 +1,4 @@
-"""Hostile messages, made of what was heard and of the table of topics. Pure."""
+"""Hostile messages, made from recorded messages and from the table of topics. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KINDS = ("flipped", "numbers", "replayed", "lies")
 """flipped   a few bits of a message that was said
 numbers   fields of one, replaced by what no field should be
 replayed  said once more, byte for byte
-lies      well-formed, by somebody whom it does not come from, within all bounds"""
+lies      well-formed, within all bounds, from a sender to which it does not belong"""
 _BIG = (1 << 61) + 12345
 _KEPT = 32
 """Payloads kept of each key: a replay may be seconds old."""
@@ -32,7 +32,7 @@ class Hostile:
         self._fuzzer = fuzzer
         self._chance = random.Random(f"hostile/{seed}")
         self._heard: dict[str, deque[tuple[bytes, bytes | None]]] = {}
-        """Key -> what was said under it lately, each with its code."""
+        """Key -> the latest payloads under it, each with its code."""
         self._keys: list[str] = []
 
     def heard(self, key: str, payload: bytes, code: bytes | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What a run under faults came to: recovery after each, what the processes take up, and the laws. Pure."""
+"""The results of a run under faults: recovery after each, resource use of the processes, and the laws. Pure."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """What all processes took up at one time, when none was missing."""
+    """Resource use of all processes at one time, when none was missing."""
 
     at_s: float
     rss_mb: float
@@ -187,7 +187,7 @@ class Recovery:
 
     @property
     def reported(self) -> bool:
-        """Whether every vehicle has been heard of."""
+        """True if every vehicle has reported."""
         return len(self._last) >= len(self._vehicles)
 
     def over(self, at_s: float) -> None:
@@ -211,11 +211,11 @@ class Recovery:
                 self._moved_s.setdefault(id, at_s)
 
     def routed_s(self) -> float | None:
-        """When the last vehicle was routed again; None while one is not."""
+        """Time at which the last vehicle was routed again; None while one is not."""
         return self._last_of(self._routed_s)
 
     def moving_s(self) -> float | None:
-        """When the last vehicle moved again; None while one does not."""
+        """Time at which the last vehicle moved again; None while one does not."""
         return self._last_of(self._moved_s)
 
     def standing(self) -> list[str]:

@@ -43,9 +43,9 @@ _WATCH_S = 30.0
 _SCAN_S = 0.2
 _SAMPLE_S = 1.0
 _AT_ONCE = 100
-"""Hostile messages between two looks at what is heard."""
+"""Hostile messages between two checks of the received messages."""
 _MATERIAL_S = 1.0
-"""So long before each burst everything that is said is kept as material."""
+"""All messages in these seconds before each burst are kept as material."""
 _MESSAGES_PER_S = 2000.0
 """Faster ones would be dropped by our own session, and not reach the router."""
 _MARGIN_S = 600.0
@@ -53,11 +53,11 @@ _MARGIN_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a swarm is tried.
+    """Options of a run under faults.
 
     scenario  a file or a built-in name
     seconds   the run ends after so long; None: with the messages
-    messages  the run ends with so many hostile messages; None: with the seconds
+    messages  number of hostile messages after which the run ends; None: it ends with the seconds
     every_s   from one fault to the next, at least
     kinds     which faults
     within_s  a fault from which the swarm recovers later breaks a law
@@ -317,7 +317,7 @@ class ChaosRun:
     # --- watching -------------------------------------------------------------------------------------------
 
     def _listen(self, attacker: Attacker, seconds: float) -> None:
-        """Take in what is said for so long; look at the processes when it is time."""
+        """Listens for this many seconds; checks the processes when it is time."""
         until_s = self._now_s + seconds
         while True:
             for payload in attacker.reports(min(max(until_s - self._now_s, 0.0), 0.05)):
@@ -346,19 +346,19 @@ class ChaosRun:
                     )
 
     def _scan(self) -> None:
-        """Who runs now; who has ended without being killed."""
+        """Scans for processes that run now, and for those that have ended without being killed."""
         gone = [(name, pid) for name, pid in self._pids.items() if has_ended(pid)]
         for name, pid in gone:
             del self._pids[name]
             if pid not in self._killed:
                 self.results.ended.append(Ended(at_s=self._now_s, name=name, reason=self._reason(name)))
                 tell(f"{name} ended by itself at {self._now_s:.1f} s")
-        # To search costs more than all else here, so only what is missing is searched for.
+        # A search is the most expensive part, so only missing entries are searched.
         if len(self._pids) < len(self._names):
             self._pids.update(processes(self.run_dir))
 
     def _reason(self, name: str) -> str:
-        """What the launcher said of it last."""
+        """The last sentence of the launcher about it."""
         with contextlib.suppress(OSError):
             lines = (self.run_dir / "up.log").read_text(errors="replace").splitlines()
             return next((line[:300] for line in reversed(lines) if line.startswith(f"{name}: ")), "without a word")

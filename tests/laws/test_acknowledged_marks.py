@@ -1,5 +1,5 @@
-"""What a keeper acknowledged, and nobody took back after that, is in the end on all replicas: whoever was cut off,
-taken for dead, killed or started again meanwhile, and whatever was compacted.
+"""A mark that a keeper acknowledged, and that was not taken back, reaches all replicas in the end. This holds
+through cuts, false deaths, kills, restarts and compaction.
 
 By hand, with more examples: `PYTHONPATH=.:tests python tests/laws/test_acknowledged_marks.py 2000`"""
 
@@ -48,7 +48,7 @@ def steps() -> st.SearchStrategy[Step]:
 
 
 class History:
-    """Authors, two keepers and a listener; what was ever stated, and what keepers acknowledged."""
+    """Authors, two keepers and a listener; all statements so far, and those which keepers acknowledged."""
 
     def __init__(self) -> None:
         self.links = LossyLinks(1, jitter_ms=20)
@@ -102,7 +102,7 @@ class History:
         self.swarm.run(seconds)
 
     def look(self) -> None:
-        """Note what stands and what is acknowledged now."""
+        """Notes the current statements and acknowledgements."""
         for author in self.authors.values():
             name = author.replica.author
             assert name is not None
@@ -127,7 +127,7 @@ class History:
         return found
 
     def quiet(self) -> None:
-        """All links are good again, the keepers run, and nobody states anything more."""
+        """All links are good again, the keepers run, and no author makes another statement."""
         for keeper in KEEPERS:
             self.start(keeper)
         self.take(("cut", ()))

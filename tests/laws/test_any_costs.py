@@ -1,4 +1,4 @@
-"""Whatever a map is said to cost: a tree is exact on it, or the map is refused, and nothing overflows."""
+"""Any costs of a map: a tree is exact on them, or the map is refused, and nothing overflows."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WEIGHTS = st.sampled_from([0.0, 0.0, 1e-30, 0.5, 1e12])
 
 @pytest.fixture(scope="module", autouse=True)
 def quiet() -> Iterator[None]:
-    """Maps at the bounds are what is drawn here; what the log says of each is not looked at."""
+    """Maps at the bounds are drawn here; the log about each is not checked."""
     log = logging.getLogger("planner_service.tree.cost_grid")
     log.setLevel(logging.ERROR)
     yield

@@ -76,7 +76,7 @@ class Heard:
     report: Body
     at_ns: int
     awake_ns: int = 0
-    """How long the process has listened since."""
+    """Time for which the process has listened since."""
 
 
 @dataclass
@@ -102,7 +102,7 @@ class Twin:
         return closed
 
     def may(self) -> set[int]:
-        """All that any report says whose lease lasts."""
+        """All claims of reports whose lease lasts."""
         closed: set[int] = set()
         for each in self.heard:
             report = each.report
@@ -215,7 +215,7 @@ def grant(agent: Agent, seq: int, cells: dict[str, list[int]]) -> None:
 
 @dataclass
 class Driven:
-    """What became of a random drive among random bodies."""
+    """The outcome of a random drive among random bodies."""
 
     steps: int = 0
     avoided: int = 0

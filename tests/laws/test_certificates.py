@@ -1,4 +1,5 @@
-"""What planners say of their routes holds under every rule, strategy and life; and checks see what does not."""
+"""Planners' claims about their routes hold under every rule, strategy and history; the checks find a false
+claim."""
 
 from __future__ import annotations
 

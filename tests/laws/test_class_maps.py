@@ -1,5 +1,6 @@
-"""The map of a class follows from what is held alone: however marks for all, marks for one class, zones and what is
-learned came, ended and went, each class has the map that one has who hears all that is held at once."""
+"""The map of a class follows from the held sets alone. Marks for all, marks for one class, zones and learned
+factors may come, end and leave in any order: the map equals that of a replica which receives the held sets at
+once."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ NUMBERS = {"walker": 1, "truck": 3}
 
 
 class History:
-    """A replica with the maps of two classes, and what comes to it."""
+    """A replica with the maps of two classes, and the input that it receives."""
 
     def __init__(self, seed: int) -> None:
         self.rng = rng = np.random.default_rng(seed)
@@ -90,7 +91,7 @@ class History:
             self.replica.read_groups(None if self.rng.integers(2) else frozenset(["all"]))
 
     def check(self) -> None:
-        for _ in range(4):  # what is learned changes the map some seconds later at most
+        for _ in range(4):  # learned factors change the map some seconds later at most
             self.now_ns += 40 * NS_PER_S
             self.replica.tick(self.now_ns)
         other, maps = self.anew()

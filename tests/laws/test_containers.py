@@ -1,4 +1,4 @@
-"""Containers of a plan: each process once and by itself, nobody root, keys with their owners. And the example for
+"""Containers of a plan: each process once and by itself, none as root, keys with their owners. And the example for
 Kubernetes: pods as the standard "restricted" wants them, valid by its schemas."""
 
 from __future__ import annotations
@@ -72,9 +72,8 @@ def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> 
 
 @pytest.mark.parametrize("name", PODS)
 def test_the_command_line_takes_the_words_of_a_pod(name: str) -> None:
-    role, *words = PODS[name]["spec"]["containers"][0]["args"]
-    context = command().make_context("swarm", [role, *words], resilient_parsing=True)
-    taken = command().get_command(context, role).make_context(role, words).params
+    _, role, *words = PODS[name]["spec"]["containers"][0]["args"]
+    taken = command().commands["role"].commands[role].make_context(role, words).params
     assert (taken["health_port"], taken["signals_address"], taken["log_format"]) == (HEALTH_PORT, "0.0.0.0", "json")
     assert taken["scenario"] == "/etc/swarm/scenario.toml"
 
@@ -95,7 +94,8 @@ def test_the_example_lets_pods_reach_routers_and_a_node_be_emptied() -> None:
 
 
 def restricted(pod: dict[str, Any]) -> list[str]:
-    """What the Pod Security Standard "restricted" forbids of these pods: kubernetes.io, Pod Security Standards."""
+    """The prohibitions of the Pod Security Standard "restricted" for these pods: kubernetes.io, Pod Security
+    Standards."""
     wrong = [key for key in ("hostNetwork", "hostPID", "hostIPC", "initContainers") if pod.get(key)]
     kinds = {"configMap", "secret", "emptyDir", "projected", "persistentVolumeClaim"}
     wrong += [str(each) for each in pod["volumes"] if set(each) - {"name"} - kinds]
@@ -129,7 +129,7 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
         assert LABEL.fullmatch(compose["name"])
         for each in containers:
             service = compose["services"][each.name]
-            assert service["command"][0] == each.process.role
+            assert service["command"][:2] == ["role", each.process.role]
             assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001:10001", True, ["ALL"])
             assert "privileged" not in service
             assert service["restart"] == "unless-stopped"

@@ -106,7 +106,7 @@ def test_consecutive_agents_run_together(scenario: Scenario, hosts: HostsConfig)
 @settings(max_examples=few(150), deadline=None)
 @given(SCENARIOS, machines(st.just(HOST_ROLES)))
 def test_machines_have_agents_by_their_cores(scenario: Scenario, hosts: HostsConfig) -> None:
-    """Whoever has any is as full of router, launcher and agents as the others, by an agent."""
+    """A machine that has agents is as full of router, launcher and agents as the others, to one agent."""
     plan = planned(scenario, hosts)
     if plan is None:
         return

@@ -38,7 +38,7 @@ def write(swarm: SwarmModel, author: SyncService, cell: int) -> None:
 
 
 def lacks(reader: SyncService, other: SyncService | KeeperService, authors: Sequence[str]) -> int:
-    """How many sets of these authors the other holds newer than the reader, in the reader's regions."""
+    """Number of sets of these authors which the other holds in a newer version, in the reader's regions."""
     theirs = other.replica.held.ledger.held(list(authors))
     return len(reader.replica.missing(theirs))
 
@@ -109,7 +109,7 @@ def test_digests_come_from_keepers_and_from_those_who_speak_of_what_is_held() ->
 
 
 class Deaf(LossyLinks):
-    """The keeper hears nothing from one author, and for a while nobody does."""
+    """The keeper hears nothing from one author, and for a while no replica does."""
 
     quiet = True
 
@@ -200,7 +200,7 @@ def test_whoever_is_listened_to_is_known_since_when(happened: list[tuple[str, st
 
 
 def test_agents_listen_to_everybody_at_times_that_are_spread() -> None:
-    """Of a hundred agents that began together about one in eighteen does so in any period."""
+    """About one in eighteen of a hundred agents that began together does this in any period."""
     at_once = np.zeros(90, int)
     for n in range(100):
         interest = DigestInterest(f"a{n}.1", 10)

@@ -1,4 +1,5 @@
-"""Where uphill is not downhill: whatever cells cost, trees are exact to the last bit and grow about as quickly."""
+"""Uphill differs from downhill: for any cell costs, trees are exact to the last bit and grow in about the same
+time."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ROUTE
 
 LARGE = mock.patch.object(growth_times, "INLINE_NS", 100)
-"""As if every map were so large that growing seven of its cells took too long."""
+"""Every map counts as too large: growing seven of its cells takes too long."""
 
 
 @given(paces(), planner_configs(), happenings())

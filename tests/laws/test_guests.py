@@ -1,5 +1,5 @@
-"""Guests in right of way: robots that come, crash, come back and leave, agents that join while the swarm runs, and
-operators who say that one is gone, under the same faults. Nobody meets anybody, and nobody is lost. Each rule that
+"""Guests in right of way, under the same faults: robots come, crash, come back and leave; agents join while the
+swarm runs; operators say that a robot has left. No two vehicles meet, and none is lost. Each rule that
 docs/design/external-vehicles.md needs is taken out in turn, and the law must notice.
 
 More histories: `pytest tests/laws/test_guests.py -m seeds --seeds 0:2000`.
@@ -194,7 +194,7 @@ FIRST = {
     "a_robot_drives_on_though_it_is_replaced": 4,
     "a_cell_that_was_shut_for_a_guest_is_anybodys": 3,
 }
-"""Histories tried before the others, as they collided last: what is rare is found soon."""
+"""Histories tried before the others, because they collided last: rare faults are found soon."""
 
 
 @pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)

@@ -58,7 +58,7 @@ for line in sys.stdin:
 than to refuse a file."""
 
 MOST_MB = 400
-"""Of a command that refuses its input. It takes 150 with the libraries of rasters."""
+"""Memory bound of a command that refuses its input. It takes 150 with the libraries of rasters."""
 
 
 def npy(shape: tuple[int, ...], descr: str = "<f4", body: bytes = b"") -> bytes:
@@ -67,7 +67,7 @@ def npy(shape: tuple[int, ...], descr: str = "<f4", body: bytes = b"") -> bytes:
 
 
 def archive(path: Path, **members: bytes | int) -> Path:
-    """An .npz; a number stands for so many megabytes of zeros after the head of their array."""
+    """An .npz file; a number stands for that many megabytes of zeros after the head of their array."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -327,7 +327,7 @@ def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
     )
 )
 def test_no_text_gets_past_the_bounds_of_toml(parts: list[str]) -> None:
-    """What is parsed nests no deeper than its bound: the scan sees what the parser sees."""
+    """Parsed values nest no deeper than the bound: the scan sees the same text as the parser."""
     try:
         values = parse_toml("".join(parts), "x", ConfigError)
     except ConfigError:

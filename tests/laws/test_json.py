@@ -42,8 +42,8 @@ def as_dict(message: Message) -> dict[str, Any]:
     "kind", sorted({*PUT, *ASKED}, key=lambda kind: kind.__name__), ids=lambda kind: kind.__name__
 )
 def test_what_is_shown_as_json_says_the_same_when_it_is_put(kind):
-    """Of what is put or asked; answers of planners, which nobody else gives, are shown in more detail. Inf and the
-    absence of a value are both null, so what is shown is compared."""
+    """Puts and requests; answers of planners are shown in more detail. Inf and the absence of a
+    value are both null, so the shown values are compared."""
 
     @settings(max_examples=few(40), deadline=None)
     @given(MESSAGES[kind])

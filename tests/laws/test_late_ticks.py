@@ -1,4 +1,4 @@
-"""Right of way where ticks come late: vehicles drive as much in so many ticks, however long these take."""
+"""Right of way with late ticks: vehicles drive the same distance in a number of ticks, however long these take."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_late_ticks_do_not_cost_vehicles_more_than_the_time_they_take(times_as_l
     for seed in range(few(3)):
         on_time, late = drive(seed, 1), drive(seed, times_as_long)
         assert not late.collisions
-        # What is said is heard a tick later, so a step takes longer; by the time of the wall it were a tenth.
+        # A message is received a tick later, so a step takes longer; by wall time it would be a tenth.
         assert sum(late.moves.values()) > 0.5 * sum(on_time.moves.values())
         assert late.takeovers <= 2 * on_time.takeovers
         assert late.messages < 1.1 * on_time.messages

@@ -1,4 +1,4 @@
-"""What drives and what flies never ask, hold or wait for each other: no process of one layer is in the other."""
+"""Ground and air vehicles never ask, hold or wait for each other: no process of one layer is in the other."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_no_plot_and_no_member_is_in_two_layers(
 
 @given(st.integers(0, 1), st.integers(0, 1), st.sampled_from(["a1", "a2", "stranger"]), st.integers(0, 3))
 def test_only_those_of_its_layer_answer_a_new_life(layer: int, asked: int, who: str, disk: int) -> None:
-    """And nobody answers a guest that bears the name of an agent of the other layer, a2."""
+    """No process answers a guest that bears the name of an agent of the other layer, a2."""
     spawns = {"a0": {"a0-00": 1}, "a1": {"a1-00": 5}}
     plots = Plots(GridSpec(20, 20, 10.0), list(spawns), layer=layer, others=["a2"])
     rights = RightOfWay("a0", plots, spawns, OwnRecord(disk=7), {})

@@ -1,4 +1,5 @@
-"""Who leads: at most one of those who hear each other, soon one after every fault, no change without cause."""
+"""Leadership: at most one leader among those who hear each other, soon one after every fault, no change without
+cause."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from swarm.wire.messages.processes import Beat
 MS = NS_PER_S // 1000
 DELAY_NS = 30 * MS
 SOON_NS = LEASE_NS + 2 * BEAT_NS + DELAY_NS
-"""A lease, a period of whoever spoke and one of whoever listens, and the way between them."""
+"""A lease, a period of the sender and one of the receiver, and the transit time between them."""
 HANDOVER_NS = 2 * BEAT_NS + DELAY_NS
 """Two lead for no longer than it takes until the worse one hears the better one. Much less than a lease."""
 STEADY_NS = SETTLED_NS + 2 * LEASE_NS + 4 * BEAT_NS
@@ -25,7 +26,7 @@ STEADY_NS = SETTLED_NS + 2 * LEASE_NS + 4 * BEAT_NS
 
 @dataclass(eq=False)
 class Candidate:
-    """A process: its core, and what is wrong with it."""
+    """A process: its core, and its faults."""
 
     rank: int
     skew_ns: int
@@ -49,11 +50,11 @@ class World:
         self.number = 0
         self.far: set[int] = set()
         self.disturbed_ns = 0
-        """When anything was last wrong, or became right again."""
+        """Time of the last fault, or of its end."""
         self.several_since_ns: dict[bool, int] = {}
         """Since when several lead who hear each other, by side of a cut."""
         self.changes: list[tuple[int, tuple[int, ...]]] = []
-        """When the set of those who lead changed, and to which ranks."""
+        """Time of each change of leaders, and their ranks."""
         spread = range(count)
         self.all = [Candidate(n, self.chance.randrange(NS_PER_S), self.chance.randrange(BEAT_NS)) for n in spread]
         for each in self.all:
@@ -122,7 +123,7 @@ class World:
             self.at(who.hung_until_ns, lambda: self.tick(who, core))
             return
         now_ns = self.now_ns + who.skew_ns
-        if self.chance.random() < 0.5:  # a tick may come before or after what waits
+        if self.chance.random() < 0.5:  # a tick may come before or after the waiting events
             self.read(who, core, now_ns)
         before = core.leads
         ready = self.now_ns >= who.ready_ns
@@ -150,7 +151,7 @@ class World:
         if self.now_ns >= who.hung_until_ns:
             self.read(who, who.core, self.now_ns + who.skew_ns)
 
-    # --- what is seen from above ----------------------------------------------------------------------------
+    # --- the view from above ------------------------------------------------------------------------------------
 
     def well(self) -> list[Candidate]:
         return [each for each in self.all if each.core is not None and self.now_ns >= each.hung_until_ns]

@@ -1,5 +1,5 @@
-"""A mark beats what is learned, that beats the prior, and lethal ground stays so: in whatever order words and marks
-come, all maps that hold the same are the one that is made cell by cell."""
+"""A mark overrides a learned factor, which overrides the prior, and lethal ground stays lethal. Messages and marks
+may come in any order: all maps that hold the same sets equal the one that is made cell by cell."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIDE = 40
 Words = list[dict[int, Measurement]]
 SAID = st.builds(Measurement, st.integers(1, 500), st.integers(-MOST, MOST), st.integers(0, ONE))
 WORDS = st.lists(st.dictionaries(st.integers(0, 5), SAID, max_size=4), min_size=1, max_size=6)
-"""Of each author, about slopes of the class that `terrain_of_pace` knows."""
+"""Messages of each author, about slopes of the class that `terrain_of_pace` knows."""
 
 
 def terrain_of(seed: int, radius_m: float) -> Terrain:

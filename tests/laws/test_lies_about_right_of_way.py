@@ -64,7 +64,8 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
 
 
 def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> int:
-    """Tell one such lie for each true message about right of way. Returns how many were told."""
+    """Tell one such lie for each true message about right of way. Returns the number of processes that were lied
+    to."""
     bus = simulation.network.bus("liar", simulation.scenario.network.namespace)
     heard: list[Heard] = []
     lies: set[bytes] = set()

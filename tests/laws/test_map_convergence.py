@@ -1,6 +1,6 @@
-"""How soon replicas are equal again after loss, partitions and coming and going, on the memory bus, seeded.
+"""The time until replicas are equal again after loss, partitions, joins and departures, on the memory bus, seeded.
 
-By hand, as in docs/map-figures.md: `PYTHONPATH=.:tests python tests/laws/test_map_convergence.py`"""
+By hand, as in docs/method/measurements.md: `PYTHONPATH=.:tests python tests/laws/test_map_convergence.py`"""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Watched:
         self.planner = Planner(self.watch, 7, config, tree, self.map, Counters())
         self.now_ns = self.seq = 0
         self.at: int | None = None
-        """Where the target is."""
+        """The target's place."""
         self.routes = self.waited = 0
         self.told_at: dict[int, int] = {}
         """Version of the map -> when there was one first."""
@@ -93,7 +93,7 @@ class Watched:
         self.waited += bool(self.told_at)
 
     def check(self, route: Route) -> None:
-        """What a route says that it costs is what it costs on the map as the planner knows it now."""
+        """The stated cost of a route is its cost on the map as the planner knows it now."""
         if route.status is not RouteStatus.OK:
             return
         self.routes += 1
@@ -126,7 +126,7 @@ def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() ->
 
 
 class Searched(Watched):
-    """The same of a target that nobody sees, once its planner has begun to search for it."""
+    """The same for an unseen target, once its planner has begun to search for it."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(seed)

@@ -1,4 +1,5 @@
-"""`swarm mavlink`, whatever comes in whatever order: what is never said to a vehicle, and what always is."""
+"""`gateway mavlink` under any events in any order: commands that are never sent to a vehicle, and those that always
+are."""
 
 from __future__ import annotations
 
@@ -66,7 +67,7 @@ def heard(message: codec.Incoming) -> Callable[[World], object]:
 
 
 def became(**values: object) -> Callable[[World], object]:
-    """The vehicle or the world as somebody else has made it."""
+    """The vehicle or the world after a change from outside."""
 
     def become(world: World) -> None:
         for name, value in values.items():
@@ -121,7 +122,7 @@ def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_eac
 
 
 class Laws:
-    """What holds after each tick, from what was heard and said alone."""
+    """Invariants after each tick, from messages in and out alone."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -130,16 +131,17 @@ class Laws:
         self.answered_ns = -NS_PER_S
         self.asked_ns = -NS_PER_S
         self.spoken: Action | None = None
-        """What was said last of the mission in flight; None while there is none."""
+        """The last message of the mission in flight; None while there is none."""
         self.spoken_ns = 0
         self.items = self.asked = self.tries = 0
-        """Of the mission in flight: how many it has, how many were asked for, how often `spoken` was said."""
+        """The mission in flight: its number of items, the number of requested items, the number of repetitions of
+        `spoken`."""
         hear = world.adapter.on_message
 
         def listen(message: codec.Incoming, now_ns: int) -> None:
             if type(message) in self.heard_ns:
                 self.heard_ns[type(message)] = now_ns
-            # Whatever the vehicle answers, and each refusal, may end an upload.
+            # Any answer of the vehicle, and each refusal, may end an upload.
             if isinstance(message, codec.MissionAnswered):
                 self.answered_ns = now_ns
             if isinstance(message, codec.ItemAsked):

@@ -1,4 +1,4 @@
-"""A tree made exact by its parents is the one grown from scratch, whatever was done to it before."""
+"""A tree made exact through its parents equals the one grown from scratch, whatever was done to it before."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def steep_climb(rng: np.random.Generator, rows: int, cols: int) -> Climb:
 
 
 class Mended:
-    """A tree that is mistreated and mended, on a map that changes."""
+    """A tree that is damaged and repaired, on a map that changes."""
 
     def __init__(self, seed: int, priced: dict[str, Any], rows: int = 45, cols: int = 52) -> None:
         self.rng = np.random.default_rng(seed)
@@ -111,7 +111,8 @@ def test_after_windows_jumps_marks_and_strides_a_mended_tree_is_a_grown_one_bit_
 
 
 def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -> None:
-    """Every cell's cost is drawn anew, as no repair would leave it: parents lead anywhere but the best way."""
+    """Every cell's cost is drawn again, as no repair would leave it: parents lead anywhere but along the best
+    way."""
     rng = np.random.default_rng(3)
     pace = random_pace(rng, 60, 60, 100.0, 0.1)
     costs = CostGrid(GridSpec(60, 60, 1.0), PlannerConfig())

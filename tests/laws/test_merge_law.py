@@ -22,7 +22,7 @@ def test_merging_depends_on_neither_order_nor_repetition(sets: list[MarkSet], da
 
 @given(st.lists(mark_sets(), max_size=12), st.lists(mark_sets(), max_size=12))
 def test_merging_does_not_depend_on_grouping(one: list[MarkSet], two: list[MarkSet]) -> None:
-    """What two replicas hold, merged into a third, is what all the sets merge to."""
+    """Two replicas merged into a third hold the merge of all the sets."""
     third, composite = replica_of([])
     for part in (one, two):
         for each in replica_of(part)[0].held.answer(MarksRequest()):

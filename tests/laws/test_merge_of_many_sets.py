@@ -21,7 +21,7 @@ LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 
 @st.composite
 def ending_sets(draw: st.DrawFn) -> MarkSet:
-    """As `mark_sets`, some of whose statements end by themselves between 0 and 9."""
+    """Like `mark_sets`, but some statements end by themselves between 0 and 9."""
     made = draw(mark_sets())
     count = len(made.kinds)
     untils = draw(st.lists(st.sampled_from([1, 5, 9, FOREVER]), min_size=count, max_size=count))
@@ -37,7 +37,7 @@ def ending_sets(draw: st.DrawFn) -> MarkSet:
 
 @pytest.fixture(autouse=True, params=[-1, 10**9], ids=["many", "few"])
 def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As arrays and as lists."""
+    """The sets as arrays and as lists."""
     monkeypatch.setattr(merge_module, "_FEW", request.param)
 
 

@@ -76,7 +76,7 @@ def test_whatever_stands_for_a_version_is_a_message_or_refused(kind, version):
 
 
 def _attempt(payload: bytes, kind: type[Message]) -> bool:
-    """Whether it is accepted. If so, it is what msgpack and msgspec one after the other would make of it; but where
+    """True if it is accepted. If so, it is what msgpack and msgspec one after the other would make of it; but where
     that fails the reason lies in what no field asks for, so it is a message of its own all the same."""
     try:
         message = decode(payload, kind)
@@ -254,7 +254,7 @@ COLUMNS = [(kind, name) for kind in (*TYPES, Routes) for name in columns_of(kind
 
 @pytest.mark.parametrize(("kind", "name"), COLUMNS, ids=lambda part: getattr(part, "__name__", part))
 def test_a_column_of_another_length_or_beyond_its_bounds_is_refused(kind, name):
-    """Whether its type checks it or, as for the statements of marks, other code does."""
+    """Either its type refuses it or, for the statements of marks, other code does."""
     message, rule = BY_TYPE[RouteReply if kind is Routes else kind], columns_of(kind)[name]
     honest, dtype = getattr(message.routes if kind is Routes else message, name), dtype_of(rule)
     honest = honest or bytes(dtype.itemsize)

@@ -34,8 +34,8 @@ def kept(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 class Build:
-    """What a build of a wire version does with a message whose steps began in the wire versions `begun_in`, by the
-    rules of `Step` alone."""
+    """The treatment of a message by a build of a wire version whose steps began in the wire versions `begun_in`, by
+    the rules of `Step` alone."""
 
     def __init__(self, wire: int, begun_in: list[int]) -> None:
         self.wire = wire
@@ -73,7 +73,7 @@ def test_no_message_is_unreadable_for_a_live_member_in_any_order_of_restarts(
     begun_in, restarts = history
     members = [Build(0, begun_in)] * 4
     under_way = {members[0].writes}
-    """Versions of what was written since the restart before the last one: it may still be on its way."""
+    """Versions of messages since the restart before the last one: they may still be in transit."""
     for which, wire in restarts:
         others = members[:which] + members[which + 1 :]
         if not all(are_neighbours(wire, other.wire) for other in others):
@@ -122,7 +122,7 @@ BUILDS: dict[int, tuple[type[Message], dict[type[Message], Step]]] = {
 
 
 def speak(monkeypatch: pytest.MonkeyPatch, wire: int) -> type[Message]:
-    """Let the codec be that of a build of a wire version. Returns its type of the message."""
+    """Makes the codec that of a build of a wire version. Returns its type of the message."""
     kind, steps = BUILDS[wire]
     monkeypatch.setattr(versions, "WIRE_VERSION", wire)
     STEPS.clear()

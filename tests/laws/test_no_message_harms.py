@@ -128,8 +128,8 @@ targets = 1
 [monitor]
 live = false
 """
-"""With all that a run may have: classes that drive and that fly, in a wind, pulled routes, a target that is
-searched for, a group that shares its targets out, and ground that is learned."""
+"""A run with all features: classes that drive and that fly, in a wind, pulled routes, a hidden target, a group that
+shares its targets out, and learned ground."""
 TEXTS = {"plain": PLAIN, "whole": WHOLE}
 NAMED = ("t", "h", "h.r1", "walkers", "drones", *(f"a{n}-0{m}" for n in range(4) for m in range(2)))
 AUTHORS = ("all.a0.1", "all.a1.1", "all.a1.2", "walkers.a2.1", "drones.a3.1")
@@ -138,12 +138,12 @@ PACE[10:30, 30] = np.inf
 STATES = ("fresh", "running", "cut", "without target", "restarted")
 
 OFTEN = (MARKS, MARKS, MARKS, SIGHTED, PUSHED_ROUTE)
-"""Told more often than others, as most of what they state is about what is not there."""
+"""Types that are sent more often than others, because most of their statements name things that do not exist."""
 
 
 class Lied(SwarmModel):
-    """Of a run the router, a keeper, the targets, the monitor, the first planner or, of the whole, all, the agents,
-    and a liar.
+    """The processes of a run which receive lies: router, keeper, targets, monitor and first planner or, for the
+    whole run, all of them, the agents, and a liar.
 
     run  of TEXTS
     """
@@ -170,7 +170,7 @@ class Lied(SwarmModel):
                 if not (role == "targets" and state == "without target"):
                     self.begin(role, id, 1)
         if state != "fresh":
-            self.run(3 if run == "plain" else 7)  # whoever searches has begun
+            self.run(3 if run == "plain" else 7)  # the searching planner has begun
 
     def begin(self, role: str, id: str, incarnation: int) -> object:
         setup, terrain, truth = self.setup(role, id, incarnation), self.terrain, self.truth
@@ -196,7 +196,7 @@ class Lied(SwarmModel):
         return service
 
     def disturb(self, step: int) -> None:
-        """What happens to the processes while they are lied to."""
+        """Disturbs the processes while they receive lies."""
         if self.state == "cut" and step in (4, 12):
             for node in ("agent-a0", f"planner-{self.target}"):
                 (self.cut if step == 4 else self.heal)(self.buses[node])
@@ -217,7 +217,7 @@ class Lied(SwarmModel):
         return heard
 
     def take_back(self) -> None:
-        """Whoever reaches the router may give orders, so an operator takes back what was ordered."""
+        """Any client of the router may give orders, so an operator takes back the orders."""
         heard: list[Event] = []
         self.ear.ask(GIVE_ORDER, GiveOrder(), heard.append, tag="o", keeper="0")
         self.ear.ask(ZONES, ZoneOrder(), heard.append, tag="z", keeper="0")
@@ -260,13 +260,13 @@ def world(run: str) -> tuple[Scenario, Terrain, Floats]:
 def lied_to(run: str, state: str, seed: int, steps: int, altered: bool) -> Lied:
     """A swarm after many lies of every kind.
 
-    altered  half of the lies are what was said, with one thing in it altered
+    half of the lies are real messages with one field altered
     """
     swarm = Lied(run, state, seed)
     liar = swarm.liar
     if altered:
         liar.listen()
-    # Only a process that nobody has confirmed yet ends when it is told of another run.
+    # Only a process that has no confirmation yet ends when it hears of another run.
     liar.serve(tuple(topic for topic in asked() if topic is not RUN or state == "running"))
     for step in range(steps):
         for topic in (*published(), *OFTEN):

@@ -1,4 +1,5 @@
-"""A tree of pieces after any moves, jumps and marks: costs are scipy's, and what is driven along the parents."""
+"""A tree of pieces after any moves, jumps and marks: its costs equal scipy's and the cost of driving along the
+parents."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
 
 FINE = 1e-11
-"""Relative. A step may be left 2**-46 of a cost too dear, and float64 rounds."""
+"""Relative. A step may leave a cost 2**-46 too high, and float64 rounds."""
 
 
 class Chase:
@@ -96,7 +97,8 @@ class Chase:
         self.settle(windows)
 
     def strike(self) -> None:
-        """Change dots, lines and patches all over the map: dearer, cheaper, closed, opened or all of these."""
+        """Changes dots, lines and patches all over the map: more expensive, cheaper, closed, opened or all of
+        these."""
         rows, cols = self.pace.shape
         kind, windows = int(self.rng.integers(5)), [self.ground.grid.around(self.tree.root, 0)]
         other = random_pace(self.rng, rows, cols, 5.0, 0.2)
@@ -211,7 +213,7 @@ def test_a_long_walk_stays_exact() -> None:
 
 @pytest.mark.parametrize("seed", range(9000, 9000 + few(60)))
 def test_single_cells_beside_the_borders_of_tiles(seed: int) -> None:
-    """What gets dearer or cheaper there concerns the tile beside it, too: by its costs, by its corners, or not."""
+    """A change of cost there concerns the tile beside it, too: by its costs, by its corners, or not at all."""
     chase = Chase(seed, 80)
     rows, cols = chase.pace.shape
     for n in range(12):
@@ -228,7 +230,7 @@ def test_single_cells_beside_the_borders_of_tiles(seed: int) -> None:
 
 
 def struck(seeds: range, most: int) -> int:
-    """As `chases`, with trees that look at few tiles at a time or at any number."""
+    """Like `chases`, but the tree may look at few tiles at a time or at any number."""
     gave_way = 0
     for seed in seeds:
         chase = Chase(seed, most)
@@ -249,7 +251,7 @@ def test_marks_of_every_kind_and_size() -> None:
 
 
 def test_what_loses_its_way_and_has_it_again_is_looked_at_along_its_edge_only() -> None:
-    """Whatever lies behind a closed way rises by one number, and so keeps its parents."""
+    """All costs behind a closed way rise by one number, and so the parents stay."""
     rows, cols = 640, 640
     ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig())
     pace = random_pace(np.random.default_rng(8), rows, cols, 3.0, 0.1)

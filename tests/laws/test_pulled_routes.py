@@ -142,7 +142,7 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
 
 
 def test_a_route_that_would_come_back_to_a_cell_is_not_pulled() -> None:
-    """From the cell below the start a segment leads back over the start; whoever is pushed a route there begins
+    """From the cell below the start a segment leads back over the start; a vehicle with a pushed route there begins
     the same loop again."""
     pace = np.array(
         [[1, 92.7, 3.2], [58.4, 12.9, 1.4], [10.3, 0.01, 17], [2.7, 6.4, 0.01], [0.1, 8.6, 0.01], [0.2, 0.9, 2.4]],
@@ -261,7 +261,7 @@ def test_legs_that_do_not_end_with_their_route_are_refused(legs: list[int]) -> N
 
 
 def test_a_client_refuses_a_segment_that_ends_where_it_begins() -> None:
-    """East and back west as one segment: nobody could say where one is on it."""
+    """East and back west as one segment: no position on it is defined."""
     frame = Frame(GridSpec(9, 9, 1.0))
     legs = np.array([2], "<u4").tobytes()
     for directions, refused in ((b"\2\6", True), (b"\2\2", False)):

@@ -12,7 +12,7 @@ from swarm.grid import Window
 
 
 def trials(count: int, seed: int, shape: tuple[int, int], most_side: int) -> int:
-    """How many of so many changes, to maps of all kinds, were repaired without giving way."""
+    """Number of changes, on maps of all kinds, that were repaired without a fallback."""
     mended = 0
     for n in range(0, count, 12):
         rng = np.random.default_rng([seed, n])

@@ -250,7 +250,7 @@ FIRST = {
     "seats_a_file_that_is_not_the_first": 56,
     "acts_on_a_table_that_is_not_the_newest": 33,
 }
-"""Histories tried before the others, as they collided last: what is rare is found soon."""
+"""Histories tried before the others, because they collided last: rare faults are found soon."""
 
 
 @pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)

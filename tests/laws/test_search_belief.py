@@ -1,4 +1,4 @@
-"""What a search never does, whatever the map, the motion and what is said of vehicles."""
+"""Invariants of a search, for any map, motion and reports of vehicles."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
 
 
 def searching_flat_ground(side: int) -> tuple[Searcher, Ways]:
-    """One that looks for a target which nobody ever saw, with sensors of 50 m."""
+    """A search for a target which no vehicle has ever seen, with sensors of 50 m."""
     pace = np.full((side, side), 0.2, np.float32)
     costs = CostGrid(GridSpec(side, side, METRES), PlannerConfig())
     costs.load(pace)
@@ -261,7 +261,7 @@ def test_where_one_can_come_down_and_not_up_nobody_is_sent_to_where_he_stands(se
     searcher = Searcher(ways, 20.0, 2.0, f"{seed}")
     searcher.begin(pace, None, 0.0)
     for n in range(12):
-        for _ in range(80):  # who is told to ask again asks again
+        for _ in range(80):  # a vehicle that is told to ask again does so
             searcher.tick(0.1, [])
             route = searcher.route(ways, f"v{n}", 30 * n, 0, 0)[0]
             if math.isfinite(route.cost_s):

@@ -104,7 +104,7 @@ def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: i
         assert sorted(label[cells[nodes]]) == sorted(set(label[label >= 0]))
         found = {(label[cells[a]], label[cells[b]]) for a, b, _ in links if doublings[a] == doublings[b] == level}
         assert found == {(label[u], label[v]) for u, v, _ in ground.steps if label[u] != label[v]}
-        # What is in one node at this stride is in one at the next, and a link leads there.
+        # The members of one node at this stride share one at the next, and a link leads there.
         above = {(a, label[cells[b]]) for a, b, _ in links if doublings[a] == level - 1 and doublings[b] == level}
         assert above == {(a, label[cells[a]]) for a in np.flatnonzero(doublings == level - 1)}
 

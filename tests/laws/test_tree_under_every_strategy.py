@@ -16,21 +16,32 @@ from support.planner_strategies import (
     happenings,
     paces,
     planner_configs,
+    random_climb,
     random_pace,
 )
 
 from planner_service.growth_times import block_half
 from planner_service.strategy import STAGES
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
 
-@given(paces(), planner_configs(), happenings())
-@settings(max_examples=few(300), deadline=None)
+@st.composite
+def climbs(draw: st.DrawFn, shape: tuple[int, int]) -> Climb:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return random_climb(
+        rng, GridSpec(*shape, 1.0), draw(st.sampled_from([0.0, 0.1, 0.5])), draw(st.sampled_from([0.1, 0.3, 10.0]))
+    )
+
+
+@pytest.mark.parametrize("directed", [False, True])
+@given(paces(), planner_configs(), happenings(), st.data())
+@settings(max_examples=few(200), deadline=None)
 def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
-    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
+    directed: bool, pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], data: st.DataObject
 ) -> None:
-    play = Play(pace, config)
+    play = Play(pace, config, climb=data.draw(climbs(pace.shape)) if directed else None)
     play.check()
     for event in events:
         play.happen(event)

@@ -22,7 +22,7 @@ from swarm.wire.topics import FLEET, FOLLOWED
 
 AGENTS = ("a0", "a1", "a2")
 BURSTS = st.lists(st.integers(1, 9), min_size=12, max_size=12)
-"""How often each agent speaks in each tenth of a second."""
+"""Messages of each agent in each tenth of a second."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,4 +1,4 @@
-"""Which tracker owns a target: the law of `swarm.runtime.tracking`, attacked with loss, delay, order and clocks."""
+"""The owner of a target: the law of `swarm.runtime.tracking`, attacked with loss, delay, order and clocks."""
 
 from __future__ import annotations
 

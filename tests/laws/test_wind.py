@@ -1,5 +1,5 @@
-"""What flies in a uniform wind: times against the wind triangle, trees against scipy over explicit edges, segments
-against crossings as fractions, and vehicles against what their routes promise."""
+"""Flight in a uniform wind: times against the wind triangle, trees against scipy over explicit edges, segments
+against crossings as fractions, and vehicles against the promises of their routes."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ grounds = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, 14), st.integers(2
 
 
 def triangle_s_per_m(wind: Wind, south: float, east: float) -> float:
-    """What a metre in a direction takes at SPEED_MPS, by looking for the heading that leads there: the one whose
-    velocity through the air and that of the wind come to a velocity over the ground in that direction."""
+    """Seconds per metre in a direction at SPEED_MPS, from a search for the heading whose air velocity and the wind
+    add up to that direction over the ground."""
     towards = cmath.phase(complex(east, -south))
     blown = SPEED_MPS * complex(wind.east, -wind.south)
 
@@ -124,7 +124,7 @@ def twin_edges(flown: AirGround, wind: Wind) -> csr_matrix:
 
 
 ROUNDED = 3e-3
-"""What the table of rises is coarse by, over a whole way."""
+"""The rounding of the table of rises, over a whole way."""
 
 
 @settings(max_examples=few(60), deadline=None)
@@ -162,7 +162,7 @@ def twin_segment_s(flown: AirGround, wind: Wind, start: tuple[int, int], end: tu
 
 
 def flown_climb_s(flown: AirGround, cells: list[tuple[int, int]]) -> float:
-    """What the steps from cell to cell climb, each as the table of the class has it."""
+    """The climb of the steps from cell to cell, each from the table of the class."""
     total, climb = 0.0, flown.climb
     for before, cell in itertools.pairwise(cells):
         length = math.dist(before, cell)
@@ -198,7 +198,7 @@ def test_a_pulled_flight_costs_its_wind_and_its_climbs_and_is_never_dearer_than_
 
 
 def straight_s(wind: Wind, row: int, col: int) -> float:
-    """What the straight way home takes on the level: no flight takes less."""
+    """Seconds of the straight way home on the level: no flight takes less."""
     metres = METRES * math.hypot(row, col)
     return metres * triangle_s_per_m(wind, -row, -col) if metres else 0.0
 

@@ -1,4 +1,4 @@
-"""What several live tests start."""
+"""Fixtures which several live tests start."""
 
 from __future__ import annotations
 

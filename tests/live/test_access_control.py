@@ -1,7 +1,7 @@
 """Access control as it is enforced: every role, every key, every operation, with real certificates and sessions.
 
 A session with a router's certificate is the counterpart: it may do everything. Each role tries every key of the
-table, its own and those of somebody else, and what got through is compared with the table.
+table, its own and those of others, and the successful attempts are compared with the table.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NAMES = {
     "operator": "operator.anna",
 }
 OUTSIDER = "agent.blue.a7"
-"""Has a certificate of the same authority, and is admitted by nobody."""
+"""The client has a certificate of the same authority, and no router admits it."""
 REVOKED, ISSUED_AGAIN = "agent.blue.a8", "agent.blue.a9"
 SETTLE_S = 0.2
 LATEST_S = 5.0
@@ -110,7 +110,7 @@ class Case:
 def cases(who: Bearer | None) -> list[Case]:
     """Each operation on each topic, under keys that are the bearer's own and keys of which one field is not.
 
-    who  None for somebody who may do nothing
+    who  None for a process that may do nothing
     """
     tried = who or bearer(OUTSIDER)
     found = []
@@ -138,7 +138,7 @@ def other(field: str) -> str:
 
 
 def allows(who: Bearer | None, topic: Topic, operation: str, key: str) -> bool:
-    """The table, read anew: nothing of what makes the router's rules is used."""
+    """The permissions by the table alone, without the code that makes the router's rules."""
     if who is None or operation == "delete":
         return False
     fields = topic.parse(NAMESPACE, f"{NAMESPACE}/{key}")

@@ -54,10 +54,10 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     hands.network = load_scenario(here).network
     endpoint = hands.network.connect[0]
 
-    hands.start("router", str(here))
+    hands.start("role", "router", str(here))
     eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
     elsewhere = hands.folder / "elsewhere"  # another machine keeps its runs elsewhere
-    planner = hands.start("planner", str(there), "--target", "t0", runs=elsewhere)
+    planner = hands.start("role", "planner", str(there), "--target", "t0", runs=elsewhere)
     sentence = f"there is no file {there.parent / 'ridge.tif'} here: waiting for a keeper, which hands it out"
     eventually(lambda: hands.logs().count(sentence) == 1, 90, "a planner that waits for a keeper")
     time.sleep(3)
@@ -68,7 +68,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     for role in ("keeper", "targets"):
         hands.start(role, str(here), "--run-id", "far")
     eventually(lambda: len(hands.members()) == 3, 60, "those with the file")
-    hands.start("agent", str(there), "--id", "a0", runs=elsewhere)
+    hands.start("role", "agent", str(there), "--id", "a0", runs=elsewhere)
     eventually(lambda: len(hands.members()) == 5, 60, "all five")
     assert "there is no file" in hands.logs()
     assert "terrain.json" in {path.name for path in (elsewhere / "far").iterdir()}
@@ -84,7 +84,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     assert agent["counts"]["payloads_dropped"] == 0
 
     there.write_text(here.read_text() + "\n[cost]\nmax_slope_deg = 20\n")
-    told = swarm("agent", there, "--id", "a1", "--runs", there.parent / "runs", timeout_s=90)
+    told = swarm("role", "agent", there, "--id", "a1", "--runs", there.parent / "runs", timeout_s=90)
     assert told.returncode == 3
     assert "are the [cost] sections of the scenarios the same?" in told.stderr
     assert "Traceback" not in told.stderr
@@ -94,9 +94,9 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
 def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: Hands) -> None:
     scenario = str(hands.path)
     endpoint = hands.network.connect[0]
-    hands.start("router", scenario)
+    hands.start("role", "router", scenario)
     eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
-    first = hands.start("keeper", scenario, "--run-id", "two")
+    first = hands.start("role", "keeper", scenario, "--run-id", "two")
     for role in (
         ("targets",),
         ("planner", "--target", "t0"),
@@ -107,13 +107,13 @@ def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: 
 
     def sets(store: str) -> dict[str, int]:
         path = hands.folder / "runs" / "two" / store
-        told = swarm("map", "inspect", path, "--json")
+        told = swarm("marks", "show", path, "--json")
         if told.returncode:
             return {}
         return {author: held["marks"] for author, held in json.loads(told.stdout)["authors"].items()}
 
     eventually(lambda: sets("map.sqlite"), 90, "marks in the first keeper's store")
-    second = hands.start("keeper", scenario, "--id", "east")
+    second = hands.start("role", "keeper", scenario, "--id", "east")
     eventually(lambda: sets("map-east.sqlite"), 60, "marks in the second keeper's store")
     first.kill()
     first.wait(10)
@@ -124,6 +124,6 @@ def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: 
         "the second keeper to have what the first had",
     )
     assert second.poll() is None
-    told = swarm("keeper", scenario, "--id", "no/name", "--runs", hands.folder / "runs")
+    told = swarm("role", "keeper", scenario, "--id", "no/name", "--runs", hands.folder / "runs")
     assert told.returncode == 2
     assert "--id 'no/name' is not 1 to 64 of letters" in told.stderr

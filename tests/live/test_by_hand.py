@@ -19,9 +19,9 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) -> None:
     scenario = (str(hands.path),)
-    hands.start("router", *scenario)
+    hands.start("role", "router", *scenario)
     eventually(lambda: swarm("status", "--connect", hands.network.connect[0]).returncode == 0, 30, "the router")
-    hands.start("keeper", *scenario, "--run-id", "by-hand")
+    hands.start("role", "keeper", *scenario, "--run-id", "by-hand")
     eventually(lambda: ("keeper", "0", "by-hand") in hands.members(), 60, "the keeper")
     for role in (("targets",), ("planner", "--target", "t0")):
         hands.start(*role, *scenario)
@@ -38,7 +38,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
     eventually(is_served, 30, "a route")
     part = hands.start("up", str(hands.path), "--connect", hands.network.connect[0], "--only", "agent", "--plain")
     eventually(lambda: ("agent", "a1", "by-hand") in hands.members(), 60, "the agents")
-    told = swarm("agent", "--id", "a1", *scenario, "--runs", hands.folder / "runs")
+    told = swarm("role", "agent", "--id", "a1", *scenario, "--runs", hands.folder / "runs")
     assert told.returncode == 5
     assert told.stderr.endswith("swarm: agent a1 takes part in run by-hand already; stop it first\n")
     status = json.loads(swarm("status", "--connect", hands.network.connect[0], "--json").stdout)
@@ -53,9 +53,9 @@ def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: 
     text = hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1")
     hands.path.write_text(text)
     scenario, connect = str(hands.path), hands.network.connect[0]
-    keeper = hands.start("keeper", scenario)
+    keeper = hands.start("role", "keeper", scenario)
     part = hands.start("up", scenario, "--connect", connect, "--only", "planner", "--plain")
-    impatient = hands.start("agent", scenario, "--id", "a0")
+    impatient = hands.start("role", "agent", scenario, "--id", "a0")
     sentence = f"no router at {connect} yet: waiting for one"
     eventually(lambda: hands.logs().count(sentence) == 3, 150, "three who wait")
     impatient.send_signal(signal.SIGINT)
@@ -63,7 +63,7 @@ def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: 
     time.sleep(3)  # longer than the timeout of a connection
     assert keeper.poll() is part.poll() is None
     assert hands.logs().count(sentence) == 3
-    hands.start("router", scenario)
+    hands.start("role", "router", scenario)
     eventually(lambda: swarm("status", "--connect", connect).returncode == 0, 60, "the router")
     eventually(lambda: len(hands.members()) == 4, 150, "router, keeper and planners")
     assert len({run_id for role, _, run_id in hands.members() if role != "router"}) == 1

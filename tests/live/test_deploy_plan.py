@@ -1,6 +1,6 @@
-"""Three machines, as docs/deploy.md says word by word, and the loss of one of them for good.
+"""Three machines, as docs/operate/machines.md says word by word, and the loss of one of them for good.
 
-Figures, of so many losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
+Figures for a number of losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from swarm.liveness import job_of, split_rank
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-PAGE = Path(__file__).parents[2] / "docs" / "deploy.md"
+PAGE = Path(__file__).parents[2] / "docs" / "operate" / "machines.md"
 COMMANDS_AT_MOST = 6
 LOST = "alpha"
 LOOKS_FROM, THROUGH = "desk", "bravo"
 LONGEST_S = 60.0
-"""Beside other tests on two cores; what it takes alone is in docs/deploy.md."""
+"""Beside other tests on two cores."""
 ADDRESSES = {"alpha": "10.77.0.1", "bravo": "10.77.0.2", "charlie": "10.77.0.3", LOOKS_FROM: "10.77.0.9"}
 PER_AGENT = 2
 SCENARIO = f"""
@@ -77,7 +77,7 @@ class Deployed:
             f'case "$1" in\n{cases}esac\nmkdir -p "$place"; cd "$place"; exec ip netns exec "$space" sh -c "$2"',
         )
         (folder / "my.toml").write_text(SCENARIO)
-        (folder / "hosts.toml").write_text("\n".join(block("From nothing", 0)))
+        (folder / "hosts.toml").write_text("\n".join(block("Steps", 0)))
 
     def follow(self, commands: list[str]) -> None:
         """Runs the commands of the page: those of `ssh` side by side, as they last as long as the swarm."""
@@ -115,7 +115,7 @@ def deployed(folder: Path) -> Iterator[tuple[Deployed, Onlooker]]:
     }
     with machines(ADDRESSES, environment) as network:
         made = Deployed(folder, network)
-        made.follow([*block("From nothing", 1), *block("Without systemd", 0)])
+        made.follow([*block("Steps", 1), *block("Without systemd", 0)])
         scenario = folder / "my.toml"
         endpoint = f"tls/{ADDRESSES[THROUGH]}:7447"
         onlooker = Onlooker(network, LOOKS_FROM, scenario, endpoint, made.kits / "certs")
@@ -164,19 +164,19 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
     orphans = {vehicle: before["targets"][vehicle] for vehicle in left if before["targets"][vehicle] in gone.leads}
     acknowledged = before["acknowledged"][gone.ids["keeper"][0]]
 
-    # Who answered last is the one that is gone; its standby may have led before, too.
+    # The planner that answered last has ended; its standby may have led before, too.
     dead = {
         target: max(before["answered"][target].items(), key=lambda life: life[1][1])[0] for target in gone.leads
     }
 
     def answers(target: str) -> list[float]:
-        """When others than the dead planner first answered after the loss."""
+        """Time of the first answer after the loss by another planner than the dead one."""
         found = onlooker.notes["answered"][target]
         return [first for life, (first, _) in found.items() if life != dead[target] and first > lost_s]
 
     def first_routes() -> list[float]:
-        """Of each vehicle whose planner is gone: when another one pushed a route, or it began one, perhaps of
-        another target."""
+        """For each vehicle whose planner has ended: the time at which another planner pushed a route, or the
+        vehicle began one, perhaps of another target."""
         notes = onlooker.notes
         return [
             min(
@@ -211,7 +211,7 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
 
 
 def steady(leads: dict[str, float], planner: str) -> bool:
-    """Whether a planner leads, and none of its standbys has for a while."""
+    """True if a planner leads, and none of its standbys has led for a while."""
     others = [at_s for id, at_s in leads.items() if id != planner and job_of(id) == planner]
     now_s = time.monotonic()
     return now_s - leads.get(planner, -math.inf) < 1.0 and now_s - max(others, default=-math.inf) > 3.0
@@ -247,7 +247,7 @@ def test_the_page_brings_up_three_machines_and_the_loss_of_one_costs_no_route_an
 
 
 def test_the_page_needs_few_commands() -> None:
-    assert len(block("From nothing", 1)) + len(block("From nothing", 2)) <= COMMANDS_AT_MOST
+    assert len(block("Steps", 1)) + len(block("Steps", 2)) <= COMMANDS_AT_MOST
 
 
 if __name__ == "__main__":

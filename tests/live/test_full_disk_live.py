@@ -1,4 +1,4 @@
-"""A whole swarm whose files cannot grow: it goes on, says what is missing, and prints its figures."""
+"""A whole swarm whose files cannot grow: it goes on, names the missing space, and prints its figures."""
 
 from __future__ import annotations
 

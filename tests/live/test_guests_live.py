@@ -1,5 +1,5 @@
 """Vehicles that are not in the scenario, in a swarm of real processes: one with a program of its own, and some that
-`swarm vehicle add` drives."""
+`swarm order vehicle add` drives."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
 
 
 def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:
-    """The vehicles that an agent says it has, once they are so many."""
+    """The vehicles that an agent reports, once the number is reached."""
     heard: set[str] = set()
     with client(live.network) as bus:
         bus.collect(FLEET)
@@ -121,7 +121,7 @@ def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int 
 
 
 def add(live: LiveSwarm, *options: object) -> subprocess.Popen[str]:
-    command = [*SWARM, "vehicle", "add", live.path, "--runs", live.runs, "--group", "all", *options]
+    command = [*SWARM, "order", "vehicle", "add", live.path, "--runs", live.runs, "--group", "all", *options]
     return subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True)
 
 
@@ -130,14 +130,14 @@ def test_vehicles_are_added_and_removed_while_the_swarm_runs(live: LiveSwarm, ru
     added = add(live, "--count", 3, "--id", "extra")
     try:
         assert vehicles_of(live, "extra", count=3) == {"extra-00", "extra-01", "extra-02"}
-        done = swarm("vehicle", "remove", "extra-01", "a0-02", *where)
+        done = swarm("order", "vehicle", "remove", "extra-01", "a0-02", *where)
         assert (done.returncode, done.stderr) == (0, "")
         assert "extra-01: left" in done.stdout
         assert "a0-02: left" in done.stdout
-        refused = swarm("vehicle", "gone", "extra", *where)
+        refused = swarm("order", "vehicle", "forget", "extra", *where)
         assert refused.returncode == 2
         assert "extra is alive" in refused.stderr
-        assert swarm("vehicle", "remove", "extra", *where).returncode == 0
+        assert swarm("order", "vehicle", "remove", "extra", *where).returncode == 0
         assert added.wait(10) == 0
     finally:
         added.kill()
@@ -155,9 +155,9 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
             added.send_signal(signal.SIGKILL)
             added.wait(10)
     time.sleep(live.network.lease_s + 0.5)
-    gone = swarm("vehicle", "gone", "more", *where)
+    gone = swarm("order", "vehicle", "forget", "more", *where)
     assert (gone.returncode, gone.stderr) == (0, ""), gone
-    unknown = swarm("vehicle", "gone", "nobody", *where)
+    unknown = swarm("order", "vehicle", "forget", "nobody", *where)
     assert unknown.returncode == 2
     assert "no agent knows a guest 'nobody'" in unknown.stderr
     for options, sentence in (

@@ -28,12 +28,12 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
     manager.settimeout(60)
     with manager:
         monkeypatch.setenv("NOTIFY_SOCKET", manager.getsockname())
-        keeper = hands.start("keeper", str(hands.path), "--health-port", str(port), "--log-format", "json")
+        keeper = hands.start("role", "keeper", str(hands.path), "--health-port", str(port), "--log-format", "json")
         monkeypatch.delenv("NOTIFY_SOCKET")
         assert manager.recv(100) == b"STATUS=its start"
 
         def missing() -> list[str] | None:
-            """What the keeper says that it lacks; None while nobody answers."""
+            """The keeper's stated lack; None while no keeper answers."""
             try:
                 answer = ask(url, live=False)
             except BusError:
@@ -44,7 +44,7 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
 
         eventually(lambda: missing() == ["keeper-0: its router"], 60, "that it waits for its router")
         assert ask(url, live=True).ok, "waiting is no fault"
-        router = hands.start("router", str(hands.path))
+        router = hands.start("role", "router", str(hands.path))
         while b"READY=1" not in manager.recv(1000):
             pass
         eventually(lambda: missing() == [], 60, "that it is ready")

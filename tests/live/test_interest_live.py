@@ -1,4 +1,4 @@
-"""Interest over real Zenoh: what is far is not heard, and is fetched on coming near."""
+"""Interest over real Zenoh: distant regions are not received, and are fetched when a vehicle comes near."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TERRAIN = terrain_of_pace(np.ones((64, 600), np.float32), 10.0)
 
 
 class Member:
-    """A replica on a session of its own; it works when it is told to."""
+    """A replica on a session of its own; it works on request."""
 
     def __init__(self, network: NetworkConfig, author: str, *, near: bool = False) -> None:
         self.bus: ZenohBus = open_bus(network)

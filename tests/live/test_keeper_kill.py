@@ -88,7 +88,7 @@ class Load:
             time.sleep(0.002)
 
     def _learn(self) -> None:
-        """Say what was measured of two kinds of ground by now: sets of marks as all others, but about no cell."""
+        """Publishes measurements of two kinds of ground: sets of marks like all others, but about no cell."""
         self.put += 1
         said = {0: Measurement(self.put, ONE, ONE // 10), 7: Measurement(5, -ONE, 0)}
         word = mark_set("load.1", "all", LEARNED, 1, self.put * SEQ_STEP, Statements(*columns_of(said, self.put)))

@@ -1,4 +1,4 @@
-"""`swarm map learned` asks a swarm that runs, over real zenoh."""
+"""`swarm marks factors` asks a swarm that runs, over real zenoh."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
             def told() -> list[dict[str, object]]:
                 region = beyond_region(terrain.grid)
                 bus.publish(MARKS, word, region=region, tile=tile, author="all.a1.1")
-                result = CliRunner().invoke(app, ["learned", "--connect", endpoint, "--json"])
+                result = CliRunner().invoke(app, ["factors", "--connect", endpoint, "--json"])
                 return json.loads(result.stdout)["kinds"] if result.exit_code == 0 else []
 
             eventually(told, 30, "the keeper")

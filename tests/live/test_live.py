@@ -42,7 +42,7 @@ def served_cell(bus: ZenohBus, target: str = "t0") -> tuple[int, int]:
 
 
 def incarnation(bus: ZenohBus, row: int, col: int) -> int | None:
-    """Of the planner that serves a route now; None if nobody does."""
+    """Incarnation of the planner that serves a route now; None if none does."""
     for reply in ask(bus, ROUTE, RouteRequest(row=row, col=col), timeout_s=0.5, target="t0"):
         if reply.routes[0].status is RouteStatus.OK:
             return int(reply.incarnation)
@@ -62,21 +62,21 @@ def test_everybody_answers_with_the_same_run_and_terrain(live: LiveSwarm, bus: Z
 
 def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: ZenohBus) -> None:
     row, col = served_cell(bus)
-    told = swarm("route", "--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint)
+    told = swarm("route", "--target", "t0", "--from", f"cell:{row},{col}", "--connect", live.endpoint)
     assert told.returncode == 0, told.stderr
     assert f"from cell:{row},{col} (xy:" in told.stdout
-    told = swarm("route", "--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint, "--json")
+    told = swarm("route", "--target", "t0", "--from", f"cell:{row},{col}", "--connect", live.endpoint, "--json")
     assert json.loads(told.stdout)["routes"][0]["cells_row_col"][0] == [row, col]
-    place = ("--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint)
+    place = ("--target", "t0", "--from", f"cell:{row},{col}", "--connect", live.endpoint)
     told = swarm("route", *place, "--steps", 1)
     assert "\n1 steps, " in told.stdout or "\n0 steps, " in told.stdout  # there already
     told = swarm("route", *place, "--cost")
     assert told.stdout.startswith(f"from cell:{row},{col} (xy:")
     assert told.stdout.count("\n") == 2  # the age of the pose, too
-    told = swarm("route", "--target", "t0", "--row", 4000, "--col", 1, "--connect", live.endpoint)
+    told = swarm("route", "--target", "t0", "--from", "cell:4000,1", "--connect", live.endpoint)
     assert (told.returncode, told.stdout) == (2, "")
     assert "--from is 'cell:4000,1', outside the terrain: 96 x 128 cells" in told.stderr
-    told = swarm("route", "--target", "t7", "--row", row, "--col", col, "--connect", live.endpoint)
+    told = swarm("route", "--target", "t7", "--from", f"cell:{row},{col}", "--connect", live.endpoint)
     assert (told.returncode, told.stdout) == (4, "")
     assert told.stderr.startswith("swarm: no planner of target 't7' answers")
     status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
@@ -171,7 +171,7 @@ def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: 
     other = tmp_path / "other.toml"
     text = live.path.read_text().replace("relief_m = 300", "relief_m = 310").replace("count = 2", "count = 3")
     other.write_text(text)
-    told = swarm("planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
+    told = swarm("role", "planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
     assert told.returncode == 5, told.stderr
     assert "terrain files or cost rules differ" in told.stderr
     assert "Traceback" not in told.stderr

@@ -1,4 +1,4 @@
-"""What a person sees: the live view in a real browser, and in rerun's own viewer."""
+"""The view of a person: the live view in a real browser, and in rerun's own viewer."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def connected(client_type: Any, url: str) -> Any:
     while True:
         try:
             return client_type.connect(url)
-        except Exception:  # it says so in many ways that nobody listens yet
+        except Exception:  # it says in many ways that no endpoint listens yet
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(0.2)

@@ -1,4 +1,4 @@
-"""`swarm mavlink` between a swarm of real processes and an autopilot that is not ours: MAVSDK's server side."""
+"""`gateway mavlink` between a swarm of real processes and an autopilot that is not ours: MAVSDK's server side."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Pair:
 
     def adapter(self, *options: object) -> Child:
         where = ("--connect", self.live.endpoint, "--lost-after", 2)
-        return self._start(*SWARM, "mavlink", f"udpin:127.0.0.1:{self.port}", *where, *options)
+        return self._start(*SWARM, "gateway", "mavlink", f"udpin:127.0.0.1:{self.port}", *where, *options)
 
     def _start(self, *command: object) -> Child:
         self.children.append(Child(self.folder / f"child{len(self.children)}.txt", *command))

@@ -1,4 +1,5 @@
-"""Orders to real processes: each command returns when all obey, and what was ordered outlives whoever obeys."""
+"""Orders to real processes: each command returns when all obey, and an order outlives the processes that obey
+it."""
 
 from __future__ import annotations
 
@@ -25,14 +26,14 @@ OPTIONS = ("--no-live",)
 
 
 def order(live: LiveSwarm, *words: object, code: int = 0) -> Any:
-    """What a command says, as JSON."""
-    done = swarm(*words, "--connect", live.endpoint, "--json")
+    """The output of a command, as JSON."""
+    done = swarm("order", *words, "--connect", live.endpoint, "--json")
     assert done.returncode == code, done.stdout + done.stderr
     return json.loads(done.stdout) if code == 0 else done.stderr
 
 
 def places(live: LiveSwarm, seconds: float) -> list[dict[str, int]]:
-    """The cells of all vehicles, at the first and the last report of so many seconds."""
+    """The cells of all vehicles, at the first and the last report within the given seconds."""
     inbox = Inbox()
     first: dict[str, int] = {}
     last: dict[str, int] = {}
@@ -56,12 +57,12 @@ def standing(live: LiveSwarm) -> dict[str, int]:
 
 
 def test_zones_are_added_listed_and_removed(live: LiveSwarm) -> None:
-    added = order(live, "zone", "add", "--polygon", "10,10 10,20 20,20 20,10", "--name", "z", "--until", "10m")
+    added = order(live, "zone", "add", "--polygon", "10,10 10,20 20,20 20,10", "--name", "z", "--for", "10m")
     assert added["silent"] == []
     assert {"agent-a0", "agent-a1", "planner-t0", "planner-t1"} <= added["obeyed_s"].keys()
-    (zone,) = order(live, "zone", "list")["zones"]
+    (zone,) = order(live, "zone", "ls")["zones"]
     assert (zone["name"], zone["kind"], zone["cells"]) == ("z", "lethal", 100)
-    place = ("--target", "t0", "--row", 15, "--col", 15, "--connect", live.endpoint)
+    place = ("--target", "t0", "--from", "cell:15,15", "--connect", live.endpoint)
     # A planner that is alive may not have heard its target yet.
     eventually(lambda: "lethal" in swarm("route", *place).stdout, 20, "a route from a closed cell")
     assert order(live, "zone", "remove", "z")["zones"] == []
@@ -82,14 +83,14 @@ def test_an_added_target_gets_a_planner_and_is_chased(live: LiveSwarm) -> None:
     assert order(live, "target", "add", "x", "--at", "48,64", "--walk", "still")["silent"] == []
 
     def routed() -> bool:
-        found = swarm("route", "--target", "x", "--row", 40, "--col", 60, "--connect", live.endpoint)
+        found = swarm("route", "--target", "x", "--from", "cell:40,60", "--connect", live.endpoint)
         return found.returncode == 0 and "to x at cell:" in found.stdout
 
     eventually(routed, 40, "a route to the new target")
-    assert order(live, "group", "all", "targets", "x")["silent"] == []
+    assert order(live, "group", "all", "x")["silent"] == []
     removed = order(live, "target", "remove", "x")
     assert removed["given"]["off"]
-    order(live, "group", "all", "--as-scenario")
+    order(live, "unset", "groups.all")
     eventually(lambda: "planner-x" not in swarm("status", "--connect", live.endpoint).stdout, 20, "its end")
 
 
@@ -129,9 +130,9 @@ def test_a_bad_order_gets_a_sentence(live: LiveSwarm, words: tuple[str, ...], sa
 def test_settings_and_stops_are_obeyed(live: LiveSwarm) -> None:
     assert order(live, "set", "time_scale", "5")["silent"] == []
     assert order(live, "vehicle", "stop", "a0-00")["silent"] == []
-    said = swarm("orders", "--connect", live.endpoint).stdout
+    said = swarm("order", "ls", "--connect", live.endpoint).stdout
     assert "set time_scale 5" in said
     assert "vehicle a0-00" in said
-    order(live, "vehicle", "go", "a0-00")
-    order(live, "set", "time_scale", "--as-scenario")
-    assert "no orders" in swarm("orders", "--connect", live.endpoint).stdout
+    order(live, "vehicle", "start", "a0-00")
+    order(live, "unset", "time_scale")
+    assert "no orders" in swarm("order", "ls", "--connect", live.endpoint).stdout

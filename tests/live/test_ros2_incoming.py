@@ -69,12 +69,12 @@ def seen(swarm: Swarm) -> Iterator[Observer]:
 
 @pytest.fixture(scope="module")
 def port(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Of the ROS side's router, with a gateway at work."""
+    """Port of the ROS side's router, with a gateway at work."""
     folder = tmp_path_factory.mktemp("gateway")
     (folder / "gateway.toml").write_text(SETTINGS)
     with ros_router() as port, (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [*SWARM, "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
+            [*SWARM, "gateway", "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
              "--ros", f"tcp/127.0.0.1:{port}", "--runs", str(live.runs)],
             stdout=log, stderr=log,
         )  # fmt: skip
@@ -102,7 +102,7 @@ def pose_at(swarm: Swarm, row: int, col: int, frame: str = "map") -> dict[str, A
 
 
 def drive(peer: RosPeer, swarm: Swarm, robot: str, row: int, col: int) -> None:
-    """Let a robot say ten times a second that it is there."""
+    """Makes a robot report this place ten times a second."""
     at = pose_at(swarm, row, col, f"{robot}/odom")
     peer.put(f"/{robot}/odom", ODOMETRY, hz=10, header=at["header"], pose={"pose": at["pose"]})
 

@@ -1,4 +1,4 @@
-"""`swarm ros2` beside a real swarm: heard by a foreign stack, by plain Zenoh, by a node of ours that comes late."""
+"""`gateway ros2` beside a real swarm: heard by a foreign stack, by plain Zenoh, by a late node of ours."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Gateway:
     def start(self, *options: str) -> subprocess.Popen[str]:
         with (self.folder / "ros2.log").open("w") as log:
             return subprocess.Popen(
-                [*SWARM, "ros2", "--connect", self.swarm, "--ros", self.endpoint,
+                [*SWARM, "gateway", "ros2", "--connect", self.swarm, "--ros", self.endpoint,
                  "--runs", str(self.runs), *options],
                 stdout=log, stderr=log, text=True,
             )  # fmt: skip
@@ -84,7 +84,7 @@ def running(gateway: Gateway) -> Iterator[Gateway]:
 
 @pytest.fixture
 def session(gateway: Gateway) -> Iterator[zenoh.Session]:
-    """Of a node of ours at the ROS side's router."""
+    """Session of a node of ours at the ROS side's router."""
     with open_ros(gateway.endpoint) as session:
         yield session
 
@@ -184,7 +184,7 @@ def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> 
     assert process.wait(40) == 0, gateway.said
     assert "Traceback" not in gateway.said
     alone = subprocess.run(
-        [*SWARM, "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
+        [*SWARM, "gateway", "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert alone.returncode == 4
@@ -216,7 +216,7 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
         ends.enter_context(made_up_swarm(network, "bench"))
         port = ends.enter_context(ros_router())
         peer = ends.enter_context(RosPeer(port, definitions))
-        # Before the gateway is there: the SDK asks nobody for what was latched before.
+        # Before the gateway starts: the SDK does not ask for latched messages.
         for row in OUT:
             peer.hear(topic_of(row), ROWS[row].type_name)
         process = Gateway(endpoint, port, tmp_path, tmp_path).start("--namespace", "bench")

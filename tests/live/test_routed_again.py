@@ -1,6 +1,6 @@
 """A machine of agents is cut off without a word, or dies as a whole: its vehicles are soon on their routes again.
 
-How soon, with more turns: `PYTHONPATH=.:tests python tests/live/test_routed_again.py 5 30 120`"""
+The time to a new route, with more rounds: `PYTHONPATH=.:tests python tests/live/test_routed_again.py 5 30 120`"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run outlives its processes: they may all be started again, and what was acknowledged is there."""
+"""A run outlives its processes: all may be started again, and the acknowledged state is there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.network
 
 
 def sets_in(store: Path) -> int:
-    done = swarm("map", "inspect", store, "--json")
+    done = swarm("marks", "show", store, "--json")
     assert done.returncode == 0, done.stderr
     return int(json.loads(done.stdout)["sets"])
 

@@ -1,4 +1,4 @@
-"""A run on two machines, as docs/deploy.md says: certificates, a launcher on each, a name that is revoked."""
+"""A run on two machines, as the page says: certificates, a launcher on each, a name that is revoked."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_launchers_on_two_machines_make_one_run_each_with_the_certificates_of_it
     reports = list(hands.folder.glob("*/small-*/report.json"))
     assert [path.parent.parent.name for path in reports] == ["runs"]
     assert json.loads(reports[0].read_text())["routes_served"] >= 12
-    told = swarm("report", *(path.parent for path in hands.folder.glob("car-runs/small-*/run.json")))
+    told = swarm("runs", "report", *(path.parent for path in hands.folder.glob("car-runs/small-*/run.json")))
     assert told.returncode != 0
     assert "the launcher of another machine records the run" in told.stderr
 
@@ -101,7 +101,7 @@ def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successo
         bus.publish(STATS, said, role="agent", id=id)
 
     def says(bus: ZenohBus, id: str) -> bool:
-        """Whether what it says is heard; a0 speaks meanwhile, so that not hearing is no matter of time."""
+        """True if its message is received; a0 speaks meanwhile, so that silence is no matter of time."""
         heard.clear()
         until_s = time.monotonic() + 10
         while heard.count("a0") < 5 and time.monotonic() < until_s:
@@ -139,7 +139,7 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
     hands.path.write_text(hands.path.read_text().replace("[network]", '[network]\nadmit = ["rover.all.r1"]'))
     certs = issue(hands)
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
-    hands.start("router", str(hands.path), "--listen", endpoint, *tls(certs))
+    hands.start("role", "router", str(hands.path), "--listen", endpoint, *tls(certs))
     eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
     run = msgspec.structs.replace(keeper_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns())
     heard: list[str] = []

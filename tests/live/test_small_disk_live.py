@@ -56,7 +56,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
         filler = disk / "filler"
         with pytest.raises(OSError, match="No space"):
             fill(filler)
-        until(out, f"cannot write to {run_dir}: No space left on device", 20)
+        until(out, f"cannot write {run_dir}: No space left on device", 20)
         until(out, "has ended: No space left on device; another begins when there is space", 20)
         for role in ("agent", "keeper"):  # one that dies meanwhile lives again on the full disk
             name = next(path.stem for path in run_dir.glob(f"{role}*.log"))

@@ -59,7 +59,7 @@ class Asker:
 
 
 class Leaders:
-    """Who leads now, by what each tells."""
+    """The current leaders, by the claims of each process."""
 
     def __init__(self, bus: ZenohBus) -> None:
         self.told: dict[str, bool] = {}
@@ -75,7 +75,7 @@ class Leaders:
                 self.lost = stats.gauges.get("lost", 0.0)
 
     def are(self, **told: bool) -> bool:
-        """Whether the planner of t0 and its standby lead: `first`, `second`."""
+        """True if the planner of t0 and its standby lead: `first`, `second`."""
         return {"first": self.told.get("t0"), "second": self.told.get("t0.r1")} == told
 
 

@@ -1,4 +1,4 @@
-"""`swarm sweep` on a cluster of this machine: nothing is lost by a worker or a sweep that is killed."""
+"""`swarm study run` on a cluster of this machine: nothing is lost by a worker or a sweep that is killed."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
 def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_path: Path, number: signal.Signals):
     path, out = write_study(tmp_path, STUDY.replace('"0:3"', '"0:100"')), tmp_path / "out"
     kept_by_now = out / "results.jsonl"
-    words = [*COMMAND, "sweep", str(path), "--workers", "1", "--out", str(out)]
+    words = [*COMMAND, "study", "run", str(path), "--workers", "1", "--out", str(out)]
     running = subprocess.Popen(words, stderr=subprocess.PIPE, start_new_session=True, text=True)
     try:
         eventually(lambda: (kept_by_now.exists() and kept_by_now.stat().st_size) or running.poll() is not None, 200)

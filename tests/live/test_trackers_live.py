@@ -1,9 +1,8 @@
-"""A target whose tracker is a process from outside: served, stolen by nobody, lost, regained, handed over."""
+"""A target whose tracker is an outside process: served, never stolen, lost, regained, passed on."""
 
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,27 +24,23 @@ walk = "external"
 caught = "stay"
 """
 OUTSIDE = Path(__file__).parents[1] / "support" / "outside_tracker.py"
-PAGE = Path(__file__).parents[2] / "docs" / "operate" / "trackers.md"
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "tracker.py"
 
 
 class Outside:
     """The processes that are not ours."""
 
-    def __init__(self, live: LiveSwarm, page: Path) -> None:
-        """page  where the script of the documentation is written"""
+    def __init__(self, live: LiveSwarm) -> None:
         self._live = live
-        self._page = page
-        (script,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-        page.write_text(script)
         self.started: list[subprocess.Popen[bytes]] = []
 
     def start(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
         schema = schema_of("pose")
         return self._start(OUTSIDE, self._live.endpoint, schema, "x", tracker, *_place_m(row, col))
 
-    def start_page(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
+    def start_example(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
         """The program in the documentation, which has nothing of ours either and puts JSON."""
-        return self._start(self._page, self._live.endpoint, "x", tracker, *_place_m(row, col))
+        return self._start(EXAMPLE, self._live.endpoint, "x", tracker, *_place_m(row, col))
 
     def _start(self, *command: object) -> subprocess.Popen[bytes]:
         process = subprocess.Popen([sys.executable, *map(str, command)], cwd="/")
@@ -74,16 +69,14 @@ def status_of_x(live: LiveSwarm) -> dict[str, Any]:
 
 def route_to_x(live: LiveSwarm, *options: str) -> str:
     return swarm(
-        "route", "--connect", live.endpoint, "--target", "x", "--row", 40, "--col", 40, "--steps", 1, *options
+        "route", "--connect", live.endpoint, "--target", "x", "--from", "cell:40,40", "--steps", 1, *options
     ).stdout
 
 
 @pytest.mark.thorough
-def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_over(
-    live: LiveSwarm, tmp_path: Path
-) -> None:
+def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_over(live: LiveSwarm) -> None:
     live.wait_until_up()
-    outside = Outside(live, tmp_path / "page.py")
+    outside = Outside(live)
     try:
         assert "no_target" in route_to_x(live)
         assert status_of_x(live)["pose_age_s"] is None
@@ -93,7 +86,7 @@ def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_ove
         assert reply["target_cell"] == 50 * 128 + 60
         assert reply["pose_age_s"] < 2
         assert not reply["tracker_lost"]
-        second = outside.start_page("camera", 20, 90)
+        second = outside.start_example("camera", 20, 90)
         eventually(lambda: live.said("poses of tracker camera are refused, as tracker radar owns it"), 20, "a note")
         assert status_of_x(live)["target_cell"] == 50 * 128 + 60
         first.kill()
@@ -102,7 +95,7 @@ def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_ove
         second.kill()
         eventually(lambda: bool(status_of_x(live)["tracker_lost"]), 20, "the loss")
         assert "x is lost: it has no tracker, and this is its position" in route_to_x(live)
-        eventually(lambda: live.said("outdated") and live.said("lost targets: x"), 20, "the live line")
+        eventually(lambda: live.said("outdated") and live.said("target lost: "), 20, "the live line")
         third = outside.start("radar", 50, 61)
         eventually(lambda: not status_of_x(live)["tracker_lost"], 20, "the return")
         outside.start("camera", 20, 91)
@@ -119,5 +112,5 @@ def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_ove
     assert tracking["poses_refused"] > 0
     said = live.output.read_text()
     assert "Traceback" not in said
-    for sentence in ("tracks it now, before that tracker radar did", "nobody knew where it was"):
+    for sentence in ("tracks it now, before that tracker radar did", "without a known position"):
         assert sentence in said

@@ -1,6 +1,6 @@
 """The version before this one and this one in one run, as real processes, machine by machine.
 
-How long any vehicle is without a route while three machines go from the version before to this one:
+The longest time of a vehicle without a route while three machines go from the version before to this one:
 `PYTHONPATH=.:tests python tests/live/test_two_versions.py`, and with `--stop-first` without taking over."""
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def older_tree(folder: Path) -> Path:
 
 
 def check_understood(network: NetworkConfig, processes: int) -> None:
-    """All processes have told what they count: nobody has dropped a payload or found a stranger."""
+    """All processes have published their counters: none has dropped a payload or found a stranger."""
     counted: dict[tuple[str, str], Mapping[str, int]] = {}
 
     def hear(event: Event) -> None:

@@ -295,7 +295,7 @@ def test_closing_takes_seconds_at_most_though_the_router_hangs(world):
 def test_nobody_to_reach_is_a_sentence(world):
     network = NetworkConfig(connect=(f"tcp/127.0.0.1:{free_ports(1)[0]}",), connect_timeout_s=0.3)
     with pytest.raises(
-        BusError, match=r"cannot reach a router at tcp/127.0.0.1:\d+: .*is `swarm router` running there"
+        BusError, match=r"cannot reach a router at tcp/127.0.0.1:\d+: .*is `swarm role router` running there"
     ):
         open_bus(network)
 
@@ -322,7 +322,7 @@ def test_a_slow_reader_keeps_the_newest_and_nobody_waits(world):
         a.publish(POSE, pose(seq=seq), target="t0")
     assert time.monotonic() - began_s < 5.0
     world.until(lambda: seen)
-    world.settle()  # a link that was full may have dropped the last of the burst, as poses are told again
+    world.settle()  # a link that was full may have dropped the last of the burst, as poses are sent again
     for seq in range(5000, 5100):
         a.publish(POSE, pose(seq=seq), target="t0")
         time.sleep(0.1)
@@ -513,7 +513,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
 
 
 def test_who_leaves_before_it_obeys_is_not_called_silent_and_who_hangs_is(world: ZenohWorld) -> None:
-    """A planner whose target was just removed still answers who is there."""
+    """A planner whose target was just removed still answers the call for members."""
     members = {role: world.bus(role) for role in ("keeper", "planner", "agent", "targets")}
     for role, bus in members.items():
         bus.declare_alive(Peer(role, "x", 1))

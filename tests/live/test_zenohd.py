@@ -1,5 +1,5 @@
 """zenohd and its storage-manager plugin as router and store. Opt-in: `ZENOHD=/opt/zenohd pytest -m zenohd`, or
-zenohd on PATH with the plugin beside it; `docs/deploy.md` says how to install them."""
+zenohd on PATH with the plugin beside it; `docs/operate/routers.md` says how to install them."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router
             author.run(1.5)
             author.write(np.arange(0, GRID.cells, 22), MarkKind.CLEAR)
             author.run(1.5)
-            # Zenoh drops puts where a link is congested, and a storage tells nobody what it has: without a keeper,
-            # which would ask again, what was dropped is only there if it is said again.
+            # Zenoh drops puts where a link is congested, and a storage publishes no digest: without a keeper, which
+            # would ask again, a dropped put only arrives if it is repeated.
             for tile in author.replica.held.tiles:
                 own = [each for each in author.replica.held.of_tile(tile) if each.author == name]
                 author.sync.publish(own)
                 author.run(0.01)
             authors[name] = author
-    with open_bus(router.network) as bus:  # nobody else is left
+    with open_bus(router.network) as bus:  # no other process is left
         late = Participant(bus)
         eventually(lambda: late.run(0.2) or late.sync.joined, 20, "the late join")
         assert sum(len(late.replica.held.of_tile(tile)) for tile in late.replica.held.tiles) == 2 * GRID.tiles

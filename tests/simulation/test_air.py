@@ -105,7 +105,7 @@ WEST, EAST, SOUTH_EAST = (9, 9), (9, 52), (45, 45)
 
 
 def speed_mps(routes: str, start: tuple[int, int], end: tuple[int, int]) -> float:
-    """How fast a drone is over the ground on its way, as the median of its ticks."""
+    """Median speed of a drone over the ground on its way, over its ticks."""
     text = _PLAIN.replace("START", str([*start])).replace("END", str([*end])).replace("ROUTES", routes)
     simulation = OrderedSimulation(parse_scenario(text))
     places: list[tuple[float, float, float]] = []

@@ -1,4 +1,4 @@
-"""Bodies among the whole swarm: nobody drives into one, with faults and without, and work goes on."""
+"""Bodies among the whole swarm: no vehicle drives into one, with faults and without, and work goes on."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from swarm.wire.messages.orders import ZoneOrder
 
 SECONDS = 12.0
 LONG_S = 20.0
-"""Until somebody on foot has captured a target, too: rovers are there first."""
+"""Long enough that a walker has captured a target, too: rovers are there first."""
 _TEXT = """
 name = "mixed"
 seed = 3
@@ -151,7 +151,7 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
 
 
 def test_walkers_leave_zones_of_all_and_of_their_own_and_more_of_them_join() -> None:
-    """One lies over ground that no rover could drive; what is for walkers says nothing to rovers."""
+    """One lies over ground that no rover could drive; a zone for walkers does not concern rovers."""
     scenario, terrain = made(_TEXT)
     simulation = OrderedSimulation(scenario, terrain=terrain)
     laws = LawBook(simulation)

@@ -1,5 +1,5 @@
-"""The whole swarm in dense traffic: no two vehicles meet, nobody waits for long, whoever crashes, is cut off or is
-started twice."""
+"""The whole swarm in dense traffic: no two vehicles meet and none waits for long, with crashes, cuts and double
+starts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
 
 @pytest.mark.seeds(3)
 def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
-    """As the dense runs did in which two vehicles met."""
+    """The settings of the dense runs in which two vehicles met."""
     scenario, terrain = crowd("open", seed, vehicles=24, per_agent=3, side=16)
     crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{(5 * n + seed) % 8}") for n in range(10))
     simulation = Simulation(scenario, faults=FaultPlan(jitter_ms=20, crashes=crashes), terrain=terrain)

@@ -45,7 +45,7 @@ def places(simulation: OrderedSimulation) -> list[int]:
 def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(3)
-    # Where vehicles stand: they have to leave before it gets in.
+    # The cells of vehicles: they have to leave before it gets in.
     rovers = [guest(simulation, f"rover-{n}", cell) for n, cell in enumerate(places(simulation)[:3])]
     drive(simulation, rovers, 12)
     assert all(rover.moves > 5 for rover in rovers)
@@ -91,7 +91,7 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     before = {id: vehicle.cell for id, vehicle in agent.vehicles.items()}
     drive(simulation, [], 5)
     assert any(vehicle.cell != before[id] for id, vehicle in agent.vehicles.items())
-    assert set(before) <= set(simulation.recorder.observed.vehicles().ids)  # whoever watches sees them
+    assert set(before) <= set(simulation.recorder.observed.vehicles().ids)  # observers see them
 
     simulation.crash(node.name)
     drive(simulation, [], 5)

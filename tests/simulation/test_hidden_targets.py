@@ -1,4 +1,5 @@
-"""Targets that only vehicles see: whoever stands where one was, and sees that it is gone, goes for another."""
+"""Targets that only vehicles see: a vehicle which stands at a target's old place and sees none there goes for
+another."""
 
 from __future__ import annotations
 

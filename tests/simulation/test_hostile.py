@@ -1,4 +1,4 @@
-"""One node that sends anything at all, on every key, harms nobody: no service raises, the swarm does its work."""
+"""One node that sends anything at all, on every key, harms no service: none raises, and the swarm does its work."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def ignore(event: Event) -> None:
 
 
 def key_fields(topic: Topic, message: Message, chance: random.Random) -> dict[str, str]:
-    """The fields that the message itself names, else those of somebody who exists."""
+    """The fields that the message itself names, else those of an existing process."""
     named = {name: getattr(message, name, None) for name in topic.fields}
     return {name: str(chance.choice(KNOWN) if value is None else value) for name, value in named.items()}
 

@@ -1,4 +1,5 @@
-"""What a process heard, fed to the same code, gives the same outputs; other outputs are found at their event."""
+"""A process's recorded inputs, fed to the same code, give the same outputs; other outputs are found at their
+event."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from launch_scripts.cli import app
+from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import keep, recordings_of, replay_run
 from launch_scripts.simulation.simulate import simulate
@@ -53,12 +54,12 @@ def records_of(path: Path) -> list[Record]:
 
 
 def recorded_of(run: Path, process: str) -> list[Record]:
-    """What is recorded of a process's first life."""
+    """The recording of a process's first incarnation."""
     return records_of(recordings_of(run, process)[0].path)
 
 
 def outcome_of(folder: Path) -> Outcome:
-    """Of a run with one recording, which can be replayed."""
+    """The outcome of a run with one recording, which can be replayed."""
     (found,) = replay_run(folder)
     assert found.outcome is not None
     return found.outcome
@@ -94,7 +95,7 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
     )
     terrain = build_terrain(scenario)
     calls = itertools.count()
-    # As a live planner is given them: CPU time, kernels that are compiled by and by, networks in files.
+    # The inputs of a live planner: CPU time, kernels that are compiled by and by, networks in files.
     live = {
         "stopwatch": time.thread_time_ns,
         "all kernels": lambda: next(calls) > 40,
@@ -331,7 +332,7 @@ def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_diff
 
 
 def test_all_that_a_process_is_started_with_is_recorded() -> None:
-    # Where a process keeps its files, who had them before, and whom it tells how it is, is no input: what it reads
-    # there is.
+    # The folder of a process's files, their former owner, and the receiver of its health are no input: the content
+    # that it reads there is.
     here = {"run_dir", "record_inputs", "health", "takes_over"}
     assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(records.Head.__struct_fields__)

@@ -44,7 +44,7 @@ vehicles = { per_agent = 2, sense_range_m = 40, capture_range_m = 20 }
 """
 _HIDDEN = _BASE.replace("speed_m_per_s = 1", 'speed_m_per_s = 1, tracker = "sighted"')
 _SHOWN_S = 4.5
-"""When the running swarm is looked at."""
+"""Time at which the running swarm is observed."""
 
 Run = tuple[str, Scenario, Callable[[OrderedSimulation], None]]
 
@@ -119,7 +119,7 @@ class Logged:
         pass
 
     def details(self, *paths: str) -> list[str]:
-        """What people read who point at things of these entities."""
+        """The text that a person reads when pointing at these entities."""
         return [text for path in paths for text in self.newest.get(f"{path}:details", ())]
 
     @property
@@ -168,7 +168,7 @@ class Watched:
         return self.simulation.scheduler.clock.now_ns()
 
     def status(self) -> OutsideObserver:
-        """Somebody who comes now and asks."""
+        """A new observer that asks now."""
         simulation = self.simulation
         bus = simulation.network.bus("status", simulation.scenario.network.namespace, simulation.authenticator)
         observer: OutsideObserver
@@ -191,14 +191,14 @@ class Watched:
         self.monitor.tick(now_ns)
 
     def hush(self) -> None:
-        """Nobody says anything any more, and what was said arrives."""
+        """All processes fall silent, and messages under way arrive."""
         for node in self.simulation.nodes.values():
             node.ticking = False
         self.simulation.run_until(self.simulation.now_s + 0.6)
 
 
 def shown_in(text: str) -> dict[str, str]:
-    """Label -> what is shown of it, from the lines of any of the four."""
+    """Label -> shown value, from the lines of any of the four."""
     labels = sorted((fact.label for fact in facts.FACTS), key=len, reverse=True)
     found: dict[str, str] = {}
     for part in re.split(r" {2,}|\n|\*\*, ", text):
@@ -221,7 +221,7 @@ def rows_in(text: str) -> list[list[str]]:
 
 
 def alarms_in(text: str, state: RunState) -> set[str]:
-    """Which of the alarms that last are shown."""
+    """The lasting alarms that are shown."""
     return {line for line in (alarm.line(state.grid) for alarm in state.standing_alarms) if line in text}
 
 

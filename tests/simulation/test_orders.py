@@ -139,7 +139,7 @@ def _open(terrain: Terrain) -> int:
 @pytest.mark.seeds(4)
 def test_every_process_that_starts_after_an_acknowledged_pause_obeys_it(seed: int, terrain: Terrain) -> None:
     chance = random.Random(seed)
-    # Where a target is, only its planner knows when the process that moves it dies: not both are killed at once.
+    # Only its planner knows a target's place when the process that moves it dies: not both are killed at once.
     names = ("agent-a0", "agent-a1", "agent-a2", "keeper-0", "targets-0")
     crashes = [Crash(8.0 + 4.0 * chance.random(), chance.choice(names)) for _ in range(10)]
     simulation = simulated(terrain, FaultPlan(crashes=tuple(crashes)), seed)

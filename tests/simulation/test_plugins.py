@@ -82,7 +82,7 @@ Sensor = Walk = Assigner = Dynamics = Plugin
 
 
 def failed(tmp_path: Path, scenario: str, **bodies: str) -> tuple[list[str], dict[str, Any]]:
-    """What is told, and the report, of a run whose plug-in does this after a while."""
+    """The messages and the report of a run whose plug-in fails this way after a while."""
     text = FAILING
     for name in ("sensor", "walk", "assigned", "speed"):
         text = text.replace(f"{{{name}}}", bodies.get(name, "None"))

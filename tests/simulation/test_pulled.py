@@ -32,7 +32,7 @@ capture_range_m = 30.0
 
 
 class Headings:
-    """Which ways vehicles headed while they drove."""
+    """The headings of vehicles while they drove."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.eighths: list[float] = []

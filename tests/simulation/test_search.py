@@ -1,4 +1,4 @@
-"""Targets that nobody sees are searched for: vehicles drive on, apart from each other, until one sees them."""
+"""Targets that no vehicle sees are searched for: vehicles drive on, apart from each other, until one sees them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A group that shares out its targets, in a whole swarm: what is told, and who chases what."""
+"""A group that shares out its targets, in a whole swarm: its messages, and the vehicles of each target."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLUSTERED = Scenario(
 
 
 def run(scenario: Scenario, seconds: float = 6.0) -> tuple[Counter[str | None], str]:
-    """How many vehicles chase each target in the end, and the log of all deliveries."""
+    """Number of vehicles that chase each target in the end, and the log of all deliveries."""
     log = io.StringIO()
     simulation = Simulation(scenario, trace=log)
     simulation.run_until(seconds)

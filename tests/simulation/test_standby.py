@@ -22,7 +22,7 @@ from swarm.wire.topics import POSE, ROUTE
 STANDING_BY = msgspec.structs.replace(SMALL, standbys=StandbyConfig(planner=1, targets=1))
 ASK_S = 0.05
 TOLD_AGAIN_S = 0.5
-"""Where a target's pose was lost, the next one comes after so long."""
+"""Seconds until the next pose of a target after a lost one."""
 LONGEST_GAP_S = 1.0
 """Longest time without an answer, simulated. A leader's death is noticed after 0.6 s, at the next tick."""
 
@@ -111,7 +111,7 @@ def test_both_sides_of_a_cut_are_planned_for_and_one_planner_leads_when_it_heals
 
 
 class Poses:
-    """What an observer hears of the targets, in order, and where they truly are."""
+    """The poses of targets as an observer hears them, in order, and the true places."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -153,7 +153,7 @@ def test_the_targets_go_on_from_where_they_are_and_captures_count_on(seed: int) 
     simulation.finish()
     told = sum(max(pose.captures for _, pose in heard) for heard in poses.heard.values())
     assert told > 0
-    # The report lacks what the dead process had counted since it last told its counters, a second before at most.
+    # The report lacks the counts since the last publication of the dead process, a second before at most.
     assert told - 1 <= simulation.report(24)["captures"] <= told
 
 

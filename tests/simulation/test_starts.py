@@ -1,4 +1,4 @@
-"""A swarm that starts waits for nobody who is there."""
+"""A swarm that starts waits for no process that is there already."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     laws = LawBook(simulation)
     simulation.run_until(4)
     agent = agents(simulation)["agent-a1"].agent
-    simulation.run_until(4.2)  # what was on its way before the cut may still be granted
+    simulation.run_until(4.2)  # a message in transit before the cut may still be granted
     held = {id: list(agent.holdings.path(id)) for id in agent.vehicles}
     simulation.run_until(12)
     assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())

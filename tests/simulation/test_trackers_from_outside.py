@@ -76,7 +76,7 @@ class OutsideTracker:
 
 
 class Ear:
-    """Somebody who hears the planner of x, and asks it."""
+    """A client that hears the planner of x, and asks it."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -111,7 +111,7 @@ class Ear:
 
 
 def notes(simulation: Simulation) -> list[Note]:
-    """What planners have told people."""
+    """Sentences of planners for people."""
     return [note for _, note in simulation.recorder.notes if note.role == "planner"]
 
 
@@ -120,7 +120,7 @@ def kinds(simulation: Simulation) -> list[str]:
 
 
 def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
-    """What everybody who hears poses knows of the trackers of x."""
+    """The knowledge of all receivers of poses about the trackers of x."""
     found: dict[str, Tracking | None] = {"recorder": simulation.recorder.observed._trackings.of("x")}
     for node in simulation.nodes.values():
         service: Any = node.service
@@ -146,7 +146,7 @@ def captures_of_x(simulation: Simulation) -> int:
 
 
 def states(simulation: Simulation) -> set[VehicleState]:
-    """Of the vehicles that chase x."""
+    """States of the vehicles that chase x."""
     return {each.state for each in vehicles(simulation).values() if each.target == "x"}
 
 

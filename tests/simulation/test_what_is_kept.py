@@ -1,5 +1,5 @@
-"""Agents think again only of vehicles about which something changed. Nothing that changes may be missed: what is
-kept is what would be made anew, in every tick, under faults, in crowds and among bodies."""
+"""Agents think again only of vehicles about which something changed. No change may be missed: the kept value equals
+a recomputed one, in every tick, under faults, in crowds and among bodies."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def plan_all(warden: Warden, now_ns: int) -> None:
 
 
 def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[int]], list[int]]:
-    """What a table grants to a host, and which of the cells around its vehicles others hold."""
+    """The cells that a table grants to a host, and the cells around its vehicles that others hold."""
     grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if agent_of(vehicle) == host}
     standing, cols = warden._hosts[host].standing, warden._plots.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]

@@ -64,7 +64,7 @@ def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
 
 
 class FakePlanner:
-    """Serves exact routes and costs to one target from a tree that is grown anew for every question."""
+    """Serves exact routes and costs to one target from a tree that is grown again for every question."""
 
     def __init__(self, world: AgentWorld, target: str, incarnation: int = 1) -> None:
         self.world = world
@@ -233,7 +233,7 @@ class AgentWorld(SwarmModel):
         return self.agents[id]
 
     def crash_agent(self, id: str) -> None:
-        """The process is gone; its vehicles stand where they were."""
+        """The process ends; its vehicles stay at their places."""
         service = self.agents.pop(id)
         if service.agent.vehicles:
             self.ghosts[id] = {v.id: v.cell for v in service.agent.vehicles.values()}

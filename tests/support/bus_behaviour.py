@@ -170,7 +170,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
     world.until(lambda: bool(box) and box[-1].message.text == f"n{NOTE.buffer + 49}")
     texts = [each.message.text for each in b.collected(NOTE)]
     assert texts[-1] == f"n{NOTE.buffer + 49}"
-    assert len(texts) == NOTE.buffer  # of a topic whose values all count, the newest so many
+    assert len(texts) == NOTE.buffer  # the newest ones, of a topic whose values all count
     b.unsubscribe(NOTE)
     world.settle()
     a.publish(NOTE, note("late"), role="agent", id="a0")
@@ -186,7 +186,7 @@ def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World)
         for target in ("t0", "t1"):
             a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
     world.put_bytes(a, TRUE_POSE, b"garbage", target="t2")
-    a.publish(TRUE_POSE, pose("t1", seq=99), target="t0")  # what is rejected hides nothing
+    a.publish(TRUE_POSE, pose("t1", seq=99), target="t0")  # a rejected value hides no other
     world.until(lambda: len(box) == 2)
     assert {(event.fields["target"], event.message.seq) for event in box} == {("t0", 20), ("t1", 20)}
     world.until(lambda: b.counts["payloads_dropped"] == 2)

@@ -1,4 +1,4 @@
-"""A network under test, and what the rules of a bus are told with."""
+"""A network under test, and the terms in which the rules of a bus are written."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from swarm.wire.messages.processes import RunInfo
 
 
 def keeper_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
-    """What a keeper answers of a run with two classes of vehicles."""
+    """The answer of a keeper of a run with two classes of vehicles."""
     return run_info(grid, run_id=run_id, role="keeper", id="0", classes=["walker", "truck"])
 
 
@@ -29,7 +29,7 @@ class SlowClock:
 
 
 class Program:
-    """What a program sees (`swarm`), and the session behind it.
+    """The view of a program (`swarm`), and the session behind it.
 
     slow_ns  its clock is behind that of all others by so much, which it learned when it connected
     """

@@ -1,4 +1,4 @@
-"""How much of a law each commit tries: a share of the examples and histories that a test names. `--thorough` tries
+"""The effort of each commit on a law: a share of the examples and histories that a test names. `--thorough` tries
 all of them."""
 
 from __future__ import annotations
@@ -17,5 +17,5 @@ def try_all() -> None:
 
 
 def few(count: int) -> int:
-    """Of as many as a test names, those that are tried now: at least one."""
+    """The number to try now, of the number that a test names: at least one."""
     return max(1, math.ceil(count * _share))

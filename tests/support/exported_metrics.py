@@ -1,4 +1,4 @@
-"""What an exporter exports of a swarm that has everything to tell."""
+"""The export of a swarm in which every figure has a value."""
 
 from __future__ import annotations
 

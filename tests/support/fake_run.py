@@ -1,4 +1,4 @@
-"""What one who watches a simulated run hears of it."""
+"""The messages of a simulated run, as an observer receives them."""
 
 from __future__ import annotations
 

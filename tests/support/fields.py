@@ -149,7 +149,7 @@ class Field:
 
 
 def paces_of_any_ratio(pace: Pace, rng: np.random.Generator) -> Iterator[tuple[str, Pace]]:
-    """What is met on real maps, and what is made against a queue of buckets. Lethal cells stay so."""
+    """Fields as on real maps, and fields made against a queue of buckets. Lethal cells stay so."""
     rows, cols = pace.shape
     usual = np.float32(np.median(pace[np.isfinite(pace)]))
     middle = int(np.flatnonzero(np.isfinite(pace))[np.isfinite(pace).sum() // 3])

@@ -1,5 +1,5 @@
 """A traffic world with guests: robots that speak for themselves, agents that join while the swarm runs, and
-operators who say that a robot is gone. All under the same faults."""
+operators who declare a robot absent. All under the same faults."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ANOTHER_CELL_NS = 2 * NS_PER_S
 
 
 class GuestProcess(Process):
-    """One life of a robot. Its body is on `disk`: when the process dies it stands where it stands, until somebody
-    carries it away."""
+    """One life of a robot. Its body is on `disk`: when the process dies, the body stays there until it is carried
+    away."""
 
     world: GuestWorld
 
@@ -50,7 +50,7 @@ class GuestProcess(Process):
         self.do(self.guest.begin(self.world.chance.getrandbits(32)))
 
     def try_to_enter(self) -> None:
-        """Where the body stands; one that stands nowhere tries here and there."""
+        """Tries the cell of the body; a body without a cell tries here and there."""
         self.asked_ns = self.world.now_ns
         self.guest.enter(self.world.chance.choice(self.world.free) if self.body is None else self.body)
 
@@ -119,8 +119,8 @@ class GuestProcess(Process):
 
 
 class AddedProcess(Process):
-    """One life of an agent that is not in the scenario. Its vehicles enter where there is place; a new life finds
-    those that it had in the tables, and lets the others enter anew."""
+    """One life of an agent that is not in the scenario. Its vehicles enter where there is place; a new incarnation
+    finds its earlier vehicles in the tables, and lets the others enter again."""
 
     world: GuestWorld
 
@@ -153,7 +153,7 @@ class AddedProcess(Process):
 
 
 class OperatorProcess(Process):
-    """Says that a robot is gone, until wardens have freed its cells."""
+    """Declares a robot absent until wardens have freed its cells."""
 
     world: GuestWorld
 
@@ -186,9 +186,9 @@ class OperatorProcess(Process):
 
 
 class GuestWorld(TrafficWorld):
-    """As a traffic world, with `robots` that come and go and `added` agents of two vehicles each.
+    """A traffic world with `robots` that come and go and `added` agents of two vehicles each.
 
-    entered, left, removed  how often guests did, and how often an operator said that one is gone
+    entered, left, removed  number of arrivals and departures of guests, and of robots declared absent
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Height models as files, for tests of what is read from them."""
+"""Height models as files, for tests of the readers."""
 
 from __future__ import annotations
 

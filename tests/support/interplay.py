@@ -54,7 +54,7 @@ class Robot(Guest):
 
 
 class Walker:
-    """A body that nobody steers: it stands, walks onto things, leaps, or reports nonsense at the bounds."""
+    """A body without a driver: it stands, walks onto things, leaps, or reports nonsense at the bounds."""
 
     def __init__(self, world: Interplay, name: str, until_s: float) -> None:
         chance = world.chance
@@ -71,7 +71,7 @@ class Walker:
             self.until_s, self.lease_s = min(until_s, world.simulation.now_s + 1.5), 1.0
 
     def tick(self) -> bool:
-        """False once it is gone."""
+        """False once it has left."""
         world, chance = self.world, self.world.chance
         gone = world.simulation.now_s >= self.until_s
         if self.kind == "walks":
@@ -263,7 +263,7 @@ class Interplay:
     # --- laws -------------------------------------------------------------------------------------------------
 
     def _forget_removed(self, node: Node) -> None:
-        """What has left by its agent's word stands nowhere."""
+        """A vehicle that has left by its agent's word stands on no cell."""
         if isinstance(node.service, AgentService):
             bodies = self.trial._cells.get(node.name, {})
             gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._away)
@@ -337,7 +337,7 @@ class Interplay:
             simulation.run_until(simulation.now_s + TICK_S)
 
     def _orders_obeyed(self) -> list[str]:
-        """Everybody's book is the keeper's, and holds what was acknowledged."""
+        """Every book equals the keeper's, and holds the acknowledged orders."""
         simulation = self.simulation
         keeper: Any = simulation.nodes["keeper-0"].service
         if keeper is None:

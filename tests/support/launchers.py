@@ -31,7 +31,7 @@ STANDBYS = "\n[standbys]\nplanner = 1\ntargets = 1\n"
 
 @dataclass(frozen=True)
 class Part:
-    """What runs on a machine. `rank` is that of planners and the targets process; None: all ranks."""
+    """The processes that run on a machine. `rank` is that of planners and the targets process; None: all ranks."""
 
     roles: tuple[str, ...]
     rank: int | None = None
@@ -44,7 +44,7 @@ THREE = {
     "planners": Part(("planner", "targets"), 0),
     "field": Part(("agent", "planner", "targets"), 1),
 }
-"""As a plan of a deployment places them: planners and their standbys apart. The scenario needs `STANDBYS`."""
+"""A placement like that of a deployment plan: planners and their standbys apart. The scenario needs `STANDBYS`."""
 
 
 class Machine:
@@ -84,17 +84,17 @@ class Machine:
         return self.process.wait(60)
 
     def said(self) -> str:
-        """All that its launchers have said."""
+        """All output of its launchers."""
         return (self.folder / "output.txt").read_text()
 
     @property
     def lives(self) -> bool:
-        """That its launcher still runs; fails with what it has said where it does not."""
+        """Asserts that its launcher still runs; shows its output if not."""
         assert self.process.poll() is None, self.said()
         return True
 
     def up(self) -> bool:
-        """Whether the launcher that was started last says that all is up."""
+        """True if the launcher that was started last reports that all is up."""
         return self.lives and self.said().count("all processes are alive") >= len(self.started)
 
     def ask_to_end(self) -> None:
@@ -104,7 +104,7 @@ class Machine:
                 process.send_signal(signal.SIGINT)
 
     def end(self) -> None:
-        """Wait for the end of what has been asked, and kill what does not end."""
+        """Waits for the end of the stopped processes, and kills those which do not end."""
         for process in self.started:
             try:
                 process.wait(20)
@@ -133,7 +133,7 @@ class Routed:
                 self._longest_s[id] = max(gap_s, self._longest_s.get(id, 0.0))
 
     def begin(self) -> None:
-        """Forget what was longest."""
+        """Forgets the longest time."""
         self._longest_s = {}
 
     def longest_s(self) -> float:
@@ -143,7 +143,7 @@ class Routed:
         return max(max(ended.get(id, 0.0), now_s - last_s) for id, last_s in dict(self._last_s).items())
 
     def all_since(self, began_s: float) -> bool:
-        """Whether all vehicles were heard to be on a route after that time, by the monotonic clock."""
+        """True if all vehicles were reported on a route after that time, by the monotonic clock."""
         return sum(last_s > began_s for last_s in dict(self._last_s).values()) == VEHICLES
 
     def any_since(self, began_s: float) -> bool:
@@ -185,8 +185,8 @@ def machines_of(
 
 
 def shared_kernels(tree: Path) -> None:
-    """Let another version find the kernels that this one has compiled, and leave its own beside them: their names
-    say of which sources they are."""
+    """Shares this version's compiled kernels with another version, which leaves its own beside them: their names
+    tell their sources."""
     (ROOT / "planner_service" / "kernels" / "__pycache__").mkdir(exist_ok=True)
     (tree / "planner_service" / "kernels" / "__pycache__").symlink_to(
         ROOT / "planner_service" / "kernels" / "__pycache__"

@@ -15,7 +15,7 @@ from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic
 
 _KEPT = 20
-"""Of what was heard about each topic."""
+"""Number of kept samples of each topic."""
 
 
 class Liar:
@@ -26,7 +26,7 @@ class Liar:
         self.fuzzer = fuzzer
         self._chance = random.Random(f"liar/{seed}")
         self._heard: dict[str, deque[tuple[dict[str, str], Message]]] = defaultdict(lambda: deque(maxlen=_KEPT))
-        """Topic -> what was put and answered last, with the fields of its key."""
+        """Topic -> last put and last answer, with the fields of its key."""
         self._own: set[bytes] = set()
         """Payloads of its own lies, which it hears, too."""
         self.told = 0

@@ -117,7 +117,7 @@ class LiveSwarm:
         eventually(lambda: self.said("all processes are alive"), 90, "the start of the swarm")
 
     def pid_of(self, name: str) -> int:
-        """Of the newest incarnation, from its log."""
+        """Process id of the newest incarnation, from its log."""
         log = (self.run_dir / f"{name}.log").read_text()
         return int(re.findall(r"starts, pid (\d+)", log)[-1])
 

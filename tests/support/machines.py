@@ -15,7 +15,7 @@ class Machines:
     """The namespaces, what runs in them, and how it is ended.
 
     addresses    name -> address
-    environment  of what is started there
+    environment  names of the processes there
     """
 
     def __init__(self, addresses: Mapping[str, str], environment: Mapping[str, str]) -> None:
@@ -55,7 +55,7 @@ class Machines:
         self._running[name].append(process)
 
     def lose(self, name: str) -> None:
-        """The machine loses its power: first its cable, so that nobody hears its processes end."""
+        """Simulates the loss of power of the machine: first its cable is cut, so that its processes end unheard."""
         _ip("-n", self.space("switch"), "link", "set", f"p{list(self.addresses).index(name)}", "down")
         self._kill(name)
 
@@ -93,7 +93,7 @@ def _ip(*arguments: str) -> None:
 
 
 def why_not() -> str | None:
-    """Why this machine cannot run two namespaces; None if it can."""
+    """The reason why this machine cannot run two namespaces; None if it can."""
     if shutil.which("ip") is None:
         return "there is no command ip (iproute2)"
     space = f"swarm-try-{os.getpid()}"

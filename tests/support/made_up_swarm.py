@@ -1,4 +1,4 @@
-"""Vehicles, routes, marks and a target which are only told of, for those who watch a swarm from outside."""
+"""Made-up vehicles, routes, marks and a target, for observers of a swarm from outside."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WEST_M, _NORTH_M, _CRS = 500_000.0, 5_300_000.0, "EPSG:32632"
 
 
 def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
-    """A set of so many marks, spread over its tile."""
+    """A set of the given number of marks, spread over its tile."""
     cells = np.arange(marks, dtype=np.uint16) * (1024 // max(marks, 16))
     kinds = (np.arange(marks) % 2).astype(np.uint8)
     paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))

@@ -14,7 +14,7 @@ from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 
 
 def run_info(grid: GridSpec | None = None, **fields: Any) -> RunInfo:
-    """What an agent answers of its run, on this grid or on one of a single cell."""
+    """The answer of an agent about its run, on this grid or on one of a single cell."""
     grid = grid or GridSpec(1, 1, 1.0)
     told: dict[str, Any] = {
         "run_id": "r", "role": "agent", "id": "a0", "incarnation": 1, "scenario": "s", "terrain": "0",
@@ -25,7 +25,7 @@ def run_info(grid: GridSpec | None = None, **fields: Any) -> RunInfo:
 
 
 def stats(role: str = "agent", id: str = "a0", counters: Counters | None = None, **fields: Any) -> Stats:
-    """What a process tells of itself once a second: what it has counted, or nothing."""
+    """Statistics of a process, published once a second: its counters, or nothing."""
     counted = counters or Counters()
     told: dict[str, Any] = {
         "incarnation": 1, "stamp_ns": 1, "counts": counted.counts, "gauges": counted.gauges,
@@ -48,8 +48,8 @@ def fleet_of(
     target: str | None = None,
     **fields: Any,
 ) -> Fleet:
-    """An agent's report about vehicles which are in the north-western corner unless told otherwise. All look north
-    and are after the same target, or none."""
+    """An agent's report about vehicles, which are in the north-western corner by default. All look north and are
+    after the same target, or none."""
     zeros = [0.0] * len(ids)
     told: dict[str, Any] = {
         "author": "a0.1", "group": "all", "region": 0, "seq": 1, "stamp_ns": 1, "ids": list(ids),
@@ -62,16 +62,16 @@ def fleet_of(
 
 
 def target_pose(target: str = "t0", cell: int = 0, grid: GridSpec | None = None, **fields: Any) -> TargetPose:
-    """Where a target is: in the middle of a cell of the grid, or at 0, 0."""
+    """Place of a target: in the middle of a cell of the grid, or at 0, 0."""
     x_m, y_m = (0.0, 0.0) if grid is None else grid.centre_m(cell)
     told = {"incarnation": 1, "seq": 1, "stamp_ns": 0, "cell": cell, "x_m": x_m, "y_m": y_m}
     return TargetPose(target=target, **(told | fields))
 
 
 def planner_status(target: str = "t0", **told: Any) -> PlannerStatus:
-    """What a planner tells of itself once a second.
+    """Status of a planner, published once a second.
 
-    told  fields that differ from those here
+    told  fields that differ from the defaults here
     """
     fields = {
         "incarnation": 1, "stamp_ns": 1, "strategy": "exact", "target_cell": 5, "map_version": 1,

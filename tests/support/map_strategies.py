@@ -81,13 +81,13 @@ def mark_sets(draw: st.DrawFn) -> MarkSet:
 
 
 class Composite:
-    """A cost sink that remembers what it was told last of each cell."""
+    """A cost sink that remembers the last value of each cell."""
 
     def __init__(self, grid: GridSpec = GRID) -> None:
         self.all_kinds = np.full((MOST_CLASSES + 1, grid.cells), MarkKind.CLEAR, np.uint8)
         self.all_paces = np.zeros((MOST_CLASSES + 1, grid.cells), np.float32)
         self.kinds, self.paces = self.all_kinds[0], self.all_paces[0]
-        self.changed: list[int] = []  # cells of which the last `apply` told
+        self.changed: list[int] = []  # cells in the last `apply`
 
     def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray, class_number: int = 0) -> None:
         assert len(np.unique(cells)) == len(cells)
@@ -96,7 +96,7 @@ class Composite:
         self.all_paces[class_number, cells] = paces
 
     def learn(self, words: object) -> bool:
-        """What is learned is about no cell."""
+        """Learned factors concern no cell."""
         return False
 
     def same(self, other: Composite) -> bool:
@@ -166,7 +166,7 @@ def replica_of(sets: list[MarkSet]) -> tuple[MapReplica, Composite]:
 
 
 class Acknowledged:
-    """What the keepers' whole digests say is committed."""
+    """The committed sets, by the keepers' whole digests."""
 
     def __init__(self, bus: Bus) -> None:
         self._committed: dict[str, bytes] | None = None
@@ -179,7 +179,7 @@ class Acknowledged:
                 self._committed = digest.held
 
     def not_yet(self, author: Any) -> int | None:
-        """How many of an author's sets no keeper has committed yet; None before any keeper spoke."""
+        """Number of an author's sets that no keeper has committed yet; None before any keeper spoke."""
         if self._committed is None or author.replica.author is None:
             return None
         return len(author.replica.held.ahead_of(self._committed, [author.replica.author]))

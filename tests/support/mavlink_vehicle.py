@@ -26,7 +26,7 @@ _M_PER_DEG = 111_320.0
 
 
 class Vehicle:
-    """Where it is, and what it was told."""
+    """Its place, and the commands that it received."""
 
     def __init__(self, lat_deg: float, lon_deg: float) -> None:
         self.lat_deg, self.lon_deg = lat_deg, lon_deg
@@ -59,7 +59,7 @@ class Vehicle:
 
 
 # MAVSDK logs to the same descriptor from threads of its own, in pieces: a line of ours could begin in the middle of
-# one of its lines. What is said here has the descriptor to itself.
+# one of its lines. The messages of this line have the descriptor to themselves.
 _SAID = os.fdopen(os.dup(1), "w")
 for descriptor in (1, 2):
     os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
@@ -82,7 +82,7 @@ def main() -> None:
     actions.set_armable(True, True)
     actions.subscribe_arm_disarm(vehicle.hear_armed)
     telemetry = TelemetryServer(server)
-    # It is heard from here on: a mission that came before it was waited for would be accepted, and known to nobody.
+    # It is received from here on: a mission that came earlier would be accepted without notice.
     mavsdk.add_any_connection(f"udpout://127.0.0.1:{port}")
     say("up")
     for turn in range(int(seconds * HZ)):

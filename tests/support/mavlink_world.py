@@ -25,7 +25,7 @@ NOWHERE: Way = ()
 
 @dataclass
 class Autopilot:
-    """What is not simulated by the core: PX4 or ArduPilot as far as their protocols go.
+    """Behaviour outside of the core's simulation: PX4 or ArduPilot as far as their protocols go.
 
     answers  it takes part in missions and obeys commands; a test may take that away
     """
@@ -97,7 +97,7 @@ class World:
         self._ticks = 0
 
     def run(self, seconds: float) -> list[Action]:
-        """What is said meanwhile."""
+        """Messages meanwhile."""
         before = len(self.said)
         for _ in range(round(seconds * NS_PER_S / TICK_NS)):
             self.tick()

@@ -210,7 +210,7 @@ class MessageFuzzer:
         return {name: each.tobytes() for name, each in columns._asdict().items()}
 
     def _legs(self, steps: int) -> bytes:
-        """Segments over so many steps, or none."""
+        """Segments over that many steps, or none."""
         if not steps or self._chance.random() < 0.3:
             return b""
         turns = sorted(self._chance.sample(range(1, steps), self._chance.randrange(min(steps, 5))))

@@ -1,4 +1,4 @@
-"""A monitor on a memory bus, and somebody else who speaks."""
+"""A monitor on a memory bus, and another sender."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def hidden_truth(terrain: Terrain) -> NDArray[np.float32]:
 
 
 class Rig(SwarmModel):
-    """A monitor on a memory bus, and somebody else who speaks. Frames are drawn while a run is played."""
+    """A monitor on a memory bus, and another sender. Frames are drawn while a run is played."""
 
     def __init__(
         self,

@@ -3,8 +3,8 @@
 Each mutant is one change of one place by an operator of cosmic-ray: a comparison, a number, a branch. It is made in
 a copy of the tree (`.mutants/`, where compiled kernels stay from run to run), and the tests that import its module
 run against it, without network, until the first one fails. That test is then run once without the mutant, and must
-pass: a suite that is broken kills nothing. What survives is either a rule that no test holds or a change without
-effect; both are listed with file, line and difference, and the exit code is 1.
+pass: a broken suite kills no mutant. A survivor is either a rule that no test holds or a change without effect;
+both are listed with file, line and difference, and the exit code is 1.
 
 cosmic-ray's own runner wants a database and one command for all modules. Its operators, called as a library, let
 each mutant meet only the tests that can see it, which is what makes a sample of 200 affordable.
@@ -67,7 +67,7 @@ def mutants_of(path: Path, lines: set[int] | None) -> Iterator[Mutant]:
         places = [(start, node) for node in nodes for start, _ in operator.mutation_positions(node)]
         for occurrence, ((line, _), node) in enumerate(places):
             if node.type == "number" and not node.value.isdecimal():
-                continue  # how long somebody waits, or a tolerance: one more or less breaks no rule
+                continue  # a duration of a wait, or a tolerance: one more or less breaks no rule
             if lines is None or line in lines:
                 yield Mutant(path.relative_to(ROOT).as_posix(), line, name, occurrence)
 
@@ -100,7 +100,7 @@ def _imports(path: Path) -> set[str]:
 
 
 class Suite:
-    """Which test files see a module: those that import it, themselves or by a module of `tests/support`, or if none
+    """Test files that see a module: those that import it, themselves or by a module of `tests/support`. If none
     does, those which see the modules of its core that import it.
 
     near  of three groups only the first that is not empty: unit tests that import the module, laws that do, and all
@@ -121,8 +121,8 @@ class Suite:
         self._passes: dict[tuple[str, ...], bool] = {}
 
     def of(self, file: str, steps: int = 2) -> list[str]:
-        """Test files for a file of the product, those that name it first; none if nobody imports it in so many
-        steps."""
+        """Test files for a file of the product, those that name it first; none if no test imports it within that
+        number of steps."""
         module = file.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
         direct = [path for path, names in self._direct.items() if module in names]
         unit = [path for path in direct if path.startswith("tests/unit")]
@@ -182,7 +182,7 @@ def refresh_copy() -> None:
 
 
 def tried(mutant: Mutant, suite: Suite, limit_s: float) -> dict[str, Any]:
-    """What became of a mutant: killed, survived, or untested where no test sees its module in time."""
+    """Outcome of a mutant: killed, survived, or untested where no test sees its module in time."""
     path, tests = COPY / mutant.file, suite.of(mutant.file)
     source = path.read_text(encoding="utf-8")
     mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)

@@ -44,5 +44,5 @@ def neighbour_tree(folder: Path) -> Path:
 
 
 def environment_of(tree: Path) -> dict[str, str]:
-    """In which the interpreter of this test imports our packages from `tree`, whatever is installed."""
+    """Environment in which the interpreter of this test imports our packages from `tree`, whatever is installed."""
     return os.environ | {"PYTHONPATH": os.pathsep.join((str(tree), str(tree / "tests")))}

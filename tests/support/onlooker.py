@@ -16,7 +16,7 @@ ENDS_S = 600.0
 
 
 class Onlooker:
-    """`notes` is the newest that it told; see `onlooker_program.Notes`."""
+    """`notes` holds its latest values; see `onlooker_program.Notes`."""
 
     def __init__(self, machines: Machines, name: str, scenario: Path, endpoint: str, certificates: Path) -> None:
         command = [sys.executable, str(onlooker_program.__file__), str(scenario), endpoint, str(certificates)]

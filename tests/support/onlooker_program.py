@@ -1,5 +1,5 @@
-"""An operator's program on a machine of its own: it notes who is routed, who answers, what keepers acknowledge.
-Run by `onlooker.Onlooker`.
+"""An operator's program on a machine of its own: it notes routed vehicles, answering processes, and
+acknowledgements of keepers. Run by `onlooker.Onlooker`.
 
 argv: the scenario, the router's endpoint, the folder of certificates, seconds after which it ends by itself. It
 prints a line of JSON ten times a second, and ends with its input, too.
@@ -36,11 +36,11 @@ TELL_S = 0.1
 
 
 class Notes:
-    """What was heard: times are of the monotonic clock, in seconds."""
+    """Notes about received messages: times are of the monotonic clock, in seconds."""
 
     def __init__(self) -> None:
         self.routed: dict[str, float] = {}
-        """Vehicle -> when it last told that it is on a route."""
+        """Vehicle -> time of its last report on a route."""
         self.targets: dict[str, str] = {}
         """Vehicle -> its target."""
         self.pushed: dict[str, list[tuple[float, int]]] = {}
@@ -50,9 +50,9 @@ class Notes:
         self.answered: dict[str, dict[int, tuple[float, float]]] = {}
         """Target -> life of a planner -> when that first and last answered, since it was silent for a second."""
         self.leads: dict[str, float] = {}
-        """Planner -> when it last told that it leads."""
+        """Planner -> time of its last report as leader."""
         self.acknowledged: dict[str, dict[str, tuple[int, int]]] = {}
-        """Keeper -> "author/tile" -> (epoch, seq) of the newest set that it told to have on its disk."""
+        """Keeper -> "author/tile" -> (epoch, seq) of the newest set that it reported on its disk."""
 
     def take(self, event: Event | None) -> None:
         now_s = time.monotonic()

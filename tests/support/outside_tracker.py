@@ -1,4 +1,4 @@
-"""A tracker as somebody else would write it: plain Zenoh and msgpack, nothing of this project's code.
+"""A tracker as an outsider would write it: plain Zenoh and msgpack, nothing of this project's code.
 
 Usage: python outside_tracker.py ENDPOINT SCHEMA TARGET TRACKER X_M Y_M. Tells five times a second where the
 target is, until it is killed; on SIGTERM it hands the target over.

@@ -1,4 +1,4 @@
-"""A target's tree, the map it is told of, and whatever happens to both."""
+"""A target's tree, its map, and the changes of both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from swarm.wire.route_columns import RouteStatus
 
 
 class Play:
-    """A tree, the map it is told of, and the job that a worker may have of it.
+    """A tree, its map, and the job that a worker may have of it.
 
     has_worker  long growths are left to that job: until it is adopted, answers are about where the target was
     """
@@ -87,7 +87,8 @@ class Play:
             self.tree.force([0, self.grid.cells - 1])
 
     def walk(self, rng: np.random.Generator, steps: int, check_every: int) -> set[str]:
-        """Moves to random neighbours, with marks and a worker's growths now and then. Returns what was grown."""
+        """Moves to random neighbours, with marks and a worker's growths now and then. Returns the kind of
+        growth."""
         kinds = set()
         for step in range(steps):
             self.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))

@@ -1,4 +1,4 @@
-"""What hypothesis draws for the planner: terrains, rules, and what happens to a tree."""
+"""Hypothesis strategies of the planner: terrains, rules, and the changes of a tree."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def paces(draw: st.DrawFn, most: int = 14) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Move:
-    """The target steps or jumps: by so many rows and cols, as far as the grid goes."""
+    """A step or jump of the target: by rows and cols, as far as the grid goes."""
 
     rows: int
     cols: int
@@ -78,7 +78,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Marks:
-    """Cells (seeded) become lethal, passable, dearer or cheaper."""
+    """Cells (seeded) become lethal, passable, more expensive or cheaper."""
 
     seed: int
     count: int

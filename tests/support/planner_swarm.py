@@ -1,4 +1,4 @@
-"""Planners on a simulated network: a tracker of targets, an agent that marks, and somebody who asks and hears."""
+"""Planners on a simulated network: a tracker of targets, an agent that marks, and a client that asks and hears."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def driven_s(pace: NDArray[np.float32], route: Route) -> float:
 
 
 class Ear:
-    """Somebody who asks, and hears everything."""
+    """A client that asks, and hears everything."""
 
     def __init__(self, world: SwarmModel) -> None:
         self.world = world

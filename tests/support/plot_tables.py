@@ -1,4 +1,4 @@
-"""What members, wardens and hosts of one plot say in tests: plot 0 of a grid of 8 x 8 cells, and five agents."""
+"""Messages of members, wardens and hosts of one plot in tests: plot 0 of a grid of 8 x 8 cells, and five agents."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def holdings_of() -> Holdings:
 
 
 def granted_of(table: Table, host: str = "a0") -> Granted:
-    """What a table says to one host."""
+    """The message of a table to one host."""
     life, heard = table.hosts.get(host, (0, 0))
     grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if vehicle.startswith(host)}
     return Granted(

@@ -1,4 +1,4 @@
-"""What processes of this machine take up, for benchmarks and tries of robustness."""
+"""Resource use of processes of this machine, for benchmarks and tries of robustness."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import psutil
 
 
 class Usage(NamedTuple):
-    """What one process takes up."""
+    """Resource use of one process."""
 
     rss_bytes: int
     threads: int
@@ -17,7 +17,7 @@ class Usage(NamedTuple):
 
 
 def usage(pid: int) -> Usage | None:
-    """What a process takes up now; None if it has ended."""
+    """Current resource use of a process; None if it has ended."""
     try:
         process = psutil.Process(pid)
         return Usage(process.memory_info().rss, process.num_threads(), process.num_fds())

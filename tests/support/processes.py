@@ -1,4 +1,4 @@
-"""Which processes live: by the session that a test started them in, for names would match others' too."""
+"""Live processes, by the session that a test started them in: names would match those of others, too."""
 
 from __future__ import annotations
 

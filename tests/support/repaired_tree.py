@@ -18,9 +18,9 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
 FACTORS = (0.3, 0.7, 1.5, 3.0, np.inf, 0.0)
-"""What happens to the paces of a patch: times so much; 0 draws them anew, lethal ones too."""
+"""Changes of the paces of a patch: times the factor; 0 draws them again, lethal ones too."""
 NO_LIMIT = 10**9
-"""Of cells, edges and steps that a repair may take."""
+"""Bound on cells, edges and steps of a repair."""
 
 
 class Patchwork:

@@ -31,7 +31,7 @@ class PeerNode(Node):
 
 
 class FakeNewest:
-    """What came last on a topic, put there by a test."""
+    """The newest message of a topic, put there by a test."""
 
     def __init__(self, topic: str) -> None:
         self.endpoint = SimpleNamespace(topic=topic)

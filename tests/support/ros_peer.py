@@ -93,12 +93,12 @@ class RosPeer:
         self.kill()
 
     def hear(self, topic: str, type_name: str) -> None:
-        """Subscribe: what comes is in `heard`."""
+        """Subscribes: received messages are in `heard`."""
         self.heard.setdefault(topic, [])
         self._do("hear", topic=topic, type=type_name)
 
     def put(self, topic: str, type_name: str, hz: float | None = None, **fields: Any) -> None:
-        """Publish once, or so often a second until something else is to be; what is not given is 0 or empty."""
+        """Publishes once, or at a rate until the next command; missing fields are 0 or empty."""
         self._do("put", topic=topic, type=type_name, fields=fields, hz=hz)
 
     def ask(self, service: str, type_name: str, timeout_s: float = 15.0, **fields: Any) -> dict[str, Any]:
@@ -108,7 +108,7 @@ class RosPeer:
         return answer
 
     def kill(self) -> None:
-        """As kill -9 does."""
+        """Kills the process with signal 9."""
         self.process.kill()
         self.process.wait(10)
 

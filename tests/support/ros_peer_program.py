@@ -23,7 +23,7 @@ from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2Subscriber  # n
 from zenoh_ros2_sdk.session import ZenohSession  # noqa: E402
 
 _MOST_TOLD = 4096
-"""Of an array, so that a map is a line that can be read."""
+"""Elements of an array that are printed, which keeps a map readable as a line."""
 
 
 def told(value: Any) -> Any:
@@ -39,7 +39,7 @@ def told(value: Any) -> Any:
 
 
 def made(store: Any, name: str, given: dict[str, Any]) -> Any:
-    """A message of a type: what is not given is 0, empty or false."""
+    """A message of a type: missing fields are 0, empty or false."""
     known = name if name in store.fielddefs else name.replace("/srv/", "/srv/msg/")
     return store.types[known](
         **{field: _value(store, kind, given.get(field)) for field, kind in store.fielddefs[known][1]}

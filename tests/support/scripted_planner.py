@@ -32,7 +32,7 @@ TICK = NS_PER_S // 10
 
 
 class NotedTimes(GrowthTimes):
-    """Notes what it is told, and goes by the model."""
+    """Notes the observed times, and goes by the model."""
 
     def __init__(self, calls: list[tuple[Any, ...]]) -> None:
         super().__init__(GRID, PlannerConfig(), False, False, None)
@@ -167,7 +167,7 @@ class World:
         self.newest_mark_ns = stamp_ns
 
     def tick(self) -> list[Action]:
-        """All that a tick brings, but for the status twice a second and sentences for people."""
+        """All actions of a tick, except the status twice a second and sentences for people."""
         self.now_ns += TICK
         actions = self.planner.tick(self.now_ns)
         self.told.extend(action for action in actions if isinstance(action, PlannerStatus))

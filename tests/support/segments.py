@@ -10,8 +10,8 @@ Cell = tuple[int, int]
 
 
 def crossed(start: Cell, end: Cell) -> tuple[list[tuple[Cell, Fraction]], list[tuple[Cell, Cell]]]:
-    """Of a segment between centres: the cells that it crosses with their share of it, and the exact corners that
-    it passes, each as the two cells beside it."""
+    """The cells that a segment between centres crosses with their share of it, and the exact corners that it
+    passes, each as the two cells beside it."""
     steps = [end[k] - start[k] for k in (0, 1)]
     met: list[dict[Fraction, int]] = [
         {Fraction(2 * i + 1, 2 * abs(n)): k for i in range(abs(n))} for k, n in enumerate(steps)

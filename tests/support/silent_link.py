@@ -1,4 +1,4 @@
-"""A TCP proxy on loopback whose link can be cut without a word: nobody is told, nothing passes."""
+"""A TCP proxy on loopback whose link can be cut silently: no end is told, nothing passes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 
 
 class SilentLink:
-    """Passes bytes between whoever connects to `port` and a port behind it.
+    """Passes bytes between a client of `port` and a port behind it.
 
     cut()   from now on nothing passes, in either direction, and connections that are made wait
     heal()  what waited passes

@@ -1,4 +1,4 @@
-"""What tests of whole swarms look at and do: agents and vehicles, orders, agents that join, guests."""
+"""Helpers for tests of whole swarms: agents and vehicles, orders, agents that join, guests."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def cells(simulation: Simulation, vehicle_class: str | None = None) -> dict[str,
 class OrderedSimulation(Simulation):
     """A simulation with an operator and a launcher.
 
-    book     what was ordered and a keeper acknowledged
-    refused  what was not acknowledged: (when, order, why)
+    book     orders which a keeper acknowledged
+    refused  orders without an acknowledgement: (when, order, why)
     """
 
     def __init__(self, scenario: Scenario, **options: Any) -> None:
@@ -57,7 +57,7 @@ class OrderedSimulation(Simulation):
         self._orders_given = 0
 
     def add(self, added: AddedAgent) -> Node:
-        """Let an agent join that is not in the scenario."""
+        """Adds an agent that is not in the scenario."""
         node = self.node(spec_of("agent", added.plan.id))
         node.added = added
         node.boot()
@@ -83,7 +83,7 @@ class OrderedSimulation(Simulation):
         self._operator.ask(topic, order, post, tag=f"order-{self._orders_given}", timeout_s=1.0, keeper="0")
 
     def _start_planners(self) -> None:
-        """As a launcher does: a planner for each target, and none for one that was removed."""
+        """Acts as a launcher: a planner for each target, and none for a removed one."""
         targets, ranks = self.book.targets(self.scenario), range(self.scenario.standbys.planner + 1)
         wanted = {ranked_id(id, rank) for id in targets for rank in ranks}
         there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}

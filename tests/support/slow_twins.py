@@ -51,7 +51,7 @@ def steps(
 def _legal_steps(
     pace: NDArray[np.float32], neighbours: int, corner_cutting: bool
 ) -> Iterator[tuple[int, Cells, Cells]]:
-    """Of each direction: the cells from which a step leads there, and those to which it leads."""
+    """For each direction: the cells from which a step leads there, and the cells to which it leads."""
     rows, cols = pace.shape
     cells = np.arange(pace.size).reshape(rows, cols)
     free = np.isfinite(pace)
@@ -102,9 +102,9 @@ def cost_to_go_in_float32(
     corner_cutting: bool = False,
     climb: Climb | None = None,
 ) -> NDArray[np.float32]:
-    """What trees are to cost, to the last bit, by a heap: each sum and each product rounded as theirs.
+    """Expected costs of trees, to the last bit, by a heap: each sum and each product rounded like theirs.
 
-    Float32 sums grow with what is added to, so that the order in which cells are served makes no difference.
+    Float32 sums grow with their terms, so the order in which cells are served makes no difference.
 
     cell_cost  float32 (rows, cols), s; of the cheapest straight step into each cell
     """
@@ -132,7 +132,7 @@ def cost_to_go_in_float32(
 
 
 def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) -> NDArray[np.float64]:
-    """As `cost_to_go`, by twelve lines that can be read, to keep watch over scipy and the graph it is given."""
+    """Like `cost_to_go`, in twelve readable lines, to keep watch over scipy and the graph it is given."""
     into: dict[int, list[tuple[int, float]]] = {}
     for u, v, cost in steps(pace, **rules):  # type: ignore[arg-type]
         into.setdefault(v, []).append((u, cost))
@@ -193,7 +193,7 @@ def follow(
 
 
 class Driven(NamedTuple):
-    """What became of routes that were driven step by step.
+    """The outcome of routes that were driven step by step.
 
     last    int64 (n,), cell; -1 where a step breaks a rule
     time_s  float64 (n,), s
@@ -206,7 +206,7 @@ class Driven(NamedTuple):
 def drive(
     grid: GridSpec, config: PlannerConfig, pace: NDArray[np.float32], climb: Climb | None, routes: RouteBatch
 ) -> Driven:
-    """Every route of a batch, step by step from its start to the end of what is given of it."""
+    """Drives every route of a batch, step by step from its start to the end of its given part."""
     last, seconds = np.array(routes.starts), np.zeros(len(routes))
     begin = np.concatenate(([0], routes.ends[:-1])).astype(np.int64)
     steps = routes.ends - begin
@@ -224,7 +224,7 @@ def drive(
 def _step(
     grid: GridSpec, config: PlannerConfig, pace: NDArray[np.float32], climb: Climb | None, here: Cells, code: Cells
 ) -> tuple[Cells, NDArray[np.float64]]:
-    """Where a step leads from each cell and what it takes, s; -1 and inf where the rules forbid it."""
+    """Cell to which a step leads from each cell, and its time, s; -1 and inf where the rules forbid it."""
     row, col = np.divmod(here, grid.cols)
     r, c = row + np.array(STEP_ROW)[code], col + np.array(STEP_COL)[code]
     inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.cols)
@@ -243,7 +243,7 @@ def _step(
 
 
 def lower_bound(tree: CostToGoTree, heuristic: NDArray[np.float32] | None, cell: int, cost: float) -> float:
-    """s, what is proven of a padded cell that costs so much, as docs/certificates.md has it."""
+    """The proven bound, s, of a padded cell of this cost, by docs/method/certificates.md."""
     grid = tree.cost_grid
 
     def rounding(cost: float) -> float:

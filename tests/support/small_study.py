@@ -27,7 +27,7 @@ vehicles.sense_range_m = [60, 120]
 
 
 def dies_of_seed_one(trial: Trial) -> Result:
-    """As `run_trial`, but the process ends by one of the seeds."""
+    """Like `run_trial`, but the process ends by one of the seeds."""
     if trial.seed == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return run_trial(trial)

@@ -1,4 +1,4 @@
-"""What a build leaves on disk, and what it reads there: run with the PYTHONPATH of any version.
+"""Files that a build leaves on disk and reads there: run with the PYTHONPATH of any version.
 
     PYTHONPATH=TREE:TREE/tests python tests/support/stored_by.py write FOLDER
     PYTHONPATH=TREE:TREE/tests python tests/support/stored_by.py read FOLDER
@@ -50,7 +50,7 @@ def write(folder: Path) -> None:
 
 
 def read(folder: Path) -> str:
-    """What is in them."""
+    """The content of the files."""
     with KeeperStore(folder / "map.sqlite") as store:
         store.bind("terrain", _GRID)
         kept = [*store.load(), *store.sightings(), *store.orders()]

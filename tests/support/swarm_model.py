@@ -131,7 +131,7 @@ class SwarmModel:
         return (self.now_ns - began_ns) / NS_PER_S
 
     def describe(self) -> str:
-        """What a condition that never held is explained by."""
+        """The explanation of a condition that never held."""
         return ", ".join(bus.node for bus in self.network.buses)
 
     # --- network --------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ class SwarmModel:
         return service
 
     def kill(self, node: str) -> None:
-        """As kill -9: no last words."""
+        """Kills the process with signal 9: it sends no last message."""
         self.buses.pop(node).close()
 
     def setup(self, role: str, id: str, incarnation: int = 1) -> RoleSetup:

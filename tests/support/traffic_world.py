@@ -27,10 +27,10 @@ LOOK_AHEAD = 3
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong until `quiet_s`: shares of messages, and events a second in the whole swarm.
+    """Faults until `quiet_s`: shares of messages, and events a second in the whole swarm.
 
-    tick_ns  how often processes tick, all the time. Late ones hear what was said at their ticks only, and all go by
-             their own time, as agents do; otherwise by clocks that leap, which must do no harm either
+    tick_ns  how often processes tick, all the time. If true, messages are heard at ticks only, and all go by their
+             own time, like agents; otherwise by clocks that leap, which must do no harm either
     """
 
     loss: float = 0.0
@@ -47,7 +47,7 @@ class Faults:
 
 
 def random_faults(chance: random.Random, quiet_s: float) -> Faults:
-    """Of every kind, or not."""
+    """Faults of every kind, or not."""
     return Faults(
         loss=chance.choice((0, 0.05, 0.3)),
         repeat=chance.choice((0, 0.1)),
@@ -64,7 +64,7 @@ def random_faults(chance: random.Random, quiet_s: float) -> Faults:
 
 @dataclass
 class Disk:
-    """What survives a process: promises, tables, and the lives that ran on it."""
+    """The state that survives a process: promises, tables, and the incarnations that ran on it."""
 
     own: OwnRecord
     saved: dict[int, tuple[int, Table]] = field(default_factory=dict)
@@ -279,7 +279,7 @@ class TrafficWorld:
         return self.goals[vehicle]
 
     def look(self) -> None:
-        """The law: different vehicles are on different cells, whoever commands them."""
+        """The law: different vehicles are on different cells, whatever their hosts."""
         on = {cell: vehicle for vehicle, cell in self.unmoved.items()}
         for disks in self.disks.values():
             for disk in disks:
@@ -430,7 +430,7 @@ class TrafficWorld:
         self.at(int(self.chance.uniform(1, 5) * NS_PER_S), lambda: self.cut.discard(cut))
 
     def disturb(self) -> None:
-        """Ten times a second: what goes wrong now."""
+        """Applies the faults of this moment, ten times a second."""
         if self.quiet:
             self.cut.clear()
             return

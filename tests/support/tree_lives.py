@@ -36,7 +36,7 @@ LAWS = {
     "batch": "a route has the same numbers alone, in a batch and asked for again",
     "exact": "the route of an exact tree is as good as any, within float32",
 }
-"""What is checked of every route, and how a violation is called."""
+"""Checks of every route, and the name of each violation."""
 
 STATED = 1e-6
 """Relative; what a stated cost may be off by."""
@@ -46,13 +46,13 @@ _FLOAT64 = 1e-12
 
 @dataclass
 class Findings:
-    """What a campaign has found.
+    """The findings of a campaign.
 
     checks      routes checked, whole ones and cut ones each
     violations  by law
     worst       by law, relative; how far the worst one is off
     example     by law: the seed of the first life that broke it
-    stated      worst relative difference of a stated cost from what is driven, whole or cut, allowed or not
+    stated      worst relative difference of a stated cost from the driven cost, whole or cut, allowed or not
     """
 
     checks: int = 0
@@ -73,7 +73,7 @@ class Findings:
 
 
 def lives(seed: int) -> Iterator[Findings]:
-    """What has been found after each life, without end. Each life has a seed of its own, counted up from `seed`: a
+    """The findings after each history, without end. Each life has a seed of its own, counted up from `seed`: a
     violation's is named, and lives from it on begin with it."""
     load_all()
     findings = Findings()
@@ -84,7 +84,7 @@ def lives(seed: int) -> Iterator[Findings]:
 
 
 class Life:
-    """One tree, the map that it is told of, and a worker's growth that it may wait for."""
+    """One tree, its map, and a worker's growth that it may wait for."""
 
     def __init__(self, seed: int, findings: Findings) -> None:
         self._seed = seed
@@ -234,7 +234,7 @@ class Life:
 
 
 def _above(one: Seconds, other: Seconds) -> Seconds:
-    """How much more one is than the other, relatively to the other; 0 where it is not."""
+    """Relative excess of one over the other; 0 where it is not larger."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(one <= other, 0.0, one / other - 1.0)
 

@@ -1,4 +1,4 @@
-"""What a bus does with trusted topics, as tests: on the simulated network and on real sessions, as `bus_behaviour`.
+"""Rules of a bus for trusted topics, as tests: on the simulated network and on real sessions, like `bus_behaviour`.
 
 A world's `bus` takes an `authenticator`.
 """
@@ -38,7 +38,8 @@ def test_on_a_trusted_topic_only_who_knows_the_secret_of_the_run_is_heard(world)
     world.until(lambda: box)
     assert [event.message.seq for event in box] == [1]
     assert hears.counts["payloads_dropped"] == 3
-    world.until(lambda: len(anybody) == 3)  # who has no secret may read; nobody hears itself on this topic
+    # A process without the secret may read; it does not hear itself on this topic.
+    world.until(lambda: len(anybody) == 3)
 
 
 def test_other_topics_need_no_secret(world):

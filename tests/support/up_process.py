@@ -23,7 +23,7 @@ class UpProcess:
     """A launcher in a session of its own. It is asked to end when this process ends, however that happens; `end`
     waits for it and leaves no process of the run.
 
-    What it prints is in `up.log` in the run's folder, its report in `up.json`.
+    Its output is in `up.log` in the run's folder, its report in `up.json`.
     """
 
     def __init__(self, scenario: str, run_dir: Path, seconds: float, *words: str) -> None:
@@ -47,7 +47,7 @@ class UpProcess:
         return self.process.pid
 
     def lines(self) -> list[str]:
-        """What the launcher has said so far."""
+        """The output of the launcher until now."""
         with contextlib.suppress(OSError):
             return self._said.read_text(errors="replace").strip().splitlines()
         return []
@@ -62,14 +62,14 @@ class UpProcess:
             raise error
 
     def report(self) -> dict[str, Any] | None:
-        """What the launcher reported at its end; None if it did not."""
+        """The report of the launcher at its end; None if there is none."""
         with contextlib.suppress(OSError, ValueError):
             found: dict[str, Any] = json.loads(self._reported.read_text())
             return found
         return None
 
     def end(self) -> list[str]:
-        """Ask the launcher to end and wait for it. Returns the names of what had to be killed."""
+        """Ask the launcher to end and wait for it. Returns the names of processes that had to be killed."""
         left_behind = []
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""The table of transitions that `vehicle_agent.driving` gives, and what tells which a vehicle makes."""
+"""The table of transitions that `vehicle_agent.driving` gives, and a recorder of those that a vehicle makes."""
 
 from __future__ import annotations
 

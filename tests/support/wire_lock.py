@@ -15,14 +15,12 @@ from typing import Any
 
 import msgspec
 
-from docs.generate.wire_page import messages, parts, rows
+from docs.generate.wire_page import REQUIRED, messages, parts, rows
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
 
 PATH = Path(__file__).parents[2] / "docs" / "wire.lock"
-REQUIRED = " | refused"
-"""The end of a field without a default, as on the page of the wire."""
 NEVER_STEP = ("run", "nothing")
 """Messages by which builds of any two versions say which they are."""
 
@@ -60,7 +58,7 @@ def _locked(kind: type[Message]) -> dict[str, Any]:
 
 
 def _layout(struct: type[msgspec.Struct]) -> str:
-    """How fields are written, and whether what a later build adds is read past."""
+    """The layout of fields, and whether fields of a later build are skipped."""
     config = struct.__struct_config__
     return ("list" if config.array_like else "map") + (", no other fields" if config.forbid_unknown_fields else "")
 
@@ -71,7 +69,7 @@ def document() -> str:
 
 
 def faults() -> list[str]:
-    """What breaks the rules since the lock was written last, a sentence each."""
+    """Broken rules since the lock was written last, a sentence each."""
     return list(broken(json.loads(PATH.read_text(encoding="utf-8")), lock()))
 
 
@@ -105,7 +103,7 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
             yield f"{sentence}: {name} needs a step to its next version (swarm/wire/versions.py)"
         for struct, fields in before["structs"].items():
             for field in now["structs"].get(struct, [])[len(fields) :]:
-                if field.endswith(REQUIRED):
+                if field.endswith(f" | {REQUIRED}"):
                     added = f"{struct}.{field.partition(' | ')[0]} is added without a default"
                     yield f"{added}: builds before this one do not send it"
     elif name in NEVER_STEP:
@@ -115,7 +113,7 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
 
 
 def _changed(before: Lock, now: Lock) -> Iterator[str]:
-    """What is written otherwise in one version of a message. Fields may be added behind the others."""
+    """The differences in one version of a message. Fields may be added behind the others."""
     for struct, fields in before["structs"].items():
         kept = now["structs"].get(struct, [])
         for index, field in enumerate(fields):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # where it stands differs between versions
     from swarm.wire.messages import Message
 
 LONGEST_BYTES = 2000
-"""Of a specimen."""
+"""Upper bound on a specimen."""
 KINDS = {kind.__name__: kind for kind in MESSAGES}
 
 

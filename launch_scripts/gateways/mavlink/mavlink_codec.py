@@ -12,8 +12,6 @@ from typing import Any
 
 from msgspec import Struct
 
-from swarm.errors import ConfigError
-
 SYSID, COMPID = 245, 191
 """Ours: a system which is no vehicle, and its onboard computer."""
 AUTOPILOT = 1
@@ -153,11 +151,9 @@ Outgoing = Heartbeat | Command | MissionCount | MissionItem | MissionCurrent | M
 
 
 def pymavlink() -> Any:
-    """The dialect "common" of MAVLink 2. Raises ConfigError without pymavlink."""
-    try:
-        from pymavlink.dialects.v20 import common
-    except ModuleNotFoundError as error:
-        raise ConfigError("swarm mavlink needs pymavlink: install the extra 'mavlink'") from error
+    """The dialect "common" of MAVLink 2."""
+    from pymavlink.dialects.v20 import common
+
     return common
 
 

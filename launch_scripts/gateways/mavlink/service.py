@@ -38,7 +38,7 @@ def check_ground(frame: Frame) -> None:
     try:
         frame.to_wgs84(*frame.centre_m(0))
     except ConfigError as error:
-        raise ConfigError(f"swarm mavlink needs latitudes and longitudes: {error}") from error
+        raise ConfigError(f"swarm gateway mavlink needs latitudes and longitudes: {error}") from error
 
 
 def run(

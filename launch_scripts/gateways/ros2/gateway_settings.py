@@ -214,7 +214,7 @@ EXAMPLE = IncomingSettings(
 
 
 class Settings(Section, frozen=True, kw_only=True):
-    """Settings of `swarm ros2`. Each key has a default, so that an empty file is one.
+    """Settings of `swarm gateway ros2`. Each key has a default, so that an empty file is one.
 
     vehicles  ids of vehicles that ROS hears of, with * and ?
     forward   names of topics of the table that are forwarded; empty: all

@@ -1,4 +1,4 @@
-"""The process of `swarm ros2`: one session to the swarm, one to ROS, and the gateway between them. Shell only.
+"""The process of `gateway ros2`: one session to the swarm, one to ROS, and the gateway between them. Shell only.
 
 Both sides may come and go. Messages to ROS are published without waiting, so a ROS side that hangs costs the swarm
 nothing, and misses messages.

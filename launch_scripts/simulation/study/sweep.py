@@ -13,13 +13,13 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from launch_scripts.observe.run_folder import write_file
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
 from launch_scripts.simulation.study.summary import Summary, document, name_of, pictures_of, summarise
 from launch_scripts.simulation.study.trials import Result, Trial
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
+from swarm.files import check_writable, write_file, writing
 
 FIGURE = "figure."
 """Begins the name of a column that holds a figure."""
@@ -38,14 +38,13 @@ class ResultStore:
         """Reads existing results. Raises StoreError."""
         self.path = folder / KEPT
         self.results: dict[str, Result] = {}
-        try:
+        with writing(self.path):
             folder.mkdir(parents=True, exist_ok=True)
             with self.path.open("a+b") as file:
                 file.seek(0)
                 *lines, half = file.read().split(b"\n")
                 file.truncate(file.tell() - len(half))
-        except OSError as error:
-            raise StoreError(f"cannot use {self.path}: {error.strerror or error}") from error
+        check_writable(folder)
         for number, line in enumerate(lines, 1):
             try:
                 result = msgspec.json.decode(line, type=Result)
@@ -57,11 +56,8 @@ class ResultStore:
     def add(self, result: Result) -> None:
         """Keeps a result. Raises StoreError."""
         self.results[result.key] = result
-        try:
-            with self.path.open("ab", buffering=0) as file:
-                file.write(msgspec.json.encode(result) + b"\n")
-        except OSError as error:
-            raise StoreError(f"cannot write results to {self.path}: {error.strerror or error}") from error
+        with writing(self.path), self.path.open("ab", buffering=0) as file:
+            file.write(msgspec.json.encode(result) + b"\n")
 
 
 RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
@@ -120,26 +116,24 @@ class Sweep:
     def finish(self) -> Summary:
         """Writes the results, scenarios and summary. Raises StoreError."""
         cases, folder = [], self.folder / SCENARIOS
-        try:
+        with writing(folder):
             folder.mkdir(exist_ok=True)
-            for number, case in enumerate(self.cases):
-                if case.given is not None and case.settings:  # no file says yet what it is
-                    path = folder / f"{number}-{re.sub('[^A-Za-z0-9_.]+', '-', case.label)[:60]}.toml"
-                    write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
-                    case = msgspec.structs.replace(case, path=str(path))
-                cases.append(case)
-            summary = summarise(self.study, cases, self.store.results)
-            write_file(self.folder / RESULTS, self._table())
-            pictures = pictures_of(summary)
-            for name, file in pictures.items():
-                from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
+        for number, case in enumerate(self.cases):
+            if case.given is not None and case.settings:  # no file says yet what it is
+                path = folder / f"{number}-{re.sub('[^A-Za-z0-9_.]+', '-', case.label)[:60]}.toml"
+                write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
+                case = msgspec.structs.replace(case, path=str(path))
+            cases.append(case)
+        summary = summarise(self.study, cases, self.store.results)
+        write_file(self.folder / RESULTS, self._table())
+        pictures = pictures_of(summary)
+        for name, file in pictures.items():
+            from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
 
-                write_file(self.folder / file, draw_outcome(summary.cases, name))
-            write_file(self.folder / PAGE, document(summary, pictures).encode())
-            numbers = msgspec.to_builtins(summary, str_keys=True)
-            write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
-        except OSError as error:
-            raise StoreError(f"cannot write to {self.folder}: {error.strerror or error}") from error
+            write_file(self.folder / file, draw_outcome(summary.cases, name))
+        write_file(self.folder / PAGE, document(summary, pictures).encode())
+        numbers = msgspec.to_builtins(summary, str_keys=True)
+        write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
         return summary
 
     def _table(self) -> bytes:

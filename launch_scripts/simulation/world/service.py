@@ -26,7 +26,7 @@ from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 _MOVED_CELLS = 0.25
 """A share of a cell, which trackers of others are asked for, too (docs/design/zenoh-topology-and-inboxes.md,
-docs/operate/trackers.md)."""
+docs/vehicle/tracker.md)."""
 _AGAIN_NS = NS_PER_S // 2
 """Interval at which a target at rest is published (docs/design/zenoh-topology-and-inboxes.md): four times within
 the lease of a pose, 2 s."""
@@ -58,7 +58,7 @@ class PoseThrottle:
 
 
 TICK_HZ = 10.0
-"""Ten poses a second are enough for any planner (docs/operate/trackers.md). Most of them are not published, as a
+"""Ten poses a second are enough for any planner (docs/vehicle/tracker.md). Most of them are not published, as a
 target takes seconds for a cell."""
 _ASK_NS = NS_PER_S // 2
 """Planners are asked this often where the targets were: twice within `targets.LISTEN_NS`, so one lost question is

@@ -23,7 +23,7 @@ from shared_map.importers.zones.vector_files import Features, Layer, is_vector, 
 from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way
 from swarm.config.ground import ZoneConfig
-from swarm.errors import TerrainError
+from swarm.errors import TerrainError, missing
 from swarm.grid import MAX_CELLS, GridSpec, Window
 
 _WIDEST_M = 1000.0
@@ -85,8 +85,8 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
         raise TerrainError(f"{what} does not exist")
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
-    if any(importlib.util.find_spec(name) is None for name in ("pyogrio", "shapely")):
-        raise TerrainError(f"{what} cannot be read: pyogrio and shapely are missing; install the extra 'vectors'")
+    if importlib.util.find_spec("pyogrio") is None or importlib.util.find_spec("shapely") is None:
+        raise TerrainError(f"{what} cannot be read: it needs {missing('pyogrio')}")
     layer = open_layer(path, zone.layer, what)
     facts = FileFacts(path.name, layer.name, zone.crs or layer.crs or "none", layer.features)
     worth = _Worth(zone, layer, facts)

@@ -23,10 +23,10 @@ from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 LEVELS = 64
-"""Of the stack, from the lowest flight to the highest."""
+"""Levels of the stack, the lowest flight first."""
 _STEPS = tuple(zip(STEP_ROW, STEP_COL, strict=True))
 _EVERY = 2
-"""Of the terrain every second cell is taken, as flights are long."""
+"""Every second cell of the terrain is used, because flights are long."""
 
 
 _ROOTS, _STARTS = 2, 150
@@ -151,7 +151,7 @@ def _grown(grid: GridSpec, flown: AirGround, root: int) -> tuple[CostToGoTree, C
 def _clearance(
     grid: GridSpec, heights: Floats, flown: AirGround, routes: int, rng: np.random.Generator
 ) -> tuple[int, float]:
-    """How many routes, and the least height over ground of any: along a step over the highest cell that it touches.
+    """Number of routes, and the least height over ground: along each step, over the highest cell that it touches.
 
     Every cell of a tree is the start of one route, and each step of a route is the first step of another: so of a
     tree every step is looked at once.

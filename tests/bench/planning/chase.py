@@ -45,13 +45,13 @@ class Plan:
     """Targets, vehicles and frames of a chase.
 
     targets     each moves one cell a frame; vehicles are shared out among them
-    frames      at most so many are measured
+    frames      upper bound on the number of measured frames
     walk        how targets move; those that evade flee from the vehicles
     speed       cells that a vehicle drives a frame, on the cheapest route; one that arrives turns up elsewhere.
                 0: vehicles stand, and are asked for from where they stand
     max_cells   steps that a route is given for; 0 is the whole route
-    judge_every each so many frames one target's tree is held against an exact one
-    probes      cells from which that is done, drawn anew each time; vehicles that drive are asked instead
+    judge_every period, in frames, of the check of one target's tree against an exact one
+    probes      cells of that check, drawn again each time; vehicles that drive are asked instead
     seconds     a strategy that has taken so much CPU time is measured no further; `FEWEST` frames it always gets
     """
 
@@ -79,7 +79,7 @@ class Tally:
     frame_ms   CPU time of each frame: all trees follow their targets, all vehicles' routes are read, and full
                growths are done that a service would leave to its worker
     start_ms   CPU time a target before the first frame: the first growth, and what is found once for a map
-    updates    how often what was done to a tree; `job` is a full growth that a service's worker would do
+    updates    how often each kind of update ran; `job` is a full growth that a worker of the service would run
     batches    in how many groups the targets were run, as their trees did not fit into memory together
     gaps       one array per judged frame: cost of each route over the optimum
     proven     the same over the certificate's lower bound

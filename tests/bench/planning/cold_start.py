@@ -35,8 +35,8 @@ def start(
     ./launch_scripts/bench start --no-kernels
 
     Medians; CPU time is that of all processes which compile, to their end. Each cold run gets an empty cache folder
-    (NUMBA_CACHE_DIR) of its own; the warm ones use what the last cold one left there. That of this installation is
-    left alone. compiled: how many functions that is, of which `kernels` are called from Python.
+    (NUMBA_CACHE_DIR) of its own; the warm ones use what the last cold one left there. The cache of this
+    installation is left alone. compiled: number of compiled functions, of which `kernels` are called from Python.
     """
     rows: list[dict[str, Any]] = []
     for what in track([name for name in STAGES if kernels or name != "kernels"]):

@@ -20,7 +20,7 @@ from swarm.grid import Window
 _HALVES = (16, 32, 64)
 """Cells to every side of the windows."""
 _PATCHES = (0, 4, 8)
-"""The same of patches that become twice as dear, and what they were again; 0 is a mark of one cell."""
+"""The same for patches that become twice as expensive and then return; 0 is a mark of one cell."""
 _MOVES = 6
 """There and back, in each window."""
 _PLACES = 3
@@ -59,7 +59,7 @@ class _Side:
         self.took_ms = 0.0
 
     def change(self, window: Window, factor: float) -> bool:
-        """Whether the tree was repaired; `took_ms` says what that took."""
+        """True if the tree was repaired; `took_ms` gives the time."""
         self.pace[window.row0 : window.row1, window.col0 : window.col1] *= np.float32(factor)
         changes = self.costs.apply(self.pace, [window])
         done = []
@@ -96,8 +96,8 @@ def _windows(
     rng: np.random.Generator,
     free: NDArray[np.int64],
 ) -> None:
-    """Moves of one cell, there and back, by windows that lie on the map as a whole. The first does not count: what
-    was grown before it has left the caches to the other side."""
+    """Moves of one cell, there and back, by windows that lie on the map as a whole. The first is not counted: the
+    growth before it has evicted the caches of the other side."""
     grid = sides[0].costs.grid
     passable = set(free.tolist())
     for _ in range(_PLACES):

@@ -123,10 +123,10 @@ def kernels(
     ./launch_scripts/bench kernels
     ./launch_scripts/bench kernels --size 2048 --field maze --json
 
-    Medians over the roots, each with a growth, windows of 33 x 33 cells with their certificate, routes with theirs,
-    and four repairs of each kind, in turn. walk: 500 steps of a route, of a hundred which are read at once, without
-    certificates. A repair is of a patch, the map's part of it included, and a growth where it gave way. costs:
-    growths where costs differ by any ratio, over growths of the field.
+    Medians over the roots: a growth, windows of 33 x 33 cells and routes with their certificates, and four repairs
+    of each kind, in turn. walk: 500 steps of a route, of a hundred which are read at once, without certificates. A
+    repair is of a patch, the map's part of it included, and a growth where it gave way. costs: growths where costs
+    differ by any ratio, over growths of the field.
     """
     bench = _Bench(make_field(field, size, seed).copy(), seed)
     bench.grow()

@@ -98,7 +98,7 @@ def moves(
     moves: Annotated[int, typer.Option(min=1, help="Moves of each walk, one cell each.")] = 100,
     seed: Seed = 1,
 ) -> dict[str, Any]:
-    """Exact trees that follow a target, beside trees that are grown anew.
+    """Exact trees that follow a target, beside trees that are grown again.
 
     \b
     ./launch_scripts/bench moves
@@ -106,9 +106,9 @@ def moves(
     ./launch_scripts/bench moves --dem ridge.tif --json
 
     The same roots in turn in one process, on a random walk and straight on: a tree that is made exact by its
-    parents, one that lies in pieces, and a growth. CPU ms a move, and how many times as long a growth takes. gave
-    way: share of the moves at which the tree was grown, which is in the times; bit equal: after which it was the
-    growth's; lowered: mean share of the map whose costs fell once they had been computed along the parents.
+    parents, one that lies in pieces, and a growth. CPU ms per move, and the ratio of a growth to it. gave way:
+    share of moves at which the tree was grown instead, included in the times; bit equal: share after which the tree
+    equals the grown one; lowered: mean share of the map whose costs fell after the computation along the parents.
     """
     stage = Field(make_field(field if dem is None else str(dem), size, seed))
     rows: list[dict[str, Any]] = []

@@ -46,8 +46,8 @@ def peers(
     ./launch_scripts/bench peers --field ridge.tif --json
 
     Medians of CPU time of one thread, interleaved; peak memory from the bare field to the grown tree, which says
-    little on fields much smaller than 512 x 512; and the largest relative difference of any cell's cost to ours.
-    tcod counts in whole numbers, and finds no parents; dijkstra3d.distance_field finds none either.
+    little below 512 x 512; and the largest relative difference of a cell's cost from ours. tcod counts in whole
+    numbers and finds no parents, nor does dijkstra3d.distance_field.
     """
     if edge not in ("paper", "octile"):
         raise ConfigError(f"--edge is {edge!r}, expected paper or octile")
@@ -96,15 +96,15 @@ def peers(
             for name, ms in medians.items()
         ],
         "notes": [
-            f"{package} is not installed, so it is not measured: `uv sync --extra bench` brings it."
+            f"{package} is not installed, so it is not measured: `uv sync --group bench` brings it."
             for package in missing_packages()
         ],
     }
 
 
 def tree_memory_mb(field: str, name: str, root: int, edge: Edge) -> float | None:
-    """By how much the resident memory rises at most, from the bare field to a grown tree: what is prepared counts,
-    what a library takes for its code does not. None where the system does not tell the peak."""
+    """The rise of resident memory from the bare field to a grown tree: preparation counts, the code of a library
+    does not. None where the system does not tell the peak."""
     make = MAKERS[name]
     make(np.ones((24, 24), np.float32), edge).grow(5)  # libraries are loaded, kernels compiled
     pace = np.load(field)
@@ -130,9 +130,9 @@ def _difference(ours: Costs, theirs: Costs) -> float:
 
 @dataclass(frozen=True)
 class Tool:
-    """grow   the whole tree of a root, a flat cell: what is measured
-    costs  what was grown as (rows, cols) costs from each cell to the root, inf where there is no way; None where it
-           has none that could be compared
+    """grow the whole tree of a root, a flat cell: the part that is measured
+    costs  (rows, cols) from each cell to the root, inf where there is no way; None where the tool has no
+           comparable costs
     """
 
     grow: Callable[[int], Any]
@@ -297,10 +297,10 @@ def versions() -> dict[str, str]:
 
 
 def costs_along(pace: Pace, parents: NDArray[np.int64], root: int) -> Costs:
-    """What it costs to follow parents from every cell to the root, float64; parents are flat cells, -1 is none.
+    """Cost of following the parents from every cell to the root, float64; parents are flat cells, -1 is none.
 
-    Each round, every cell leaps to where its leap's end leaps to: a way of n steps takes log2(n) rounds. What has
-    not arrived by then goes in circles, and costs inf.
+    Each round, every cell leaps to where its leap's end leaps to: a way of n steps takes log2(n) rounds. A cell
+    that has not arrived by then is in a cycle and costs inf.
     """
     flat = pace.reshape(-1).astype(np.float64)
     leap = parents.copy()

@@ -17,9 +17,9 @@ from swarm.errors import TerrainError
 from swarm.wire.route_columns import RouteStatus
 
 _ROUTES = 400
-"""Of each tree."""
+"""Number of routes for each tree."""
 _CHECKED = 20
-"""One route of so many is priced again, segment by segment, by `segment_cost_s`."""
+"""One route in this many is priced again, segment by segment, by `segment_cost_s`."""
 _STEPS = (130, 170)
 """Steps of the routes whose pulling is timed."""
 _EQUAL = 1e-9
@@ -36,15 +36,15 @@ def pulled(
     seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were pulled.")] = 100,
     seed: Seed = 1,
 ) -> dict[str, Any]:
-    """Routes of straight segments beside those over neighbours: saving, time, and that none is dearer.
+    """Routes of straight segments beside those over neighbours: savings and time; none is more expensive.
 
     \b
     ./launch_scripts/bench pulled --field open
     ./launch_scripts/bench pulled --field ridge.tif --routes 100000
 
     Routes lead from random cells to random roots. Both kinds are priced by the integral of the pace. One route in
-    twenty is priced again, apart from the kernel. The status is 1 where one was dearer, wrong or through what is
-    lethal. Pulling some 150 steps is timed beside growing the tree.
+    twenty is priced again, apart from the kernel. The status is 1 if a route was more expensive, wrong or led
+    through lethal ground. Pulling some 150 steps is timed beside growing the tree.
     """
     pace = _field(field, size, seed)
     random = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""How crowds drive: dense worlds over many seeds, without faults, seen through what agents publish.
+"""The movement of crowds: dense worlds over many seeds, without faults, observed through the messages of agents.
 
 A step is the time in which a vehicle drives one straight cell. A vehicle waits while it stands on one cell and has
 its target not within reach, whatever the reason.
@@ -44,13 +44,13 @@ _NOTES = (
     f"Wanted: no wait over {WANTED_LONGEST_S:g} s, at most {100 * WANTED_LONG_SHARE:g} % of vehicles ever so long.",
 )
 LIMIT_S = 120.0
-"""Seconds of CPU for a drive; what is not done by then is left out."""
+"""Seconds of CPU for a drive; the rest is left out."""
 _BOX_CELLS = 2
-"""A vehicle is confined while it stays within so many cells of one, in every direction."""
+"""A vehicle is confined while it stays within this many cells of one cell, in every direction."""
 
 
 class Drives:
-    """How vehicles drive, from the reports of their agents, one for each tick. Pure."""
+    """The movement of vehicles, from the reports of their agents, one for each tick. Pure."""
 
     def __init__(self, cols: int) -> None:
         self._cols = cols
@@ -143,7 +143,8 @@ def crowd(
     seconds: Annotated[float, typer.Option(min=1, max=3600, help="Simulated seconds of each drive.")] = 40.0,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Drives at the same time.")] = 2,
 ) -> dict[str, Any]:
-    """How crowds drive: cells a step, longest waits, arrivals, in dense worlds over many seeds. Some seven minutes.
+    """Movement of crowds: cells per step, longest waits, arrivals, in dense worlds over many seeds. Some seven
+    minutes.
 
     \b
     ./launch_scripts/bench crowd
@@ -187,7 +188,7 @@ def crowd(
 
 
 def row_of(name: str, drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What several drives come to."""
+    """The summary of several drives."""
     vehicles = sum(each["vehicles"] for each in drives) or 1
     simulated_s = sum(each["vehicles"] * each["simulated_s"] for each in drives) or 1.0
     worst = max(drives, key=lambda each: each["longest_wait_s"])

@@ -39,7 +39,7 @@ _EVERY_S = 0.05
 
 
 def raw_answerer(network: NetworkConfig, pipe: Connection) -> None:
-    """Joins when asked to; then answers raw queries, until told to end."""
+    """Joins on request, then answers raw queries until it is stopped."""
     pipe.send("ready")
     if pipe.recv() == "end":
         return
@@ -82,12 +82,12 @@ _MARGIN_S = 120.0
 _TURN_S = 0.2
 _JOINED_WITHIN_S = 30.0
 _ANSWER_S = 10.0
-"""How long after the window the client may still wait for an answer."""
+"""Seconds for which the client may still wait for an answer after the window."""
 _ANSWERED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED, VehicleState.SEARCHING})
-"""States of a vehicle which has a route, needs none, or was told that there is none."""
+"""States of a vehicle which has a route, needs none, or knows that there is none."""
 _UP = "all processes are alive"
 _COUNTED = ("messages_out", "messages_in", "bytes_out", "bytes_in")
-"""What every bus counts."""
+"""Counters of every bus."""
 
 
 def measure_live(size: Size, seconds: float) -> dict[str, Any]:
@@ -186,7 +186,7 @@ class _Run:
         return figures
 
     def at_end(self, left_behind: list[str]) -> dict[str, Any]:
-        """What the launcher reported, and what is not known of it."""
+        """The report of the launcher, and the reasons for missing figures."""
         report = self._launcher.report() or {}
         if not report:
             self._not_measured.append("start-up, collisions, captures: the launcher gave no report")
@@ -241,7 +241,7 @@ class _Run:
         return routed_s
 
     def _join_helpers(self) -> bool:
-        """Whether those who measure routes have joined in time."""
+        """True if the processes that measure routes have joined in time."""
         until_s = time.monotonic() + _JOINED_WITHIN_S
         for helper in self._helpers:
             helper.send("join")

@@ -18,7 +18,7 @@ from swarm.runtime.process import collected_rarely
 WARM_UP_S = 1.0
 """Simulated seconds before the measured ones: all processes start in them."""
 LIMIT_S = 90.0
-"""Seconds of CPU for a measurement, after the terrain is made; what is not done by then is left out."""
+"""Seconds of CPU for a measurement, after the terrain is made; the rest is left out."""
 _LOADING_S = 4.0
 _STEP_S = 0.1
 

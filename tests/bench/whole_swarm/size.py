@@ -1,4 +1,4 @@
-"""How large a measured swarm is, and its scenario: that of `thousand`, with a map which grows with the vehicles."""
+"""The size of a measured swarm and its scenario: that of `thousand`, with a map which grows with the vehicles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swarm.errors import ConfigError
 from swarm.right_of_way.lock_regions import fitting_regions
 
 CELLS_PER_VEHICLE = 262.144
-"""As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
+"""The ratio of `thousand`: 512 x 512 cells for 1,000 vehicles."""
 _VEHICLES_AN_AGENT = 500
 _FEWEST_AGENTS, _MOST_AGENTS = 5, 40
 _MOST_VEHICLES = 100_000
@@ -101,8 +101,8 @@ def size_of(
 
 
 def scenario_text(size: Size, endpoint: str | None = None) -> str:
-    """The scenario as a file. What lies on the map keeps its density too: roads and rivers by length, obstacles by
-    area.
+    """The scenario as a file. The density of features on the map stays the same: roads and rivers by length,
+    obstacles by area.
 
     endpoint  of the router; the live view then takes free ports
     """

@@ -1,4 +1,17 @@
-"""What a swarm costs by its number of vehicles, live or simulated: one size after the other."""
+"""Cost of a swarm by its number of vehicles, live or simulated: one size after the other.
+
+up                  from the command until all processes are alive and a route was served
+vehicle answered    from the command until every vehicle has a route, or was told that there is none
+ticks late          taken later than half a period after they were due, or never
+CPU of all          1,000 ms/s are one core; the processes that measure are not in it
+CPU of other work   of the whole machine, the processes that measure included; it makes ticks late
+sent, delivered     payloads only; delivered in a simulation is per simulated second
+a route query       from the question of a client beside the swarm to the parsed answer, 20 times a second
+over a raw get      a plain Zenoh get of as many bytes, in turn with it
+memory of all       proportional set size: shared pages count for their share
+times real time     simulated seconds over seconds of CPU
+power               exponent of the power of the number of vehicles that fits best
+"""
 
 from __future__ import annotations
 
@@ -19,12 +32,12 @@ from swarm.errors import ConfigError, SwarmError
 
 SERIES = (100, 300, 1000, 3000, 10_000)
 MOST_LATE_SHARE = 0.1
-"""Of a run whose agents are later than this the rates say little: it does less than it should."""
+"""The rates of a run whose agents are later than this say little: it does less than it should."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One row; docs/scale-figures.md says what each means.
+    """One row of the table.
 
     key     where it is in the figures of a run: `cpu_ms_per_s.agent` is in a dictionary
     times   what it is multiplied by to be shown
@@ -123,19 +136,19 @@ def swarm(
     simulated: Annotated[bool, typer.Option("--simulated", help="One process on a manual clock.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = 5,
 ) -> dict[str, Any]:
-    """What a swarm costs: lateness, CPU, messages, memory, start-up, latency of routes, by number of vehicles.
+    """The cost of a swarm: lateness, CPU, messages, memory, start-up, latency of routes, by number of vehicles.
 
     \b
     ./launch_scripts/bench swarm --vehicles 1000
-    ./launch_scripts/bench swarm --series --write docs/scale-figures.md
+    ./launch_scripts/bench swarm --series --write sizes.md
     ./launch_scripts/bench swarm --vehicles 100,200,400,1000 --per-agent 25 --simulated
     bench swarm --vehicles 1000 --time-scale 0.001 --simulated     # what is told though nothing changes
 
     Starts the processes of `swarm up` on a free port of this machine, waits until every vehicle has a route,
     measures, and ends them: the scenario is `thousand` with a map that grows with the vehicles. With several sizes
     one after the other, and the power of the number of vehicles by which each figure grows. With --simulated the
-    same swarm in one process; each size gets 90 seconds of CPU at most. docs/scale-figures.md says what the rows
-    mean.
+    same swarm in one process; each size gets 90 seconds of CPU at most. The head of
+    tests/bench/whole_swarm/sizes.py says what the rows mean.
 
     Exit code 1 if vehicles met or entered lethal cells, or a size could not be measured.
     """
@@ -158,7 +171,7 @@ def swarm(
 
 def run_sizes(sizes: Sequence[Size], seconds: float, simulated: bool) -> dict[str, Any]:
     """Measures each size. One that cannot be measured says why, and the others go on; of a single one SwarmError is
-    raised. An interrupt keeps what has been measured."""
+    raised. An interrupt keeps the results so far."""
     rows: list[dict[str, Any]] = []
     report: dict[str, Any] = {"simulated": simulated, "seconds": seconds, "rows": rows, "interrupted": False}
     try:
@@ -194,7 +207,7 @@ def run_sizes(sizes: Sequence[Size], seconds: float, simulated: bool) -> dict[st
 
 
 def broken(report: dict[str, Any]) -> list[str]:
-    """What must not be: vehicles that met, runs that failed or did not end in order."""
+    """Violations: vehicles that met, runs that failed or did not end in order."""
     found = ["interrupted"] if report["interrupted"] else []
     for row in report["rows"]:
         title = f"{row['vehicles']:,} vehicles: "
@@ -224,7 +237,7 @@ def lines_of(report: dict[str, Any], figures: Sequence[Figure]) -> list[dict[str
 
 
 def remarks(report: dict[str, Any]) -> list[str]:
-    """What has to be known to read the figures: what is missing and why, and what the exponents are of."""
+    """Remarks that explain the figures: missing values with their reasons, and the rows behind each exponent."""
     rows = report["rows"]
     found = []
     for row in rows:
@@ -261,7 +274,7 @@ def exponent(xs: Sequence[float], ys: Sequence[float | None]) -> float | None:
 
 
 def keeps_pace(row: dict[str, Any]) -> bool:
-    """Whether a run does what it should in a second, so that its rates say what that costs."""
+    """True if a run keeps up with time, which makes its rates meaningful."""
     late = row.get("ticks", {}).get("agent", {}).get("late_share")
     return late is None or late <= MOST_LATE_SHARE
 

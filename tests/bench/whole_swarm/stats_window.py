@@ -1,4 +1,4 @@
-"""What processes counted between two instants, from the counters that each publishes. Pure."""
+"""Counts of processes between two instants, from the counters that each publishes. Pure."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class StatsWindow:
             self._newest[key] = stats
 
     def begin(self) -> None:
-        """Count from what is known now."""
+        """Starts to count from the current state."""
         self._first = dict(self._newest)
 
     @property
@@ -45,7 +45,7 @@ class StatsWindow:
 
 
 class StatsSpan:
-    """What one process counted between two of its publications."""
+    """The counts of one process between two of its publications."""
 
     def __init__(self, first: Stats, last: Stats) -> None:
         self._first, self._last = first, last
@@ -59,7 +59,7 @@ class StatsSpan:
         return self.count(name) / self.seconds
 
     def buckets(self, name: str) -> dict[int, int]:
-        """Of a histogram, what was added."""
+        """The part of a histogram that was added."""
         before = self._first.histograms.get(name, {})
         now = self._last.histograms.get(name, {})
         return {bucket: added for bucket, count in now.items() if (added := count - before.get(bucket, 0)) > 0}
@@ -71,7 +71,7 @@ class StatsSpan:
 
 
 def ticks(spans: Iterable[StatsSpan]) -> dict[str, float | int | None]:
-    """How late the ticks of some processes were: shares of those that were due; None where none was."""
+    """Lateness of the ticks of some processes: shares of those that were due; None if none was due."""
     spans = list(spans)
     due = sum(span.ticks_due for span in spans)
     worst = max((span.count("ticks_late") / span.ticks_due for span in spans if span.ticks_due), default=None)

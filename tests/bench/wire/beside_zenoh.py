@@ -187,8 +187,8 @@ def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
 
 
 def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
-    """Milliseconds until a newcomer with a new session has all sets of a keeper in its cost map; beside a raw get
-    of as many values; and beside the limit, a raw get of the same bytes in a few large replies."""
+    """Milliseconds until a newcomer with a new session has all sets of a keeper in its cost map. Beside it: a raw
+    get of as many values, and a raw get of the same bytes in a few large replies, which is the limit."""
     far.start(map_holder, sets, marks)
     times: dict[str, list[float]] = {"sets": [], "bulk": [], "ours": []}
     cpu: dict[str, list[float]] = {"sets": [], "bulk": [], "ours": []}

@@ -1,4 +1,4 @@
-"""What encoding and decoding cost: msgpack with msgspec, as on the wire, beside msgspec alone.
+"""The cost of encoding and decoding: msgpack with msgspec, the format of the wire, beside msgspec alone.
 
 The payloads are those of a simulated run, so that sizes and shares of the message types are real. Hostile payloads
 are decoded in processes of their own: what counts is by how much the resident memory rises.
@@ -82,7 +82,7 @@ def hostile() -> dict[str, bytes]:
 
 
 def _traffic() -> tuple[Counter[type[Message]], dict[type[Message], list[bytes]]]:
-    """How many messages of each type are delivered in a run, and some payloads of each, from all over it."""
+    """The number of messages of each type that a run delivers, and sample payloads of each, from all over it."""
     from launch_scripts.simulation.simulate import Simulation
 
     simulation = Simulation(load_scenario(_SCENARIO))

@@ -1,4 +1,5 @@
-"""What maps of agents and keepers take: presence by the number of vehicles, and a keeper's store by lives."""
+"""The cost of maps in agents and keepers: presence by the number of vehicles, and a keeper's store by
+incarnations."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""How soon all replicas are equal after a partition heals: two routers in network namespaces, over mutual TLS.
+"""The time until all replicas are equal after a partition heals: two routers in network namespaces, over mutual
+TLS.
 
-Two namespaces stand for two machines, a pair of veth for the cable between them. On each side run, as processes of
-their own, a router, a keeper with its store on disk, two authors that say something about eight cells every 50 ms,
-and a listener; the sides meet over tls/ with certificates made for the purpose. A round takes the cable down, lets
-both sides write, stops writing, puts the cable up, and measures until every replica of both sides tells the same
-digest and none has changed for a second.
+Two namespaces stand for two machines, a pair of veth for the cable between them. Each side runs a router, a keeper
+with its store on disk, two authors and a listener, each as a process of its own. The authors mark eight cells every
+50 ms; the sides meet over tls/ with certificates made for the purpose. A round takes the cable down, lets both
+sides write, stops writing, puts the cable up, and measures until every replica of both sides tells the same digest
+and none has changed for a second.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def _obey(service: object, process: Process) -> None:
                 service.writing = True
             case "hush" if isinstance(service, MapService):
                 service.writing = False
-    process.stop()  # our parent is gone or done
+    process.stop()  # our parent has ended
 
 
 def _say(words: list[object]) -> None:
@@ -319,7 +320,7 @@ def partition(
     rounds: Annotated[int, typer.Option(min=1, help="Partitions, one after the other.")] = 20,
     seconds: Annotated[float, typer.Option(min=0.1, help="How long each lasts, with writes on both sides.")] = 30.0,
 ) -> dict[str, Any]:
-    """How soon all replicas are equal after a partition heals. Needs root and iproute2; some eleven minutes.
+    """The time until all replicas are equal after a partition heals. Needs root and iproute2; some eleven minutes.
 
     \b
     ./launch_scripts/bench partition --rounds 2 --seconds 5

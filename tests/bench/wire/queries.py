@@ -155,7 +155,7 @@ def ask_route(bus: ZenohBus, inbox: Inbox, request: RouteRequest, target: str = 
 
 
 def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles: int) -> None:
-    """Agents, each with its own session, which publish positions ten times a second while told to."""
+    """Agents, each with its own session, which publish positions ten times a second while they are asked to."""
     buses = [open_bus(network) for _ in range(_SESSIONS)]
     pipe.send("ready")
     seq = 0

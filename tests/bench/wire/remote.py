@@ -83,7 +83,7 @@ def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[.
 
 
 class Parts:
-    """A service made of functions: what is done at the start, with an event and at a tick."""
+    """A service made of functions: its start, its reaction to an event and its tick."""
 
     def __init__(
         self,

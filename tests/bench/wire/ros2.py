@@ -1,4 +1,4 @@
-"""CPU that the gateway to ROS takes for vehicles: a made-up swarm, `swarm ros2` as users start it, one hearer."""
+"""CPU that the gateway to ROS takes for vehicles: a made-up swarm, `gateway ros2` as users start it, one hearer."""
 
 from __future__ import annotations
 
@@ -30,7 +30,19 @@ _START_S = 60.0
 @contextlib.contextmanager
 def _gateway(swarm: str, ros: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     program = "import sys; from launch_scripts.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "ros2", "--connect", swarm, "--namespace", "bench", "--ros", ros]
+    command = [
+        sys.executable,
+        "-c",
+        program,
+        "gateway",
+        "ros2",
+        "--connect",
+        swarm,
+        "--namespace",
+        "bench",
+        "--ros",
+        ros,
+    ]
     with (folder / "ros2.log").open("w") as log:
         process = subprocess.Popen([*command, "--runs", str(folder)], stdout=log, stderr=log, text=True)
     try:
@@ -50,12 +62,12 @@ def ros2(
     vehicles: Annotated[int, typer.Option(min=25, help="A multiple of 25.")] = 100,
     seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 20.0,
 ) -> dict[str, Any]:
-    """CPU that `swarm ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
+    """CPU that `swarm gateway ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
 
     \b
     ./launch_scripts/bench ros2 --vehicles 100
 
-    As a share of one core, and what a hearer of all topics gets meanwhile.
+    As a share of one core, and the messages that a subscriber of all topics receives meanwhile.
     """
     from launch_scripts.gateways.ros2.ros_node import open_ros
 

@@ -1,4 +1,4 @@
-"""The harness of benchmarks: each command is listed, and says in a sentence what is wrong."""
+"""The harness of benchmarks: each command is listed, and answers bad input with a sentence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import typer
 from bench import harness
-from bench.harness import BENCHMARKS, Lines, benchmark, figure, load
+from bench.harness import BENCHMARKS, Lines, benchmark, load
 from bench.isolated import isolated
 from support.benchmarks import bench, run
 
@@ -82,21 +82,6 @@ def test_a_page_gets_the_section_of_the_benchmark_and_keeps_the_others(made: Non
     assert page.read_text() == text
 
 
-def test_a_plot_has_a_panel_for_each_axis(made: None, tmp_path: Path) -> None:
-    run("made", "--picture", str(tmp_path / "made.png"))
-    assert (tmp_path / "made.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [(None, "-"), (0, "0"), (3.0, "3"), (1.234, "1.23"), (12_345.6, "12,346"), (0.05123, "0.051")],
-)
-def test_a_figure_is_shown_with_three_digits_and_one_that_was_not_measured_by_a_stroke(
-    value: float | None, shown: str
-) -> None:
-    assert figure(value) == shown
-
-
 def fail() -> None:
     raise ValueError("a reason")
 
@@ -148,10 +133,3 @@ def test_bad_input_is_one_sentence(words: str, complaint: str) -> None:
         bench(*words.split())
     assert complaint in str(caught.value)
     assert caught.value.exit_code == 2
-
-
-@pytest.mark.parametrize("words", ["peers --size 0", "gap --frames 0", "start --runs x"])
-def test_a_number_out_of_range_is_refused_by_name(words: str) -> None:
-    done = run(*words.split())
-    assert done.exit_code == 2
-    assert words.split()[1] in done.stderr

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
-from bench.isolated import isolated
 from bench.planning import peers as rivals
-from bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
-from bench.planning.peers import tree_memory_mb
-from bench.planning.strategies import points_of
-from support.benchmarks import bench, run
+from bench.planning.chase import BROKEN, Plan, Tally, chase
+from support.benchmarks import bench
 from support.fields import FIELDS, Field, make_field
 from support.tree_lives import LAWS
 
-from planner_service.tree.route_bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import TerrainError
-from swarm.wire.route_columns import NO_TARGET, OK, Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
     "auto",
@@ -32,7 +26,6 @@ STRATEGIES = (
     "multi_resolution",
     "variable_range+multi_resolution",
 )
-DEM = Path(__file__).parents[4] / "shared" / "data" / "dem"
 
 
 # --- peers -------------------------------------------------------------------------------------------------------
@@ -48,37 +41,6 @@ def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) 
     for name in peers:
         assert rows[name]["over_ours"] == pytest.approx(rows[name]["cpu_ms"] / rows["ours"]["cpu_ms"], rel=0.05)
         assert rows[name]["differs_from_ours"] < (1e-3 if name.startswith("tcod") else 1e-5), name
-
-
-def test_with_octile_edges_scipy_agrees() -> None:
-    report = bench("peers", "--size", "64", "--edge", "octile", "--repeats", "1", "--no-memory")
-    rows = {row["library"]: row for row in report["rows"]}
-    assert rows["scipy.csgraph.dijkstra"]["differs_from_ours"] < 1e-5
-    assert not any(name.startswith("dijkstra3d") for name in rows)
-
-
-def test_a_peer_that_is_not_installed_is_said_to_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = rivals.importlib.util.find_spec
-    monkeypatch.setattr(
-        rivals.importlib.util, "find_spec", lambda name: None if name in rivals.EXTRA else find(name)
-    )
-    report = bench("peers", "--size", "64", "--repeats", "1", "--no-memory")
-    assert report["notes"] == [
-        f"{name} is not installed, so it is not measured: `uv sync --extra bench` brings it."
-        for name in rivals.EXTRA
-    ]
-    libraries = {row["library"] for row in report["rows"]}
-    assert libraries == {"ours", "breadth_first", "scipy.csgraph.dijkstra", "skimage.graph.MCP"}
-
-
-def test_the_peak_of_memory_is_what_a_tree_needs(tmp_path: Path) -> None:
-    """Padded weights, costs and parents take 9 bytes a cell; no more than five times that is passed through."""
-    pace = make_field("uniform", 1024)
-    np.save(tmp_path / "pace.npy", pace)
-    found = isolated(tree_memory_mb, str(tmp_path / "pace.npy"), "ours", 5000, "paper")
-    if found is None:
-        pytest.skip("the system does not tell a process's peak of memory")
-    assert 9 * pace.size / 1e6 <= found <= 45 * pace.size / 1e6
 
 
 def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
@@ -121,12 +83,6 @@ def test_an_array_that_is_no_field_is_refused(tmp_path: Path, array: Any, compla
         Field(make_field(str(tmp_path / "a.npy"), 9))
 
 
-def test_a_file_that_is_no_array_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.npy").write_bytes(b"hello")
-    with pytest.raises(TerrainError, match=r"a\.npy is no \.npy array"):
-        make_field(str(tmp_path / "a.npy"), 9)
-
-
 # --- chases ------------------------------------------------------------------------------------------------------
 
 
@@ -148,43 +104,11 @@ def test_full_growths_have_no_gap_and_no_strategy_beats_the_optimum() -> None:
             assert row["gap_max"] > 1.001, "a window cannot have kept the whole tree exact"
 
 
-@pytest.mark.parametrize("model", ["rmnp/rmnp-dem.tif", "jacksboro/jacksboro_fault_dem.npz"])
-def test_the_gap_on_real_elevation_stays_small(model: str) -> None:
-    if not (DEM / model).exists():
-        pytest.skip(f"{DEM / model} is not here")
-    report = bench(
-        "gap",
-        "--dem",
-        str(DEM / model),
-        "--frames",
-        "30",
-        "--runs",
-        "1",
-        "--strategies",
-        "auto",
-        "--cpu-budget",
-        "0.0001",
-    )
-    # A budget too small for any renewal, and so the worst that a busy machine can do to `auto`.
-    assert report["rows"][0]["gap_mean"] < 1.05
-    assert report["rows"][0]["proven_p50"] >= report["rows"][0]["gap_p50"]
-
-
 def test_certificates_are_checked_by_a_command() -> None:
     report = bench("certificates", "--checks", "2000", "--seed", "3")
     assert report["checks"] >= 2000
     assert report["violations"] == 0
     assert [row["law"] for row in report["laws"]] == list(LAWS)
-
-
-def test_the_command_says_which_life_broke_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = LowerBounds.at
-    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1e9)
-    done = run("certificates", "--checks", "2000", "--seed", "4", "--json")
-    assert done.exit_code == 1
-    [found] = [row for row in json.loads(done.stdout)["laws"] if row["law"] == "bound"]
-    assert found["violations"] > 0
-    assert found["seed"] == 4
 
 
 def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
@@ -196,42 +120,6 @@ def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
     )
     for a, b in zip(one["multi_resolution"].gaps, two["multi_resolution"].gaps, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_targets_that_do_not_fit_into_memory_are_run_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    field = Field(make_field("uniform", 48))
-    plan = Plan(targets=5, vehicles=10, frames=4, probes=20)
-    entrants = {"full": PlannerConfig(strategy="full")}
-    assert chase(field, entrants, plan)["full"].batches == 1
-    none = psutil.virtual_memory()._replace(available=0)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: none)
-    tally = chase(field, entrants, plan)["full"]
-    assert tally.batches == 5
-    assert len(tally.frame_ms) == 4
-    assert tally.updates == {"full": 20}
-
-
-def test_a_strategy_whose_time_is_up_still_gets_the_fewest_frames() -> None:
-    field = Field(make_field("uniform", 48))
-    tally = chase(field, {"full": PlannerConfig(strategy="full")}, Plan(frames=50, seconds=1e-9, targets=1))["full"]
-    assert len(tally.frame_ms) == FEWEST
-
-
-def test_only_routes_that_exist_are_judged() -> None:
-    tally = Tally(frame_ms=[1.0])
-    routes = RouteBatch(
-        np.array([OK, NO_TARGET, OK], np.uint8),
-        np.array([0, 1, 2]),
-        np.empty(0, np.uint8),
-        np.zeros(3, np.int64),
-        *(np.array(values) for values in ([3.0, np.inf, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0])),
-    )
-    tally.judge(routes, np.array([3.0, np.inf, 0.0]), replace(routes, cost_s=np.array([2.0, np.inf, 0.0])))
-    row = tally.row()
-    assert row["gap_mean"] == row["gap_max"] == 1.5
-    assert row["routes_judged"] == 1
-    assert row["proven_p95"] is None, "no bound is no number"
-    assert set(row["violations"].values()) == {0}
 
 
 def test_a_violation_is_counted_and_clips_no_figure() -> None:
@@ -273,41 +161,6 @@ def test_the_paper_s_tables_have_its_rows() -> None:
     assert exact["updates"] == {"full": 60}
 
 
-def test_scale_varies_one_thing_at_a_time_unless_all_is_wanted() -> None:
-    axes = ([512, 1024], [1, 10, 100], [10, 100])
-    assert points_of(*axes, full=False) == [
-        *((512, 1, 100), (512, 10, 10), (512, 10, 100), (512, 100, 100), (1024, 10, 100)),
-    ]
-    assert len(points_of(*axes, full=True)) == 12
-
-
-def test_scale_has_a_row_per_point_and_strategy_and_draws_them(tmp_path: Path) -> None:
-    picture = tmp_path / "scale.png"
-    report = bench(
-        *("scale", "--sizes", "32,128", "--targets", "1,3", "--vehicles", "5,20", "--frames", "5"),
-        *("--strategies", "full,variable_range", "--picture", str(picture)),
-    )
-    found = [(row["size"], row["targets"], row["vehicles"], row["strategy"]) for row in report["rows"]]
-    assert len(found) == len(set(found)) == 2 * 4
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    larger = {
-        (row["size"], row["strategy"]): row["frame_ms_p50"] for row in report["rows"] if row["vehicles"] == 20
-    }
-    assert larger[128, "full"] > larger[32, "full"]
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
-    report = bench("start", "--size", "64", "--runs", "1", "--no-kernels")
-    assert [row["cache"] for row in report["rows"]] == ["cold", "warm", "cold", "warm"]
-    for cold, warm in (report["rows"][:2], report["rows"][2:]):
-        assert (cold["cache"], warm["cache"]) == ("cold", "warm")
-        assert cold["cpu_s"] > 1.5 * warm["cpu_s"] > 0
-    # The first tree takes some kernels, and builders go on to the last of them.
-    assert report["rows"][0]["compiled"] < report["kernels"] <= report["rows"][2]["compiled"]
-
-
 # --- the map and its fleets --------------------------------------------------------------------------------------
 
 
@@ -315,23 +168,6 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     without, compacted = bench("compaction", "--lives", "8")["rows"]
     assert (without["compact"], compacted["compact"]) == ("no", "yes")
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
-
-
-def test_presence_has_a_row_per_number_of_vehicles() -> None:
-    report = bench("presence", "--vehicles", "25,50", "--rounds", "3")
-    assert [row["vehicles"] for row in report["rows"]] == [25, 50]
-    assert all(value >= 0 for row in report["rows"] for value in row.values())
-
-
-def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:
-    report = bench("moves", "--size", "96", "--moves", "6")
-    assert [(row["course"], row["by"]) for row in report["rows"]] == [
-        (course, by) for course in ("random", "straight") for by in ("parents", "pieces")
-    ]
-    for row in report["rows"][::2]:
-        assert row["bit_equal"] == 1
-        assert row["gave_way"] <= 0.5
-        assert row["p50_ms"] > 0
 
 
 def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:

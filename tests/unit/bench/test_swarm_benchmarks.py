@@ -1,4 +1,4 @@
-"""`bench swarm` and `bench crowd`: sizes, what is read out of counters, exponents, what is shown."""
+"""`bench swarm` and `bench crowd`: sizes, figures from counters, exponents, tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from bench.whole_swarm import crowd, sizes
 from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
-from bench.whole_swarm.sizes import Figure, exponent, exponents, topic_figures
+from bench.whole_swarm.sizes import exponent
 from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
 from hypothesis import strategies as st
@@ -56,20 +56,6 @@ def test_every_size_has_a_valid_scenario_with_its_vehicles_agents_and_density(
         assert size.side**2 / vehicles == pytest.approx(CELLS_PER_VEHICLE, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("vehicles", "agents"), [(2, 2), (20, 5), (1000, 5), (3000, 6), (10_000, 20), (30_000, 40)]
-)
-def test_there_is_an_agent_for_each_five_hundred_vehicles_but_five_at_least_and_forty_at_most(
-    vehicles: int, agents: int
-) -> None:
-    assert size_of(vehicles).agents == agents
-
-
-def test_agents_or_vehicles_of_an_agent_may_be_given() -> None:
-    assert [size_of(n, per_agent=25).agents for n in (100, 1000)] == [4, 40]
-    assert size_of(1000, agents=40).per_agent == 25
-
-
 # --- exponents ---------------------------------------------------------------------------------------------------
 
 
@@ -78,38 +64,6 @@ def test_agents_or_vehicles_of_an_agent_may_be_given() -> None:
 )
 def test_the_exponent_of_a_power_is_found(factor: float, power: float, xs: list[int]) -> None:
     assert exponent(xs, [factor * x**power for x in xs]) == pytest.approx(power, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("xs", "ys"),
-    [([], []), ([100], [3.0]), ([100, 100], [3.0, 4.0]), ([100, 300], [3.0, None]), ([1, 2], [0.0, 5.0])],
-)
-def test_there_is_no_exponent_without_two_values(xs: list[int], ys: list[float | None]) -> None:
-    assert exponent(xs, ys) is None
-
-
-def test_what_was_not_measured_is_left_out_of_an_exponent() -> None:
-    assert exponent([100, 200, 400, 800], [1.0, None, 4.0, math.inf]) == pytest.approx(1.0)
-
-
-def row(vehicles: int, late_share: float | None = 0.0, **figures: Any) -> dict[str, Any]:
-    size = msgspec.structs.asdict(size_of(vehicles))
-    return {**size, "ticks": {"agent": {"late_share": late_share}}, "not_measured": [], **figures}
-
-
-def test_a_run_that_is_late_is_left_out_of_exponents_and_named() -> None:
-    rows = [row(100, cpu_all_ms_per_s=100), row(200, cpu_all_ms_per_s=200), row(400, 0.8, cpu_all_ms_per_s=210)]
-    figure = Figure("cpu_all_ms_per_s", "CPU", fitted=True)
-    assert exponents([figure], rows)["cpu_all_ms_per_s"] == pytest.approx(1.0)
-    report = {"simulated": False, "rows": rows, "interrupted": False, "exponents": {}}
-    [remark] = sizes.remarks(report)
-    assert "fitted without 400 vehicles" in remark
-
-
-def test_a_figure_is_found_by_its_path_and_shown_in_its_unit() -> None:
-    one = Figure("a.b", "b", times=100)
-    assert one.shown({"a": {"b": 0.01234}}) == "1.23"
-    assert one.shown({"a": {"b": None}}) == one.shown({"a": {}}) == one.shown({}) == "-"
 
 
 # --- counters ----------------------------------------------------------------------------------------------------
@@ -142,39 +96,7 @@ def test_a_window_counts_what_came_between_its_ends_in_any_order() -> None:
     assert window.silent([("agent", "a0"), ("agent", "a1"), ("keeper", "0")]) == ["agent a1", "keeper 0"]
 
 
-def test_a_process_that_was_started_again_is_not_mixed_with_its_earlier_life() -> None:
-    window = StatsWindow()
-    window.hear(stats("planner", "t0", 10, messages_in=900))
-    window.begin()
-    window.hear(stats("planner", "t0", 11, messages_in=1000))
-    window.hear(stats("planner", "t0", 20, incarnation=2, messages_in=3))
-    assert [span.count("messages_in") for span in window.spans] == [100]
-
-
-def test_of_nobody_no_share_is_told() -> None:
-    found = ticks([])
-    assert found["due"] == 0
-    assert found["late_share"] is found["worst_late_share"] is found["p50_ms"] is None
-
-
 # --- several sizes ----------------------------------------------------------------------------------------------
-
-
-def test_topics_are_the_largest_first_and_a_size_that_failed_has_strokes() -> None:
-    topics = {"fleet": {"bytes_per_s": 2000.0}, "pose": {"bytes_per_s": 9000.0}}
-    rows = [
-        row(100, topics=topics),
-        row(300, topics={"fleet": {"bytes_per_s": 1.0}}),
-        row(1000, failed="no memory"),
-    ]
-    figures = topic_figures(rows)
-    assert [figure.label for figure in figures] == ["pose", "fleet"]
-    report = {"rows": rows, "exponents": {figures[1].key: -1.5}, "interrupted": False}
-    assert sizes.lines_of(report, figures) == [
-        {"vehicles": "pose", "100": "9", "300": "-", "1,000": "-", "power": ""},
-        {"vehicles": "fleet", "100": "2", "300": "0.001", "1,000": "-", "power": "-1.50"},
-    ]
-    assert "1,000 vehicles: not measured: no memory." in sizes.remarks(report)
 
 
 def test_what_must_not_be_is_named_and_a_series_goes_on_after_a_size_that_fails(monkeypatch) -> None:
@@ -222,23 +144,6 @@ def test_waits_speed_and_arrivals_are_counted_from_what_agents_publish() -> None
     assert drives.driven_cells == pytest.approx(7 * math.sqrt(2) + 1)
     assert drives.longest_confined["waits"] == 9
     assert drives.longest_confined["straight"] == 2  # three cells away from a place it is out of its box
-
-
-def test_the_worst_wait_of_several_drives_counts_and_shares_are_of_all_vehicles() -> None:
-    one = {
-        "world": "doors", "seed": 1, "vehicles": 100, "simulated_s": 10.0, "cut_short": False,
-        "cells_per_step": 0.5,
-        "longest_wait_s": 3.0, "waited_long": 0, "confined_long": 1, "arrivals": 50, "collisions": 0,
-        "lethal_entries": 0,
-    }  # fmt: skip
-    other = {**one, "seed": 2, "cells_per_step": 0.3, "longest_wait_s": 12.0, "waited_long": 3, "collisions": None}
-    found = crowd.row_of("doors", [one, other])
-    assert found["longest_wait_s"] == 12.0
-    assert found["longest_wait_seed"] == "doors 2"
-    assert found["waited_long_share"] == pytest.approx(0.015)
-    assert found["cells_per_step"] == pytest.approx(0.4)
-    assert found["arrivals_per_vehicle_and_100_s"] == pytest.approx(5.0)
-    assert found["collisions"] == 0
 
 
 def test_a_small_crowd_is_driven() -> None:

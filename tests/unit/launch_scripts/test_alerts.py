@@ -1,4 +1,4 @@
-"""Each alert asks for what is exported, says what to do, and fires on what it is about."""
+"""Each alert queries an exported metric, names a remedy, and fires on its condition."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from launch_scripts import web
 from swarm.wire.messages.vehicles import VehicleState
 
 _ALERTS = Path(web.__file__).with_name("alerts.yml")
-_PAGE = Path(__file__).parents[3] / "docs" / "operate" / "alerts.md"
+_PAGE = Path(__file__).parents[3] / "docs" / "reference" / "metrics.md"
 
 
 def rules() -> list[dict[str, Any]]:
@@ -42,13 +42,13 @@ def test_a_rule_asks_for_what_is_exported_and_says_what_to_do(rule: dict[str, An
     assert rule["labels"] in ({"severity": "critical"}, {"severity": "warning"})
     assert re.fullmatch(r"\d+[sm]", rule.get("for", "0s"))
     assert set(rule) <= {"alert", "expr", "for", "labels", "annotations"}
-    assert said["runbook"] == f"docs/operate/alerts.md#{rule['alert'].lower()}"
+    assert said["runbook"] == f"docs/reference/metrics.md#{rule['alert'].lower()}"
 
 
 def test_every_alert_has_a_heading_with_its_severity_and_every_heading_an_alert() -> None:
-    told = re.findall(r"^## (\w+)\n\n\*(Critical|Warning)\.\*", _PAGE.read_text(), re.MULTILINE)
+    told = re.findall(r"^### (\w+)\n\n\*(Critical|Warning)\.\*", _PAGE.read_text(), re.MULTILINE)
     assert told == [(rule["alert"], rule["labels"]["severity"].capitalize()) for rule in rules()]
-    assert len(re.findall(r"^## ", _PAGE.read_text(), re.MULTILINE)) == len(told)
+    assert len(re.findall(r"^### ", _PAGE.read_text(), re.MULTILINE)) == len(told)
 
 
 _PROCESS = '{role="agent", id="a0"}'

@@ -1,4 +1,5 @@
-"""Who drove into whom: the fault is that of whoever moved in last, had it been told in time."""
+"""Blame for a hit between a body and a vehicle: the fault is that of the last to move in, if it was told in
+time."""
 
 from __future__ import annotations
 

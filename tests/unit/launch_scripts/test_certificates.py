@@ -1,4 +1,4 @@
-"""Certificates: signed by the folder's authority, keys for their owner only, faults told in a sentence."""
+"""Certificates: signed by the folder's authority, keys for their owner only, each fault a sentence."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_host_is_the_same_however_it_is_written(tmp_path: Path, host: str) -> 
 
 
 def test_what_does_not_go_together_may_not_stay(tmp_path: Path) -> None:
-    """As an interrupted renewal or another authority leaves it."""
+    """The state after an interrupted renewal or with another authority."""
     path, other = issue(tmp_path, "a0", [], 30), issue(tmp_path, "a1", [], 30)
     path.with_suffix(".key").write_bytes(other.with_suffix(".key").read_bytes())
     assert not may_stay(path, [], "a0")
@@ -120,7 +120,7 @@ def test_what_does_not_go_together_may_not_stay(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["ca", "a0"])
 def test_a_key_is_for_its_owner_only_whatever_was_left(tmp_path: Path, name: str) -> None:
-    left = tmp_path / f"{name}.key.part"
+    left = tmp_path / f"{name}.{os.getpid()}.part.key"
     left.write_text("")
     left.chmod(0o666)
     with left.open() as reader:

@@ -1,4 +1,4 @@
-"""The command line: what a user may type, and what comes back. Mistakes get a sentence and an exit code."""
+"""The command line: valid input, and the answers to it. Mistakes get a sentence and an exit code."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ast
+import inspect
 import os
 import signal
 import subprocess
@@ -18,14 +18,14 @@ from typer._completion_classes import BashComplete  # what a shell asks: there i
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
-from launch_scripts.command_line.run_command import EXTRAS
+from launch_scripts.command_line.old_names import COMMANDS, OPTIONS, current
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
 from swarm.config.setting_types import Walk
 
 
 def offered(*words: str) -> list[str]:
-    """What the shell is offered after these words; the last is not finished."""
+    """Completions of the shell after these words; the last is not finished."""
     shell = BashComplete(command(), {}, "swarm", "_SWARM_COMPLETE")
     return [item.value for item in shell.get_completions(list(words[:-1]), words[-1])]
 
@@ -38,38 +38,20 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tu
         yield from commands(group.get_command(None, name), (*path, name))
 
 
+def shown(each: Any) -> list[Any]:
+    return [param for param in each.params if not getattr(param, "hidden", False)]
+
+
 EVERY = list(commands())
-ROLES = {
-    "PIL", "cryptography", "jinja2", "llvmlite", "markupsafe", "matplotlib", "msgpack", "msgspec", "numba", "numpy",
-    "packaging", "prometheus_client", "psutil", "rasterio", "rich", "scipy", "typer", "yaml", "zenoh",
-}  # fmt: skip
-"""What the extra `roles` brings, by the names of its modules."""
-SAID_ELSEWHERE = {"pymavlink", "pyproj", "serial", "setproctitle"}
-"""What is missing of these is said where it is imported, or goes without."""
-
-
-def test_a_package_that_an_install_may_lack_has_the_extra_that_brings_it() -> None:
-    found: set[str] = set()
-    for folder in ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts"):
-        for path in Path(folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Import):
-                    found |= {each.name.partition(".")[0] for each in node.names}
-                elif isinstance(node, ast.ImportFrom) and node.module:
-                    found.add(node.module.partition(".")[0])
-    ours = {"swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts"}
-    assert found - ours - sys.stdlib_module_names - ROLES - SAID_ELSEWHERE == EXTRAS.keys()
 
 
 def test_every_command_completes_its_options_and_its_sub_commands() -> None:
     for path, each in EVERY:
-        declared = {name for param in each.params for name in param.opts if name.startswith("--")}
+        declared = {name for param in shown(each) for name in param.opts if name.startswith("--")}
         assert declared | {"--help"} <= {*offered(*path, "--"), "--help"}, path
         assert declared <= set(offered(*path, "--")), path
         if hasattr(each, "list_commands"):
-            assert each.list_commands(None) == [name for name in offered(*path, "") if not name.startswith("-")], (
-                path
-            )
+            assert each.list_commands(None) == [name for name in offered(*path, "") if name[0] != "-"], path
 
 
 def test_every_command_answers_to_h_as_to_help(
@@ -90,9 +72,45 @@ def test_every_command_answers_to_h_as_to_help(
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
 
 
+def test_the_short_help_fits_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["swarm", "-h"])
+    assert main() == 0
+    rows = capsys.readouterr().out.splitlines()
+    names = [
+        row.split()[0] for row in inspect.cleandoc(cli.Root.__doc__ or "").splitlines() if row.startswith("  ")
+    ]
+    assert len(rows) + len(names) - sum(row.startswith("  ") and row[2] != " " for row in rows) <= 24
+    assert max(map(len, rows)) < 80
+    assert len(names) == 12
+    assert "deploy" in " ".join(rows), "it names the commands that it does not explain"
+
+
+def test_an_old_name_is_told_once_and_stands_for_a_command_that_there_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = {" ".join(path): each for path, each in EVERY}
+    for old, new in COMMANDS.items():
+        assert old not in tree
+        assert new in tree
+        assert current([*old.split(), "--id", "x"])[0] == [*new.split(), "--id", "x"]
+    for name, renamed in OPTIONS.items():
+        known = {option for param in tree[name].params for option in param.opts}
+        for old, new in renamed.items():
+            assert (new if new.startswith("--") else old).partition("=")[0] in known
+    assert current(["zone", "add", "--until=9s"])[0] == ["order", "zone", "add", "--for=9s"]
+    monkeypatch.setattr(sys, "argv", ["swarm", "export", "--mcap", "--runs", "/nowhere"])
+    assert main() == 2
+    named, option, sentence = capsys.readouterr().err.splitlines()
+    assert named == "swarm: `swarm export` is now `swarm runs export`; the old name goes in 0.3"
+    assert option == "swarm: `--mcap` is now `--format mcap`; the old name goes in 0.3"
+    assert "no run" in sentence
+
+
 def test_every_option_has_one_name_and_says_what_it_is() -> None:
     for path, each in EVERY:
-        for param in each.params:
+        for param in shown(each):
             assert param.help, (path, param.name)
             names = [name for name in param.opts if len(name) > 2 or name[0] != "-"]  # a letter may be beside it
             assert len(names) <= 1, (path, param.opts)
@@ -127,37 +145,37 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("simulate", "maps/a") == ["maps/alps.toml"]
     assert offered("simulate", "ma") == ["maps/", "maze"]
     assert offered("up", "jacksboro", "--only", "p") == ["planner"]
-    assert offered("compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
-    assert "LAST" in offered("compare", "")
+    assert offered("runs", "compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
+    assert "LAST" in offered("runs", "compare", "")
     monkeypatch.chdir(newest_run / "maps")
     assert offered("down", "20260101") == ["20260101-000000-aaaa"], "from any folder"
     monkeypatch.chdir(newest_run)
-    assert offered("export", "L") == ["LAST"]
+    assert offered("runs", "export", "L") == ["LAST"]
     assert offered("new", "x.toml", "--walk", "w") == ["waypoints"]
     assert offered("new", "x.toml", "--terrain", "s") == ["synthetic"]
     assert offered("new", "x.toml", "--preset", "h") == ["hiker"]
-    assert set(offered("target", "add", "x", "--walk", "")) >= set(Walk.__args__[:4])
-    assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
-    assert offered("plugins", "check", "se") == ["sensor"]
-    assert offered("export", "LAST", "--what", "ma") == ["marks"]
-    assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
+    assert set(offered("order", "target", "add", "x", "--walk", "")) >= set(Walk.__args__[:4])
+    assert offered("order", "set", "pl") == ["planner.cpu_budget", "planner.push_s"]
+    assert offered("plugin", "check", "se") == ["sensor"]
+    assert offered("runs", "export", "LAST", "--what", "ma") == ["marks"]
+    assert offered("runs", "export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
     assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 
 def test_ids_come_from_the_scenario_that_is_named_or_from_the_newest_run(newest_run: Path) -> None:
-    assert offered("planner", "mine.toml", "--target", "") == ["deer0", "deer1"]
-    assert offered("agent", "mine.toml", "--id", "a") == ["a0", "a1", "a2", "a3"]
+    assert offered("role", "planner", "mine.toml", "--target", "") == ["deer0", "deer1"]
+    assert offered("role", "agent", "mine.toml", "--id", "a") == ["a0", "a1", "a2", "a3"]
     assert offered("route", "--target", "") == find_scenario("synthetic").target_ids
-    assert offered("target", "move", "t") == find_scenario("synthetic").target_ids
-    assert offered("vehicle", "stop", "a0-0")[:2] == ["a0-00", "a0-01"]
-    assert offered("group", "") == ["all"]
+    assert offered("order", "target", "move", "t") == find_scenario("synthetic").target_ids
+    assert offered("order", "vehicle", "stop", "a0-0")[:2] == ["a0-00", "a0-01"]
+    assert offered("order", "group", "") == ["all"]
 
 
 def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken.toml").write_text("seed = ")
-    assert offered("planner", "broken.toml", "--target", "") == []
-    assert offered("compare", "") == []
+    assert offered("role", "planner", "broken.toml", "--target", "") == []
+    assert offered("runs", "compare", "") == []
     assert offered("route", "--target", "") == []
     assert offered("check", "nowhere/x") == []
 
@@ -167,12 +185,13 @@ def test_the_shell_gets_its_words_from_the_command_itself(
 ) -> None:
     """Through `main`, as the shell's function calls it."""
     monkeypatch.setattr(sys, "argv", ["swarm"])
-    for name, value in {"_SWARM_COMPLETE": "complete_bash", "COMP_WORDS": "swarm map i", "COMP_CWORD": "2"}.items():
+    asked = {"_SWARM_COMPLETE": "complete_bash", "COMP_WORDS": "swarm marks e", "COMP_CWORD": "2"}
+    for name, value in asked.items():
         monkeypatch.setitem(os.environ, name, value)
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
-    assert capsys.readouterr().out.split() == ["inspect", "import"]
+    assert capsys.readouterr().out.split() == ["export"]
 
 
 # --- swarm doctor -------------------------------------------------------------------------------------------------

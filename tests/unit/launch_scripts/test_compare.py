@@ -1,4 +1,4 @@
-"""What differs between runs."""
+"""The differences between runs."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_the_command_shows_settings_and_figures(runs: Path, swarm: Swarm) -> None:
-    code, out, _ = swarm("compare r1 --runs", runs, runs / "r2")
+    code, out, _ = swarm("runs compare r1 --runs", runs, runs / "r2")
     assert code == 0
     told = [line.replace("│", "").split() for line in out.splitlines()]
     assert ["seed", "1", "2"] in told
     assert ["certified", "gap,", "mean", "5.00%", "5.00%"] in told
     assert ["captures", "1", "2"] in told
-    found = json.loads(swarm("compare r1 r2 --json --runs", runs)[1])
+    found = json.loads(swarm("runs compare r1 r2 --json --runs", runs)[1])
     assert found["scenario"] == {"seed": [1, 2]}
     assert found["figures"]["certified gap, mean"] == [1.05, 1.05]
 
@@ -96,6 +96,6 @@ def test_damaged_files_are_one_sentence(
         damaged.unlink()
     else:
         damaged.write_bytes(content)
-    code, _, told = swarm("compare r1 r2 --runs", runs)
+    code, _, told = swarm("runs compare r1 r2 --runs", runs)
     assert (code > 0, told.count("\n")) == (True, 1)
     assert re.search(sentence, told), told

@@ -1,4 +1,4 @@
-"""What `./launch_scripts/test` starts ends with it, however it is stopped."""
+"""The processes that `./launch_scripts/test` starts end with it, however it is stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swarm deploy plan --kit compose`: what is written stands for itself and is whole."""
+"""`swarm deploy plan --kit compose`: the written files are whole and need no others."""
 
 from __future__ import annotations
 
@@ -69,9 +69,8 @@ def test_the_command_line_takes_the_words_of_every_container() -> None:
     scenario = parse_scenario('[[targets]]\ncount = 2\n[[groups]]\nname = "all"\nvehicles = 30')
     made = make_plan(scenario, parse_hosts(HOSTS), "small-1")
     for each in (each for host in made.hosts for each in containers_of(made, host)):
-        role, *words = each.words
-        context = command().make_context("swarm", [role, *words], resilient_parsing=True)
-        taken = command().get_command(context, role).make_context(role, words).params
+        _, role, *words = each.words
+        taken = command().commands["role"].commands[role].make_context(role, words).params
         assert taken["health_port"] == 9464
         assert taken["signals_address"] == "127.0.0.1"
         assert taken["log_format"] == "json"

@@ -13,7 +13,6 @@ from support.makers import planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground.ground_colours import (
-    UNREACHED,
     CostSamples,
     GroundColours,
     TargetPictures,
@@ -21,7 +20,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     nearest_target,
 )
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec
 from swarm.wire.fields import pack_column
@@ -87,16 +86,6 @@ def test_between_samples_costs_are_linear_where_all_are_known(
     np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
 
 
-def test_beside_ground_without_a_way_costs_are_those_of_the_samples_that_have_one() -> None:
-    samples = CostSamples(GridSpec(256, 256, 10.0), None)
-    assert samples.cols[:3].tolist() == [2, 6, 10]
-    costs = np.full((64, 64), np.inf, np.float32)
-    costs[0, 0] = 1
-    found = samples.spread(costs, np.arange(1), np.arange(256))
-    assert found[0, :6].tolist() == [1.0] * 6
-    assert np.isinf(found[0, 6:]).all()
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -141,22 +130,6 @@ def pictures(terrain: Terrain) -> tuple[TargetPictures, CostSamples]:
     samples = CostSamples(terrain.grid, "t0")
     samples.hear_target("t0")
     return TargetPictures(mesh, GroundColours(mesh, terrain, terrain.ground_s_per_m, None), samples), samples
-
-
-def test_the_heat_map_is_bright_at_the_target_and_dark_afar_and_says_where_there_is_no_way() -> None:
-    pace = np.full((60, 80), 0.1, np.float32)
-    pace[:, 70:72] = np.inf
-    drawn, samples = pictures(terrain_of_pace(pace, 10.0))
-    costs = costs_to(pace, 30, 5) * 10
-    samples.on_costs(answer(samples, "t0", costs.reshape(-1)[samples.request.cells].tolist()))
-    image = drawn.to_target("t0").astype(int)
-    height, width, _ = image.shape
-    near, far, cut_off = (image[height // 2, round(share * width)] for share in (0.06, 0.8, 0.97))
-    assert near.sum() > 1.3 * far.sum()
-    assert np.abs(cut_off / cut_off.sum() - np.array(UNREACHED) / sum(UNREACHED)).max() < 0.03
-    lines, radii = drawn.tree("t0")
-    assert len(lines) == len(radii) > 50
-    assert lines[..., 0].max() < 710, "behind the wall no line begins"
 
 
 def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:

@@ -29,7 +29,7 @@ def includes(expression: str, other: str) -> bool:
 
 
 def allowed(control: dict[str, Any], name: str, flow: str, message: str, key: str) -> bool:
-    """What a router would decide, by the name in a certificate."""
+    """The decision of a router, by the name in a certificate."""
     subjects = [each["id"] for each in control["subjects"] if name in each.get("cert_common_names", ())]
     rules = [
         rule for each in control["policies"] if set(each["subjects"]) & set(subjects) for rule in each["rules"]

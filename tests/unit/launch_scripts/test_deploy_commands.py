@@ -1,4 +1,5 @@
-"""`swarm deploy`: a certificate for each process of a scenario, a configuration for zenohd, faults told."""
+"""`swarm deploy`: a certificate for each process of a scenario, a configuration for zenohd, a sentence per
+fault."""
 
 from __future__ import annotations
 

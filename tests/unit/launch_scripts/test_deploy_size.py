@@ -18,7 +18,6 @@ from launch_scripts.deploy.machines_needed import (
     fewest_machines,
     measured_runs,
     reaches,
-    too_much,
 )
 from swarm.errors import ConfigError
 
@@ -53,22 +52,6 @@ def test_needs_are_finite_and_positive_and_nothing_crosses_on_one_machine(size: 
         assert found.crossings_per_s == found.link_mbit_per_s == found.link_out_mbit_per_s == 0
     else:
         assert 0 < found.link_out_mbit_per_s <= found.link_mbit_per_s <= found.first_link_mbit_per_s
-
-
-@settings(max_examples=15, deadline=None)
-@given(vehicles=st.integers(100, 5000), targets=st.integers(1, 50), times=st.floats(1.5, 3))
-def test_a_larger_swarm_never_needs_fewer_machines_nor_better_ones_more(
-    vehicles: int, targets: int, times: float
-) -> None:
-    small, large = (Estimate(swarm(n, targets)) for n in (vehicles, int(vehicles * times)))
-    few = fewest_machines(small, WEAK)
-    assert not [each for each in too_much(few, WEAK) if not each.startswith("one ")]
-    assert fewest_machines(small, STRONG).machines <= few.machines <= fewest_machines(large, WEAK).machines
-
-
-def test_standbys_are_planners() -> None:
-    alone, followed = (Estimate(swarm(100, 4), standbys).on(1) for standbys in (0, 2))
-    assert followed.cpu_cores["planner"] == pytest.approx(3 * alone.cpu_cores["planner"])
 
 
 def test_a_swarm_that_no_number_of_machines_carries_is_refused_with_what_is_full() -> None:

@@ -97,7 +97,7 @@ def test_of_a_one_way_cut_one_side_hears_until_the_lease_ends_the_session():
 
 
 def far_off(plan: FaultPlan) -> float:
-    """How many seconds two clocks are apart at most."""
+    """Upper bound on the seconds by which two clocks differ."""
     off = {node: [skew_ms / 1e3] for node, skew_ms in plan.skews_ms.items()}
     for step in sorted(plan.clock_steps, key=lambda each: each.at_s):
         off.setdefault(step.node, [0.0]).append(off.get(step.node, [0.0])[-1] + step.by_s)
@@ -124,7 +124,7 @@ def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
 
 
 def test_agents_that_nobody_can_tell_apart_have_no_second_life():
-    """Of a drone's agent, alone in the air, and of two on the ground nobody notes which file is the first."""
+    """For a drone's agent, alone in the air, and for two on the ground, no member notes which file is the first."""
     air = (
         "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"
     )

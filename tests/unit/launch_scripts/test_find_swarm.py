@@ -1,4 +1,4 @@
-"""Which swarm a command asks when nobody says: the newest that runs here."""
+"""The swarm that a command asks by default: the newest that runs here."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from swarm.errors import BusError, ConfigError
 
 @pytest.fixture
 def listens() -> Iterator[list[int]]:
-    """Ports on which somebody listens."""
+    """Ports that listen."""
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(2)]
         for each in sockets:

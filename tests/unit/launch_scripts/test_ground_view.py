@@ -1,11 +1,9 @@
-"""What lies still in the live view: the mesh, closed ground, zones, layers, margin, legends and words."""
+"""The still parts of the live view: the mesh, closed ground, zones, layers, margin, legends and words."""
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from PIL import Image
 from support.makers import planner_status
 from support.map_strategies import set_of
 from support.monitor_rig import Rig, little_scenario, little_terrain
@@ -42,21 +39,9 @@ from launch_scripts.monitor.ground.ground_view import (
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.live_layout import (
     COST,
-    HEIGHT_PX,
-    KNOWN,
-    LEARNED,
     PHOTO,
-    TO_TARGET,
-    WIDTH_PX,
-    Scale,
-    legend_picture,
-    level_of,
-    shown_layers,
-    summary_markdown,
 )
-from launch_scripts.monitor.movers.styles import Looks
 from launch_scripts.monitor.view_outputs import Pen, in_markdown, shown
-from launch_scripts.observe.recorder import Recorder
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
@@ -65,7 +50,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 ALL = Window(0, 0, 40, 50)
@@ -115,15 +99,6 @@ def test_a_zone_that_closes_ground_is_hatched_red_even_where_operators_ordered_i
     assert not any(near(pixel, LETHAL_MARK) for pixel in ordered)
     colours.close(cells[:0])
     np.testing.assert_array_equal(colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3), found)
-
-
-def test_dear_ground_is_darker_than_cheap_ground_and_found_obstacles_are_black() -> None:
-    now = np.array(flat().ground_s_per_m)
-    now[:, 10:20], now[:, 20:30], now[:, 30:40] = 0.2, 0.4, np.inf
-    terrain = terrain_of_pace(np.where(np.isinf(now), np.float32(0.8), now), 10.0)
-    cost = colours_of(terrain, now).cost_of(ALL).astype(int).sum(axis=2)
-    cheap, dearer, dear, lethal = (cost[20, col] for col in (5, 15, 25, 35))
-    assert cheap > dearer > dear > lethal
 
 
 def test_what_is_hidden_what_is_found_and_what_is_said_wrongly_have_colours_of_their_own() -> None:
@@ -193,50 +168,6 @@ def test_zones_of_operators_are_those_that_stand() -> None:
     assert [area.name for area in ordered_areas(replica, 10, [])] == ["z2"]
 
 
-@pytest.mark.parametrize(("width_cells", "text"), [(50, "100 m"), (400, "1 km"), (4100, "10 km")])
-def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: int, text: str) -> None:
-    terrain = terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)
-    logged: dict[str, Any] = {}
-    rec = rr.RecordingStream("margin", recording_id="r")
-    rec.log = lambda path, what, static: logged.__setitem__(path, what)  # type: ignore[method-assign,assignment]
-    scene = Scene(Pen([rec], TerrainMesh(terrain)))
-    GroundView(scene, terrain, CostMap(terrain), MapReplica(terrain.grid), zoned(""))._draw_margin()
-    lines = logged["world/margin"].strips.as_arrow_array().to_pylist()
-    _, start, end, _ = lines[0]
-    number, unit = text.split()
-    texts = logged["world/margin/texts"].labels.as_arrow_array().to_pylist()
-    assert {text, "heights to scale"} <= set(texts)
-    assert end[0] - start[0] == float(number) * (1000 if unit == "km" else 1)
-    foot, tip = lines[1]
-    assert (tip[0], tip[2]) == (foot[0], foot[2])
-    assert tip[1] > foot[1]
-
-
-def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
-    elevation_m = np.tile(np.linspace(0, 5, 50, dtype=np.float32), (40, 1))
-    terrain = terrain_of_pace(np.ones((40, 50), np.float32), 10.0, elevation_m)
-    for factor, said in ((1.0, "heights to scale"), (3.24, "heights x 3.2")):
-        mesh = TerrainMesh(terrain, factor)
-        assert mesh.heights_m.max() == pytest.approx(5 * factor)
-        assert mesh.said_heights == said
-
-
-@pytest.mark.parametrize(
-    "groups", [["all"], ["reconnaissance", "haulage-trucks", "fire-fighters", "police-cars", "e"]]
-)
-def test_no_legend_is_cut_off(groups: list[str]) -> None:
-    movers = Looks(groups, ["t0"]).legend()
-    nearest = shown_layers(parse_scenario('[[targets]]\nname = "t"\ncount = 18\n'), knows_truth=False)[-1]
-    scale = Scale(("#000000", "#ffffff"), "seconds to t0", [f"{1080 * n}" for n in range(6)])
-    scaled = {COST: scale, LEARNED: scale, TO_TARGET: scale}
-    for layer in (PHOTO, COST, KNOWN, LEARNED, TO_TARGET, nearest):
-        picture = legend_picture((*layer.looks, *movers), scaled.get(layer))
-        image = Image.open(io.BytesIO(picture)).convert("RGB")
-        assert image.size == (WIDTH_PX, HEIGHT_PX)
-        right_edge = np.asarray(image)[:, -4:]
-        assert len(np.unique(right_edge.reshape(-1, 3), axis=0)) == 1, layer.name
-
-
 def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
     terrain = flat()
     cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
@@ -297,23 +228,6 @@ def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(sha
     assert area == pytest.approx((rows - 1) * (cols - 1) * 100.0, rel=1e-4)
 
 
-def test_the_corners_of_the_ground_are_the_middles_of_the_corner_cells() -> None:
-    mesh = TerrainMesh(hill(100, 151))
-    vertices = np.concatenate([tile.vertices for tile in mesh.mesh_tiles()])
-    assert vertices[:, 0].min() == 5.0
-    assert vertices[:, 0].max() == 1505.0
-    assert vertices[:, 1].max() == -5.0
-    assert vertices[:, 1].min() == -995.0
-
-
-def test_a_huge_terrain_is_thinned_out_and_a_small_one_is_not() -> None:
-    assert TerrainMesh(hill(100, 100)).texel == 1
-    mesh = TerrainMesh(hill(2100, 2100))
-    assert mesh.texel == 4
-    assert sum(len(tile.vertices) for tile in mesh.mesh_tiles()) < 150_000
-    assert photo(hill(2100, 2100), mesh.tile_window(0)).shape[0] <= 70
-
-
 def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
     terrain = hill(2100, 2100)
     mesh, pace = TerrainMesh(terrain), np.array(terrain.pace_s_per_m)
@@ -359,18 +273,6 @@ def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_othe
     texture = photo(terrain, window, pace)
     mark = texture[64 - window.row0, 10 - window.col0].astype(int)
     assert np.abs(mark - np.array(LETHAL_MARK)).max() < 40
-
-
-def test_the_summary_says_what_is_not_known_yet_with_a_dash() -> None:
-    setup = RoleSetup(Scenario(), "r", "monitor", "0", 1, 0)
-    text = summary_markdown(setup, Recorder(setup.scenario, hill(4, 4).grid).summary(0))
-    assert "captures -  marks -" in text
-    assert "| t (planner down) | 0 | - | 0 | - | - | - |" in text
-
-
-def test_what_should_worry_a_person_is_a_warning() -> None:
-    assert level_of("restart") == "WARN"
-    assert level_of("capture") == "INFO"
 
 
 @pytest.mark.parametrize(

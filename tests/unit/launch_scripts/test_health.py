@@ -255,7 +255,7 @@ class Watched:
         self.board, self.look = Board(self.running.health), swarm._end_hung
 
     def passes(self, seconds: float, stamp_ns: int, phase: Phase = Phase.RUNS) -> list[signal.Signals]:
-        """What the process is sent at a look some seconds later, by when it has ticked last at `stamp_ns`."""
+        """The signal that the process gets at a check some seconds later, if its last tick was at `stamp_ns`."""
         self.now_s, self.sent = self.now_s + seconds, []
         self.board.write(Vitals(stamp_ns, 0, phase, ()))
         self.look()

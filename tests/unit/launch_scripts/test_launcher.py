@@ -1,4 +1,4 @@
-"""The launcher with processes that do nothing: starts, restarts, ordered ends, and nobody left behind."""
+"""The launcher with idle processes: starts, restarts, ordered ends, and no process left behind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from launch_scripts.process_table import TABLE, ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
 
-# Of the network, as those: its tests wait for processes.
+# Marked as network tests, like those: its tests wait for processes.
 pytestmark = [
     pytest.mark.network,
     pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
@@ -224,7 +224,7 @@ class Ended:
 
 
 def refused(swarm: LocalSwarm, ran_s: float, *, restarts: int = 1) -> float | None:
-    """Let the only process end by a refusal after a run; what the launcher waits before the next start."""
+    """Ends the only process by a refusal after a run; returns the launcher's wait before the next start."""
     running = swarm.running[0]
     running.process = running.pipe = Ended()  # type: ignore[assignment]
     running.restarts, running.began_s = restarts, time.monotonic() - ran_s

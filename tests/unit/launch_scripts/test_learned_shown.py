@@ -1,4 +1,4 @@
-"""What was learned of kinds of ground is seen: in the live view, in figures, in the report."""
+"""Factors of learned ground are visible: in the live view, in figures, in the report."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 from support.makers import stats
 
-from launch_scripts.monitor.ground.ground_colours import GroundColours
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.recorder import Recorder
@@ -53,20 +51,6 @@ def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:
 
 def small() -> Scenario:
     return parse_scenario('name = "s"\nseconds = 5\n[[targets]]\nname = "t"\n[[groups]]\nvehicles = 1\n')
-
-
-def test_learned_ground_is_orange_where_slower_and_blue_where_quicker_and_is_not_taken_for_found() -> None:
-    cost_map, _ = learned(flat=3.0, steep=0.4)
-    colours = GroundColours(TerrainMesh(GROUND), GROUND, cost_map.ground_s_per_m, None, cost_map.prior_s_per_m)
-    shown = colours.learned_of(GROUND.grid.window).astype(int)
-    assert shown[30, 10, 0] > shown[30, 10, 2] + 40
-    assert shown[30, 40, 2] > shown[30, 40, 0] + 40
-    before = GroundColours(TerrainMesh(GROUND), GROUND, GROUND.ground_s_per_m, None)
-    np.testing.assert_array_equal(
-        colours.photo_of(GROUND.grid.window), before.photo_of(GROUND.grid.window), "nothing was marked"
-    )
-    red, green, blue = before.learned_of(GROUND.grid.window)[30, 10].astype(int).tolist()
-    assert max(red, green, blue) - min(red, green, blue) < 20, "grey where the prior stands"
 
 
 def test_the_picture_of_a_report_shows_factors_but_on_lethal_ground() -> None:

@@ -1,4 +1,4 @@
-"""Logs carry dates, are bounded in size, and a full disk harms nobody who writes one."""
+"""Logs carry dates, are bounded in size, and a full disk harms no writer."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_line_begins_with_its_date_time_and_zone(tmp_path: Path) -> None:
 
 
 def test_a_log_and_what_is_printed_into_it_stay_within_twice_the_bound(tmp_path: Path) -> None:
-    """File descriptors 1 and 2, which native libraries write to, follow the file when it is begun anew."""
+    """File descriptors 1 and 2, which native libraries write to, follow the file when it is replaced."""
     what = "for n in range(1000):\n log.info('line %d', n)\n os.write(1 + n % 2, b'native %d\\n' % n)"
     told = write(tmp_path / "a.log", what, max_bytes=10_000, takes="all")
     assert (told.stdout, told.stderr) == ("", "")

@@ -1,4 +1,4 @@
-"""`swarm map`: what is exported comes back as it was, and the bands of a GeoTIFF show the winners."""
+"""`swarm marks`: an export comes back unchanged, and the bands of a GeoTIFF show the winners."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support.map_strategies import GRID, mark_sets, set_of
 from typer.testing import CliRunner
 
 from launch_scripts.commands.map_commands import app
-from shared_map.keeper.export import from_json, to_cells, to_json
+from shared_map.keeper.export import from_json, to_json
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.measurements import Measurement
 from shared_map.replication.replica import MapReplica
@@ -63,13 +63,6 @@ def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
     assert read == [bare(each) for each in sorted(sets, key=lambda each: (each.tile, each.author))]
 
 
-def test_the_bands_show_the_winners() -> None:
-    pace, kind, _ = to_cells(GRID, SETS)
-    assert kind[0, 5:8].tolist() == [LETHAL, CLEAR, 255]
-    assert np.isinf(pace[0, 5])
-    assert np.isnan(pace[0, 6])
-
-
 def test_export_import_and_inspect_on_the_command_line(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
     out, again = tmp_path / "map.json", tmp_path / "again.sqlite"
@@ -77,10 +70,10 @@ def test_export_import_and_inspect_on_the_command_line(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["import", str(out), str(again)]).exit_code == 0
     with KeeperStore(again) as copy:
         assert sorted(copy.load(), key=lambda each: (each.tile, each.author)) == SETS
-    found = json.loads(CliRunner().invoke(app, ["inspect", str(again), "--json"]).output)
+    found = json.loads(CliRunner().invoke(app, ["show", str(again), "--json"]).output)
     assert (found["marks"], found["sets"], found["cells_with_marks"], found["cells_lethal"]) == (3, 3, 2, 1)
     assert found["authors"]["a2.1"] == {"sets": 2, "marks": 1, "tombstones": 1}
-    assert "3 marks in 3 sets" in CliRunner().invoke(app, ["inspect", str(again)]).output
+    assert "3 marks in 3 sets" in CliRunner().invoke(app, ["show", str(again)]).output
 
 
 def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path) -> None:
@@ -126,12 +119,12 @@ def complaint(arguments: list[str]) -> str:
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
-    assert "there is no store" in complaint(["inspect", str(tmp_path / "none")])
+    assert "there is no store" in complaint(["show", str(tmp_path / "none")])
     assert "write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
     assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
     junk = tmp_path / "junk"
     junk.write_text("no map")
-    assert "cannot read the store" in complaint(["inspect", str(junk)])
+    assert "cannot read the store" in complaint(["show", str(junk)])
     assert "not an exported map: file" in complaint(["import", str(junk), str(tmp_path / "x.sqlite")])
 
 
@@ -159,7 +152,7 @@ def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
 
 def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", [*SETS, *learned_sets("all.a1.1", Measurement(400, 72_000, 6_500))])
-    found = json.loads(CliRunner().invoke(app, ["inspect", str(store), "--json"]).stdout)
+    found = json.loads(CliRunner().invoke(app, ["show", str(store), "--json"]).stdout)
     assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
     assert found["authors_that_learned"] == ["all.a1.1"]
     told = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "marks.json")]).stdout
@@ -177,10 +170,10 @@ def test_what_is_learned_is_imported_as_it_was_exported(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["import", str(file), str(again)]).exit_code == 0
     with KeeperStore(again, read_only=True) as store:
         assert sorted(each.author for each in store.load() if each.tile == GRID.tiles) == ["all.a1.1", "all.a2.1"]
-    (row, *_) = json.loads(CliRunner().invoke(app, ["learned", str(again), "--json"]).stdout)["kinds"]
+    (row, *_) = json.loads(CliRunner().invoke(app, ["factors", str(again), "--json"]).stdout)["kinds"]
     assert (row["kind"], row["cells"], row["authors"]) == ("unknown 0-5", 409, 2)
     assert 2.5 < row["factor"] <= row["measured"] < 3.1
-    assert "unknown 5-10" in CliRunner().invoke(app, ["learned", str(again)]).stdout
+    assert "unknown 5-10" in CliRunner().invoke(app, ["factors", str(again)]).stdout
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The core of `swarm mavlink`: what a vehicle is told, when, and what the swarm hears of it."""
+"""The core of `swarm gateway mavlink`: the commands of a vehicle, their times, and the reports to the swarm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from support.mavlink_world import (
     FRAME,
     GRID,
     MANUAL,
-    NOWHERE,
     PLANE,
     ROVER,
     START,
@@ -64,18 +63,6 @@ def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> 
     assert not of(world, Follow)
 
 
-def test_positions_are_asked_for_until_they_come() -> None:
-    world = World(Wishes())
-    world.speaks = False
-    world.hear(world.vehicle.beat())
-    asked = [each for each in world.run(4.0) if isinstance(each, codec.Command)]
-    assert [each.command for each in asked] == [codec.SET_MESSAGE_INTERVAL] * 2
-    assert asked[0].params == (33, 100_000)
-    world.speaks = True
-    world.run(1.0)
-    assert not [each for each in world.run(3.0) if isinstance(each, codec.Command)]
-
-
 def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_back() -> None:
     world = driving(MISSION)
     world.speaks = False
@@ -86,17 +73,6 @@ def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_
     assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
     world.speaks = True
     assert [each for each in world.run(1.0) if isinstance(each, Follow)] == [Follow("t0")]
-
-
-def test_what_a_vehicle_had_before_its_link_was_lost_is_not_relied_on() -> None:
-    world = driving(MISSION)
-    world.speaks = False
-    world.run(8.0)
-    world.speaks = True
-    world.run(1.0)
-    world.adapter.hear_way(WITH_A_TURN)
-    world.run(5.0)
-    assert len(world.vehicle.missions) == 2
 
 
 def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_was_last() -> None:
@@ -111,16 +87,6 @@ def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_wa
     assert not [each for each in world.run(0.5) if isinstance(each, Follow | Report)]
     world.hear(world.vehicle.position())
     assert [each for each in world.run(0.5) if isinstance(each, Follow)] == [Follow("t0")]
-
-
-def test_without_positions_the_vehicle_is_as_lost_as_without_heartbeats() -> None:
-    world = driving(MISSION)
-    world.speaks = False
-    for _ in range(8):
-        world.hear(world.vehicle.beat())
-        world.run(1.0)
-    assert of(world, Unfollow)
-    assert any(each.startswith("no position for 5 s") for each in world.told())
 
 
 def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
@@ -218,14 +184,6 @@ def test_a_long_route_is_uploaded_in_parts() -> None:
     assert places(world.vehicle.missions[-1])[-1] == GRID.cell(21, 79)
 
 
-def test_routes_that_change_ten_times_a_second_are_a_mission_in_three_seconds() -> None:
-    world = driving(MISSION)
-    for number in range(60):
-        world.adapter.hear_way([TO_THE_EAST, WITH_A_TURN][number % 2])
-        world.run(0.1)
-    assert 2 <= len(world.vehicle.missions) <= 4
-
-
 def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_anew() -> None:
     vehicle = Autopilot(answers=False)
     world = driving(MISSION, vehicle, seconds=20.0)
@@ -243,13 +201,6 @@ def test_a_refused_mission_says_the_result() -> None:
     world.hear(codec.MissionAnswered(13))
     world.run(0.2)
     assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.told()
-
-
-def test_a_route_that_leads_nowhere_ends_an_upload() -> None:
-    world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
-    world.adapter.hear_way(NOWHERE)
-    assert codec.MissionCancelled() in world.run(0.2)
-    assert not of(world, codec.MissionItem)
 
 
 def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
@@ -401,7 +352,6 @@ def test_a_copter_in_guided_takes_off_once() -> None:
 
 # --- waypoints ---------------------------------------------------------------------------------------------------
 
-cells = st.integers(0, GRID.cells - 1)
 lines = st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30)), min_size=1, max_size=30)
 
 

@@ -1,4 +1,4 @@
-"""The shell of `swarm mavlink`, turn by turn, between a link that a test plays and a swarm on a memory network."""
+"""The shell of `gateway mavlink`, turn by turn, between a link of a test and a swarm on a memory network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
 
 
 class PlayedLink:
-    """Brings the pieces of a list, or one piece without end, and keeps what is written."""
+    """Brings the pieces of a list, or one piece without end, and keeps the written bytes."""
 
     whole = True
 
@@ -152,6 +152,6 @@ def test_what_flies_is_gone_when_its_link_is_lost_and_another_life_when_it_is_ba
 
 def test_ground_without_coordinates_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match="swarm mavlink needs latitudes and longitudes: this terrain has no coordin"
+        ConfigError, match="swarm gateway mavlink needs latitudes and longitudes: this terrain has no coordin"
     ):
         check_ground(Frame(GridSpec(9, 9, 10.0)))

@@ -1,4 +1,4 @@
-"""What comes over the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+"""The links of `swarm gateway mavlink`: bytes become checked messages of one vehicle, and nothing else."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_any_bytes_pass_the_door_as_nothing_and_a_vehicle_is_heard_after_them(
     for piece in pieces:
         door.read(piece, whole=whole)
         assert len(door._mav.buf) <= 512
-    # What looked like the begin of a message takes up to 280 bytes of what follows with it.
+    # The false begin of a message swallows up to 280 bytes that follow it.
     sender = Sender(key=key)
     heard = [each for _ in range(40) for each in door.read(sender.bytes_of(beat()), whole=whole)]
     assert heard
@@ -233,7 +233,7 @@ def opened(text: str) -> Iterator[UdpLink | StreamLink]:
 
 
 def within(link: UdpLink | StreamLink, turns: int = 100) -> bytes:
-    """What it brings first."""
+    """The first message that it brings."""
     for _ in range(turns):
         if data := link.read(0.05):
             return data

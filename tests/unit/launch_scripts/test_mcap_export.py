@@ -1,4 +1,4 @@
-"""`swarm export --mcap`: what a run left, as readers of MCAP and ROS that are not ours read it."""
+"""`swarm runs export --format mcap`: what a run left, as readers of MCAP and ROS that are not ours read it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 from support.command import Swarm
 from support.fake_run import BEGAN_NS, leave, little_scenario, played
 
@@ -123,25 +122,6 @@ def test_every_frame_hangs_on_the_terrain(heard: dict[str, list[tuple[int, Any]]
         assert parents[parents[f"{ros_name(each.id)}/base_link"]] == "map"
 
 
-def test_every_target_is_where_its_track_says(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
-    expected = defaultdict(set)
-    for each in tracks.targets:
-        for time_ns, place in zip(each.time_ns.tolist(), in_map(each.xy_m), strict=True):
-            expected[time_ns].add(place)
-    found = {time_ns: {(p.position.x, p.position.y) for p in told.poses} for time_ns, told in heard["/targets"]}
-    assert found == expected
-
-
-def test_the_map_says_what_is_lost_of_the_best_speed(heard: dict[str, list[tuple[int, Any]]]) -> None:
-    ((_, told),) = heard["/map"]
-    assert (told.info.resolution, told.info.width, told.info.height) == (25.0, 64, 48)
-    assert (told.info.origin.position.x, told.info.origin.position.y) == (0, 0)
-    shown = np.array(told.data, np.int8).reshape(told.info.height, told.info.width)[::-1]
-    expected = np.zeros((48, 64), np.int8)
-    expected[:10, :10], expected[30:, 20:40], expected[40:, 60:] = 50, 75, 100
-    assert (shown == expected).all()
-
-
 def test_marks_are_in_the_last_grid_as_they_were_at_the_end(
     heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
 ) -> None:
@@ -217,24 +197,11 @@ def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(record
         assert len(times) == summary.statistics.message_count
 
 
-def test_rosbags_reads_the_same(recording: Path, heard: dict[str, list[tuple[int, Any]]]) -> None:
-    many: dict[str, int] = defaultdict(int)
-    with AnyReader([recording]) as reader:
-        for connection, time_ns, content in reader.messages():
-            message: Any = reader.deserialize(content, connection.msgtype)
-            at, told = heard[connection.topic][many[connection.topic]]
-            assert at == time_ns
-            if connection.topic in ("/map", "/marks"):
-                assert message.data.tolist() == list(told.data)
-            many[connection.topic] += 1
-    assert many == {topic: len(told) for topic, told in heard.items()}
-
-
 def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     old = tmp_path / "old"
     old.mkdir()
     shutil.copy(run / TRACKS_FILE, old)
-    code, out, _ = swarm("export --mcap", old)
+    code, out, _ = swarm("runs export --format mcap", old)
     assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
     with (old / "export" / "old.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -256,26 +223,18 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
         damaged.mkdir(exist_ok=True)
         for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
             (damaged / each).write_bytes(content if each == file else (run / each).read_bytes())
-        code, _, told = swarm("export --mcap", damaged)
+        code, _, told = swarm("runs export --format mcap", damaged)
         assert (code > 0, complaint in told, told.count("\n")) == (True, True, 1), told
         assert not list(damaged.rglob("*.mcap*"))
     with monkeypatch.context() as patched:
         patched.delitem(sys.modules, "launch_scripts.report.mcap_export")
         patched.setitem(sys.modules, "mcap.writer", None)
-        code, _, told = swarm("export --mcap", run)
+        code, _, told = swarm("runs export --format mcap", run)
     needed = "swarm: this needs mcap, which is not installed: install the extra 'ros2' (docs/start/install.md)"
     assert (code, told.strip()) == (2, needed)
     (tmp_path / "empty").mkdir()
-    code, _, told = swarm("export --mcap", tmp_path / "empty")
+    code, _, told = swarm("runs export --format mcap", tmp_path / "empty")
     assert (code, "has no tracks.npz" in told) == (2, True)
-
-
-def test_no_recording_is_replaced_unless_told(recording: Path, run: Path, swarm: Swarm) -> None:
-    before = recording.read_bytes()
-    code, _, told = swarm("export --mcap", run, "--out", recording.parent)
-    assert (code, "--force replaces it" in told) == (2, True)
-    assert swarm("export --mcap --force", run, "--out", recording.parent)[0] == 0
-    assert recording.read_bytes() == before
 
 
 @given(st.lists(st.integers(-(10**9), 10**12)), st.integers(0, 10**11), st.integers(0, 10**12), st.integers(2, 50))

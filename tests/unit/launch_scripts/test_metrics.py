@@ -1,4 +1,4 @@
-"""Metrics are valid OpenMetrics whatever comes from the network, and say what processes said."""
+"""Metrics are valid OpenMetrics whatever comes from the network, and give the figures of the processes."""
 
 from __future__ import annotations
 

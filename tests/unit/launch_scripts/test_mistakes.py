@@ -44,7 +44,7 @@ WORDS_OF_LIBRARIES = re.compile(
     r"msgspec|TOMLDecode|ValidationError|\$\.|CPLE_|ZError"
 )
 BUSY = re.compile(r"^.*, \d+ s \.\.\.\n", re.MULTILINE)
-"""What a slow machine says meanwhile."""
+"""Output of a slow machine meanwhile."""
 LONGEST_ANSWER = 400
 """Characters; two lines of a wide terminal."""
 

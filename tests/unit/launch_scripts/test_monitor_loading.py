@@ -22,7 +22,7 @@ from swarm.wire.topics import RUN
 
 
 class View:
-    """Stands for the service that draws; writes down what it is told."""
+    """Stands for the service that draws; records its calls."""
 
     def __init__(self, member: Member) -> None:
         self.member = member
@@ -80,7 +80,7 @@ class World(SwarmModel):
         self.settle()
 
     def answers(self) -> int:
-        """How many members of a run answer a tool."""
+        """Number of members of a run that answer a tool."""
         heard: list[Event] = []
         self.tool.ask(RUN, Nothing(), heard.append, tag="run")
         self.run(0.5)

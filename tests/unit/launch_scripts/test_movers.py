@@ -1,4 +1,4 @@
-"""What moves in the live view: where it is drawn, how it looks, what it says of itself."""
+"""The moving parts of the live view: place, look and text."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.movers_view import (
     OVER_S,
     alarm_marks,
-    poles,
-    rings,
     searched_points,
     target_labels,
 )
@@ -25,7 +23,6 @@ from launch_scripts.monitor.movers.styles import (
     HUES,
     LOST_COLOUR,
     Looks,
-    shaded,
 )
 from launch_scripts.monitor.movers.vehicles_view import (
     RouteLines,
@@ -61,7 +58,7 @@ def columns(states: list[VehicleState], targets: list[int], target_ids: list[str
 
 
 def route(*cells: int, target: str = "t0", cols: int = 1000, **more: Any) -> RouteNow:
-    """A route over these cells of a grid which has so many columns."""
+    """A route over these cells of a grid with that number of columns."""
     of_grid = np.array(cells, np.int32)
     places = np.stack(np.divmod(of_grid, cols), axis=1).astype(np.float32)
     return RouteNow(target, of_grid, places, **more)
@@ -100,13 +97,6 @@ def test_the_colour_blind_tell_groups_and_targets_apart(who: str) -> None:
 
     for one, other in itertools.combinations(HUES, 2):
         assert np.linalg.norm(seen(one) - seen(other)) > 35, (one, other)
-
-
-@pytest.mark.parametrize("hue", HUES)
-def test_brightness_says_how_a_vehicle_does(hue: tuple[int, int, int]) -> None:
-    light = {state: float(np.dot(shaded(hue, state), (0.21, 0.72, 0.07))) for state in VehicleState}
-    state = VehicleState
-    assert light[state.ARRIVED] > light[state.FOLLOWING] > light[state.WAITING] > light[state.STRANDED]
 
 
 def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
@@ -150,12 +140,6 @@ def test_who_points_at_a_vehicle_reads_who_it_is_and_what_it_does() -> None:
         "a0-02: stranded; all",
         "a0-03 to t1: waits for a route; ?",
     ]
-
-
-def test_a_route_without_a_bound_claims_no_gap() -> None:
-    vehicles = columns([VehicleState.FOLLOWING], [0], ["t0"])
-    (said,) = vehicle_details(vehicles, {}, {"a0-00": route(1, 2)}, NS_PER_S)
-    assert "route 1 s old, gap not proven" in said
 
 
 ids = st.sampled_from(["t0", "t1", "t2", "t3"])
@@ -211,14 +195,6 @@ def test_an_alarm_has_the_place_of_its_cell_or_of_its_target() -> None:
 # --- places and lines -----------------------------------------------------------------------------------------
 
 
-def test_targets_stand_on_poles_above_the_ground() -> None:
-    mesh = TerrainMesh(hill(20, 20))
-    tops = mesh.place(np.array([50.0], np.float32), np.array([60.0], np.float32), 30.0)
-    pole = line(poles(mesh, tops))
-    assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
-    assert pole[1, 2] == pytest.approx(pole[0, 2] + 30.0)
-
-
 def believed(cells: list[int], shares: list[float], target: str = "t0") -> Believed:
     return Believed(
         target=target, incarnation=1, stamp_ns=0, side_m=40.0, cells=cells, shares=pack_column(shares, "<f4")
@@ -236,22 +212,6 @@ def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_o
     ground = mesh.place(np.array([55.0, 5.0], np.float32), np.array([25.0, 105.0], np.float32), 0.1 * mesh.scale_m)
     assert np.allclose(positions, ground)
     assert len(searched_points(mesh, [])[0]) == 0
-
-
-def test_nobody_there_is_nothing_to_draw() -> None:
-    mesh = TerrainMesh(hill(20, 20))
-    nowhere = mesh.place(np.empty(0, np.float32), np.empty(0, np.float32))
-    assert nowhere.shape == (0, 3)
-    around = rings(mesh, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-    assert many(poles(mesh, nowhere)) == many(RouteLines(mesh, 3).lines([])) == many(around) == 0
-
-
-def test_a_ring_lies_on_the_ground_around_its_middle() -> None:
-    mesh = TerrainMesh(hill(40, 40))
-    ring = line(rings(mesh, np.array([[200, -200, 0]], np.float32), np.array([50], np.float32)))
-    assert np.hypot(ring[:, 0] - 200, ring[:, 1] + 200) == pytest.approx(np.full(len(ring), 50.0), abs=0.01)
-    assert ring[0] == pytest.approx(ring[-1], abs=0.01)
-    assert ring[:, 2].max() > ring[:, 2].min(), "the ground rises"
 
 
 def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
@@ -294,7 +254,7 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
     mesh = TerrainMesh(hill(1, nodes))
     routes = [route(*on_tree(parents, start)) for start in starts]
     lines = RouteLines(mesh, 1)
-    for _ in range(2):  # what was drawn before leaves nothing behind
+    for _ in range(2):  # earlier drawings leave nothing behind
         strips = lines.lines(routes)
         drawn = []
         for n in range(many(strips)):
@@ -302,13 +262,6 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
             drawn += list(itertools.pairwise(cells))
         assert len(drawn) == len(set(drawn))
         assert set(drawn) == {edge for each in routes for edge in itertools.pairwise(each.cells.tolist())}
-
-
-@pytest.mark.parametrize("length", [2, 3, 4, 7, 8, 1000])
-def test_a_route_is_drawn_with_fewer_points_that_keep_its_ends(length: int) -> None:
-    drawn = line(RouteLines(TerrainMesh(hill(1, 1000)), 3).lines([route(*range(length))]))
-    assert len(drawn) == -(-(length - 1) // 3) + 1
-    assert (drawn[0, 0], drawn[-1, 0]) == (5.0, length * 10 - 5.0)
 
 
 def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() -> None:
@@ -344,11 +297,6 @@ def test_whom_nobody_knows_the_camera_cannot_follow(name: str, hint: str) -> Non
     assert sentence.startswith(f"--follow: no vehicle or target {name!r}")
     assert hint in sentence
     assert sentence.endswith("; there are t0 to t4 and a0-00 to a1-14")
-
-
-def test_the_camera_follows_whom_the_option_names_rather_than_the_scenario() -> None:
-    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[monitor]\nfollow = "t2"\n')
-    assert (with_follow(scenario, None).monitor.follow, with_follow(scenario, "t1").monitor.follow) == ("t2", "t1")
 
 
 # --- how much and how often -----------------------------------------------------------------------------------

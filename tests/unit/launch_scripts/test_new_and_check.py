@@ -207,7 +207,7 @@ def test_more_plots_than_agents_have_use_for_are_a_warning_with_what_to_set() ->
         "map.plot_regions: 4 agents share 256 plots of right of way, and speak of each in which vehicles drive"
         " 10 times a second; set it to 4, for larger ones"
     )
-    assert list(plots(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have nobody to tell
+    assert list(plots(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have no third
     assert list(plots(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
     assert list(plots(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 
@@ -278,18 +278,6 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
     row, col = start
     fine = 0 <= row < 6 and 0 <= col < 4 and np.isfinite(pace[row, col])
     assert bool(found) == (not fine), found
-
-
-def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
-    """docs/scale-figures.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
-    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.450, 745), (1000, 512, 0.677, 889)):
-        scenario = parse_scenario(
-            f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
-            f"[vehicles]\ntick_hz = 5\nper_agent = {min(vehicles // 4, 200)}\n"
-        )
-        found = machine.needs_of(scenario, cells_a_side**2)
-        assert found.cores == pytest.approx(cores, rel=0.15)
-        assert found.memory_bytes / 1e6 == pytest.approx(megabytes, rel=0.35)
 
 
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:

@@ -12,13 +12,13 @@ from support.command import Swarm
         ("zone add --polygon 5", "--polygon is '5'; expected LAT,LON"),
         ("zone add --polygon 5,x", "--polygon is '5,x'; expected LAT,LON"),
         ("zone add --polygon 1,1;2,2", "expected LAT,LON"),
-        ("zone add", "zone add: give --polygon, --polygon-m or --file"),
+        ("zone add", "give --polygon, --polygon-m or --file"),
         ("zone add --polygon-m 1,1|2,2", "is no corner"),
         ("zone add --polygon latlon:91.5,2", "no latitude (-90 to 90)"),
         ("zone add --polygon 1,1 --kind deadly", "--kind: 'deadly' is neither lethal nor pace:X"),
         ("zone add --polygon 1,1 --kind pace:nan", "--kind: 'pace:nan' is neither"),
-        ("zone add --polygon 1,1 --until tomorrow", "--until: 'tomorrow' is no time such as 90s"),
-        ("zone add --polygon 1,1 --until 0s", "--until: '0s' is no time"),
+        ("zone add --polygon 1,1 --for tomorrow", "--for: 'tomorrow' is no time such as 90s"),
+        ("zone add --polygon 1,1 --for 0s", "--for: '0s' is no time"),
         ("zone add --crs local", "--layer and --crs go with --file"),
         ("zone add --file nowhere.geojson", "--file: nowhere.geojson does not exist"),
         ("zone add --file nowhere.geojson --polygon-m 1,1", "give either --file or a polygon"),
@@ -30,15 +30,15 @@ from support.command import Swarm
         ),
         ("target add x/y --at 5,5", "name 'x/y' is not"),
         ("vehicle stop a*", "name 'a*' is not"),
-        ("group red", "group: give either targets or --as-scenario"),
-        ("group red targets t0 --as-scenario", "group: give either targets or --as-scenario"),
-        ("set time_scale", "set: give either a value or --as-scenario"),
+        ("group red", "group: give targets; `swarm order unset groups.red`"),
+        ("unset groups.", "name is missing"),
+        ("set time_scale", "set: give a value; `swarm order unset time_scale`"),
         ("set time_scale nan", "value: found nan, expected a number"),
-        ("set time_scale 5 --as-scenario", "set: give either a value or --as-scenario"),
+        ("set time_scale 5 6", "Got unexpected extra argument"),
     ],
 )
 def test_what_is_no_order_is_refused_with_the_option(words: str, says: str, swarm: Swarm) -> None:
-    code, out, err = swarm(words)
+    code, out, err = swarm("order", *words.split())
     assert (code, out) == (2, "")
     assert says in err
     assert err.count("\n") == 1

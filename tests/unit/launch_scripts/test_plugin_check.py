@@ -1,4 +1,4 @@
-"""The test kit of plug-ins: it passes what is built in and the examples of the pages, and finds what is wrong."""
+"""The test kit of plug-ins: it passes the built-in ones and the examples of the pages, and finds faults."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_the_command_says_what_the_kit_finds(folder: Path) -> None:
     assert "broken: dynamics plug-in 'tried:Plugin' of dynamics: speed returned -1 m/s" in told.stdout
     told = CliRunner().invoke(plugin_commands.app, [*arguments, "--options", '{"v": 3}'])
     assert (told.exit_code, told.stdout) == (0, "tried:Plugin keeps what a dynamics promises\n")
-    listed = CliRunner().invoke(plugin_commands.app, ["list"]).stdout
+    listed = CliRunner().invoke(plugin_commands.app, ["ls"]).stdout
     assert "walk (terrain_swarm.walk)\n  still\n  random\n" in listed
     assert "cost_layer (terrain_swarm.cost_layer)\nassignment" in listed
     assert isinstance(

@@ -1,4 +1,4 @@
-"""What the processes of a run share is loaded before they part, and the command starts that first."""
+"""Modules that the processes of a run share are loaded before the fork, and the command starts that first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What processes take up, from what each says of itself, and the table that shows it."""
+"""Resource use of processes, from the figures of each, and the table that shows it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a launcher starts, in which order, and how long it waits before it starts something again."""
+"""The processes that a launcher starts, their order, and the wait before a restart."""
 
 from __future__ import annotations
 

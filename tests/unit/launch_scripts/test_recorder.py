@@ -1,9 +1,9 @@
-"""What the recorder makes of what it heard."""
+"""The recorder's figures for the messages that it heard."""
 
 from __future__ import annotations
 
-import math
 import pickle
+import re
 
 import msgspec
 import numpy as np
@@ -14,18 +14,16 @@ from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.history import Sample, Thinned, Tracks
+from launch_scripts.observe.history import Tracks
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
-from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
-from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
@@ -131,7 +129,7 @@ def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_n
 
 
 def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
-    """So who heard all lives and who heard only the last have the same sums."""
+    """A recorder of all incarnations has the same sums as a recorder of the last only."""
     first = stats("agent", "a0", 1, 2.0, {"marks": 7})
     second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
     other = stats("agent", "a0", 5, 6.0, {"marks": 100})
@@ -141,22 +139,6 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     assert recorder.report()["marks"] == late.report()["marks"] == 9
     hear(recorder, other)  # one that was started by hand knows of no other life
     assert recorder.report()["marks"] == 109
-
-
-def test_an_older_stats_message_that_comes_late_changes_nothing(recorder: Recorder) -> None:
-    hear(recorder, stats("agent", "a0", 1, 2.0, {"marks": 7}), stats("agent", "a0", 1, 1.0, {"marks": 5}))
-    assert recorder.report()["marks"] == 7
-
-
-def test_histograms_of_all_processes_are_one(recorder: Recorder) -> None:
-    hear(
-        recorder,
-        stats("planner", "t0", growth_ms=[1.0] * 98),
-        stats("planner", "t1", growth_ms=[100.0] * 2),
-    )
-    report = recorder.report()
-    assert report["growth_ms"]["p50"] == pytest.approx(1.0, rel=0.02)
-    assert report["growth_ms"]["p99"] == pytest.approx(100.0, rel=0.02)
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
@@ -243,11 +225,6 @@ def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recor
     assert recorder.report()["marked_cells"] == 1
 
 
-def test_an_authors_older_set_does_not_replace_its_newer_one(recorder: Recorder) -> None:
-    hear(recorder, set_of("a0.1", 0, 2, {}), set_of("a0.1", 0, 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
-    assert recorder.observed.marked().cells.tolist() == []
-
-
 def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> None:
     standing_by = msgspec.structs.replace(scenario(), standbys=StandbyConfig(planner=1))
     recorder = Recorder(standing_by, GRID)
@@ -301,9 +278,9 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     hear(recorder, pose("t0", 100.0, 100.0, 1), at_s=1.0)
     hear(recorder, pose("t1", 100.0, 100.0, 1), at_s=9.0)
     first, second = recorder.summary(10 * NS_PER_S).targets
-    assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost 9 s)", True, 9.0)
+    assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost for 9 s)", True, 9.0)
     assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
-    lost = "target lost: nobody knows where t0 is; routes lead to where it was, row 0, col 0, since 0 s"
+    lost = "target lost: nobody knows where t0 is; routes lead to where it was, row 0, col 0, for 10 s"
     assert lost in plain_line(recorder.summary(10 * NS_PER_S), "small")
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
     hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end
@@ -355,11 +332,6 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
     assert recorder.summary(3 * NS_PER_S).messages_per_s == 25.0
 
 
-def test_the_report_is_json_without_nan_or_infinity(recorder: Recorder) -> None:
-    hear(recorder, status("t0", math.inf))
-    assert recorder.report()["gap"]["max"] is None
-
-
 def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     tracks = Tracks(interval_ns=1, limit=100)
     for now_ns in range(1000):
@@ -372,29 +344,8 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     assert (np.diff(places[:, 0]) > 0).all()
 
 
-def test_the_keys_of_a_track_are_kept_once() -> None:
-    tracks = Tracks(interval_ns=1)
-    for now_ns in range(100):
-        tracks.add(now_ns, [(f"v{n}", 0) for n in range(50)], np.zeros((50, 2), np.float32))
-    assert len({id(keys) for _, keys, _ in tracks._samplings.kept}) == 1
-
-
-def test_samples_thin_out_over_a_long_run_and_keep_its_beginning_and_its_end() -> None:
-    samples = Thinned[Sample](64)
-    for second in range(10_000):
-        samples.add(sample(float(second)))
-    times = [each.time_s for each in samples.all()]
-    assert 32 <= len(times) <= 65
-    assert (times[0], times[-1]) == (0.0, 9999.0)
-    assert len(set(np.diff(times[:-1]))) == 1
-
-
-def sample(time_s: float) -> Sample:
-    return Sample(time_s, (0,) * len(VehicleState), 0, 0, 0, 0, 0, 0, {}, {})
-
-
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recorder) -> None:
-    """What a recorder holds, by its own lists: captures, samples and places are all bounded."""
+    """The size of a recorder by its own lists: captures, samples and places are all bounded."""
 
     def record(from_s: int, until_s: int, step_s: int) -> int:
         for at_s in range(from_s, until_s, step_s):
@@ -429,13 +380,13 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
         hear(recorder, msgspec.structs.replace(stats(role, id, at_s=at_s), alarms=[*late, *hits]), at_s=at_s)
     state = recorder.summary(int(at_s * NS_PER_S))
     assert facts.alarm_lines(state, 9) == [
-        "x: y it is, row 1, col 1, since 3 s",
-        "behind: 6 times, agent-a0, agent-a1, keeper-0 and 3 more, the first since 12 s",
+        "x: y it is, row 1, col 1, for 57 s",
+        "behind: 6 times, agent-a0, agent-a1, keeper-0 and 3 more, the longest for 48 s",
     ]
-    assert facts.alarm_lines(state, 9, over=True)[2] == "collision: a0-00 a0-01 it is, row 1, col 1, at 31 s"
+    assert re.search(r"^collision: .*, row 1, col 1, at \d\d:\d\d:31$", facts.alarm_lines(state, 9, over=True)[2])
     recorder.alive(Peer("planner", "t1", 1), False, int(at_s * NS_PER_S))
     gone = recorder.summary(int((at_s + 1) * NS_PER_S))
-    assert facts.alarm_lines(gone, 9)[0] == "down: planner-t1 is gone, since 60 s"
+    assert facts.alarm_lines(gone, 9)[0] == "down: planner-t1 is gone, for 1 s"
     silent = recorder.summary(int((at_s + 5) * NS_PER_S))
     assert {alarm.about for alarm in silent.alarms if alarm.kind == "silent"} == {
         f"{role}-{id}" for role, id in recorder.observed.plan.crew if id != "t1"
@@ -443,12 +394,6 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
     hear(recorder, ended, at_s=at_s + 1)
     assert not [alarm for alarm in recorder.summary(int((at_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
-
-
-@pytest.mark.parametrize("cell", [-1, -(1 << 31)])
-def test_nobody_tells_of_a_capture_outside_all_maps(cell: int) -> None:
-    with pytest.raises(ProtocolError):
-        decode(encode(capture("t1", cell)), Note)
 
 
 def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(

@@ -1,4 +1,4 @@
-"""The referee: what is a collision or an entry onto lethal ground, whatever reports are lost, late or repeated."""
+"""The referee: collisions and entries onto lethal ground, whatever reports are lost, late or repeated."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_what_ended_long_ago_is_forgotten_and_where_vehicles_stand_is_not() -> N
         referee.on_fleet(a(100 * n, n % 90))
     held = [stay for stays in referee._stays.values() for stay in stays]
     assert {stay.vehicle for stay in held} == {"a", "b"}
-    # 5 s of cells, ten a second, those of the last second, after which nobody has looked yet, and where both stand.
+    # 5 s of cells, ten a second, those of the last second, which are not judged yet, and the two places.
     assert 50 <= len(held) <= 50 + 10 + 2
     reports = [report for n in (200, 201) for report in (a(100 * n, 99), b(100 * n, 99))]
     (collision,) = [broken for report in reports for broken in referee.on_fleet(report)]

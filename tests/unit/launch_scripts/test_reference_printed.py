@@ -1,4 +1,4 @@
-"""What docs/method.md says of the paper's printed rules holds of them."""
+"""The statements of docs/method/paper.md about the paper's printed rules hold."""
 
 from __future__ import annotations
 
@@ -53,4 +53,4 @@ def test_strides_jump_over_a_wall_thinner_than_a_stride():
 def test_a_picture_is_there_small_and_shown_on_a_page(name):
     images = method_pictures.IMAGES
     assert (images / f"{name}.png").stat().st_size < 160_000
-    assert any(f"images/{name}.png" in page.read_text(encoding="utf-8") for page in images.parent.glob("*.md"))
+    assert any(f"images/{name}.png" in page.read_text(encoding="utf-8") for page in images.parent.rglob("*.md"))

@@ -1,4 +1,4 @@
-"""The file of revoked names: what is in force after it changed, is broken or is gone."""
+"""The file of revoked names: the list in force after it changed, is broken or was deleted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ROS is told of a swarm: on topics that are declared, at most at their rates, and the map whole."""
+"""The topics of ROS: they are declared, keep to their rates, and the map is whole."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = No
 
 
 def puts(actions: list[Any], row: str) -> list[Any]:
-    """What was put of a row, as a hearer reads it."""
+    """Messages of a row, as a subscriber reads them."""
     found = [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
     return [TYPES.unpack(each, ROWS[row].type_name) if isinstance(each, bytes) else each for each in found]
 
@@ -206,16 +206,6 @@ def test_frames_lead_from_the_map_to_the_vehicle() -> None:
     assert static.transforms[0].transform.translation.x == 0.0
 
 
-def test_bare_frames_have_a_tree_for_each_vehicle() -> None:
-    actions = told(gateway("frames.bare = true"), World({"a-1": vehicle("a-1")}), 0.0)
-    channels = {each.channel.topic for each in actions if isinstance(each, Put)}
-    assert {"/a_1/tf", "/a_1/tf_static"} <= channels
-    assert not {"/tf", "/tf_static"} & channels
-    (odometry,), (moved,) = puts(actions, "odom"), puts(actions, "tf")
-    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
-    assert moved.transforms[0].child_frame_id == "base_link"
-
-
 def test_velocity_is_the_difference_of_places_along_the_heading() -> None:
     core = gateway()
     for step in range(8):
@@ -228,14 +218,6 @@ def test_velocity_is_the_difference_of_places_along_the_heading() -> None:
         actions = told(core, World({"a": vehicle("a", east_m, 5_199_900.0, math.pi / 2 + 0.07)}), 0.1 * step)
     (odometry,) = puts(actions, "odom")
     assert odometry.twist.twist.linear.x == 0.0, "it stands"
-
-
-def test_a_heading_that_is_not_told_is_the_last() -> None:
-    core = gateway()
-    (before,) = puts(told(core, World({"a": vehicle("a", 300_100.0, heading_rad=1.0)}), 0.0), "odom")
-    (after,) = puts(told(core, World({"a": vehicle("a", 300_101.0, heading_rad=None)}), 0.1), "odom")
-    assert after.pose.pose.position.x == 101.0
-    assert after.pose.pose.orientation == before.pose.pose.orientation
 
 
 def test_robots_of_ros_and_more_vehicles_than_there_may_be_are_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,21 +255,6 @@ def test_targets_that_nobody_tracks_are_not_told() -> None:
     assert "nobody tracks t1" in [each.message for each in diagnostics.status]
 
 
-def test_what_is_not_listed_is_not_forwarded() -> None:
-    core = gateway('forward = ["poses"]\n[topics.poses]\ntopic = "/fleet"\nhz = 1')
-    actions = told(core, World({"a": vehicle("a")}), 0.0)
-    assert {each.channel.topic for each in actions if isinstance(each, Put)} == {"/fleet"}
-    assert [each.channels for each in actions if isinstance(each, Declare)] == [(Channel("poses", "/fleet"),), ()]
-
-
-def test_without_coordinates_there_are_no_fixes() -> None:
-    actions = told(gateway(fixes=False), World({"a": vehicle("a")}), 0.0)
-    assert not puts(actions, "fix")
-    assert all(
-        "fix" not in channel.topic for each in actions if isinstance(each, Declare) for channel in each.channels
-    )
-
-
 # --- the map ------------------------------------------------------------------------------------------------------
 
 STATED = st.tuples(
@@ -322,14 +289,6 @@ def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool)
                 heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
         assert heard is not None
         assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
-
-
-def test_a_large_map_that_has_changed_is_put_again_later_than_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.gateways.ros2.map_feed._CELLS_AT_ONCE", GRID.cells // 2)
-    core, marks = gateway(), OwnMarks("all.a.1", "all", GRID)
-    assert puts(told(core, World(), 0.0), "map")
-    told(core, World(sets=marks.state([5], MarkKind.LETHAL, 0.0, BEGAN_NS)), 1.0)
-    assert [second for second in range(2, 41) if puts(told(core, World(), second), "map")] == [20]
 
 
 def test_without_the_terrain_the_map_holds_marks_alone() -> None:
@@ -499,8 +458,3 @@ def test_options_change_what_they_name_and_nothing_else(text: str, tmp_path: Pat
     before, after = parse_settings(text), load_settings(file, said)
     assert after == replace(before, ros=replace(before.ros, domain=3))
     assert load_settings(file, dict.fromkeys(said)) == before
-
-
-def test_a_mistake_in_the_options_is_one_sentence_that_names_them() -> None:
-    with pytest.raises(ConfigError, match=r"settings with options: ros\.domain: found 400"):
-        load_settings(None, {"ros.domain": 400})

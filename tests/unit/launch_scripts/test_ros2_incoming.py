@@ -1,4 +1,4 @@
-"""What comes in from ROS is hostile until it is read: no message raises, and what goes on is always valid."""
+"""Messages from ROS are hostile until they are read: none raises, and the results are always valid."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ messages = st.builds(
 
 
 def tried(read: Callable[..., Any], *given: Any) -> Any:
-    """What is read, or the sentence that says why it is not."""
+    """The result, or the sentence that refuses it."""
     try:
         return read(*given)
     except ConfigError as error:
@@ -296,7 +296,7 @@ def test_any_polygon_is_corners_on_the_terrain_or_a_sentence(points: Any, frame:
 
 
 def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
-    """Of real types, as they come from the wire: messages of which any bytes are others."""
+    """Messages of real types, as they come from the wire, with any bytes changed."""
     chance, read = random.Random(1), 0
     messages = RosMessages(TYPES, MAP)
     good = messages.odometry(0, ("map", "uav"), (*GRID.centre_m(40), 1.0), 2.0, 0.0)

@@ -45,7 +45,7 @@ def maker(grid: GridSpec = GRID, distribution: Distribution = Distribution.JAZZY
 
 
 def as_sent(messages: RosMessages, message: Any) -> Any:
-    """What a peer reads of it."""
+    """The message as a peer reads it."""
     name = str(message.__msgtype__)
     return messages.types.unpack(messages.types.pack(message, name), name)
 
@@ -128,7 +128,7 @@ def test_the_cell_under_a_point_of_ros_is_the_cell_under_ours(grid: GridSpec, da
     cell = data.draw(st.integers(0, grid.cells - 1))
     x_m, y_m = messages.map.to_ros(*grid.centre_m(cell))
     assert grid.cell_at(*messages.map.to_terrain(x_m, y_m)) == cell
-    # As Nav2's costmap_2d finds it: worldToMap.
+    # The rule of Nav2's costmap_2d: worldToMap.
     col = int((x_m - sent.info.origin.position.x) / sent.info.resolution)
     row = int((y_m - sent.info.origin.position.y) / sent.info.resolution)
     assert sent.data[row * sent.info.width + col] == cell % 97
@@ -151,7 +151,7 @@ def test_an_update_changes_the_cells_of_its_window_and_no_others(grid: GridSpec,
     part = changed[window.row0 : window.row1, window.col0 : window.col1]
     update = as_sent(messages, map_messages.occupancy_update(messages, STAMP_NS, part, window))
     shown = np.array(map_messages.occupancy_grid(messages, STAMP_NS, whole).data).reshape(grid.rows, grid.cols)
-    # As RViz pastes it.
+    # The rule of RViz for an update.
     pasted = shown[update.y : update.y + update.height, update.x : update.x + update.width]
     pasted[:] = update.data.reshape(update.height, update.width)
     assert (shown.reshape(-1) == map_messages.occupancy_grid(messages, STAMP_NS, changed).data).all()

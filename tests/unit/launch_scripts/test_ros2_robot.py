@@ -28,7 +28,7 @@ TYPES = types_of(Distribution.JAZZY)
 
 
 class NoQueue(WorkQueue):
-    """Answers no question: a test looks at what is followed."""
+    """Answers no question: a test checks the target that is followed."""
 
     def __init__(self) -> None:
         super().__init__("none", 1, 0)
@@ -161,7 +161,7 @@ class DoneAtOnce(WorkQueue):
 
 
 class Calls(list[tuple[str, Any]]):
-    """Whatever is called of it, with its first argument and whether it clears."""
+    """Records each call, with its first argument and its `clear` flag."""
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *given, **named: self.append((name, given[0] if given else None))

@@ -1,4 +1,4 @@
-"""What the gateway puts on the wire is what ROS 2 peers expect: keys, tokens, attachments, hashes, CDR."""
+"""The gateway's wire format as ROS 2 peers expect it: keys, tokens, attachments, hashes, CDR."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from launch_scripts.gateways.ros2.ros_node import Newest
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.errors import ProtocolError
 
-# As ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.
+# The hashes as ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.
 PUBLISHED = {
     "geometry_msgs/msg/PoseStamped": "10f3786d",
     "geometry_msgs/msg/PoseArray": "af0cc36d",

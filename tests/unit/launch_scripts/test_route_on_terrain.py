@@ -89,7 +89,7 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path, tmp_path: Path) -> Non
         find_route(str(hill), "cell:10,35", "cell:10,75")
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
-        (["--row", "1"], "give --target, --row and --col"),
+        (["--row", "1"], "give --target and --from"),
         (
             ["--terrain", str(hill), "--from", "cell:1,1", "--to", "cell:2,2", "--out", str(tmp_path / "a.doc")],
             "write .geojson",
@@ -108,7 +108,7 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
     assert "from 8" in said or "from 9" in said
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
-        assert (file.crs.to_string(), file.nodata, file.shape) == (SYSTEM, -1.0, (60, 80))
+        assert (file.crs.to_string(), file.nodata, file.shape, file.units) == (SYSTEM, -1.0, (60, 80), ("s",))
     assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0

@@ -44,7 +44,7 @@ def scenario() -> Scenario:
 
 
 def driven(rovers: Rovers, seconds: float, time_scale: float = 2.0) -> list[dict[str, Body]]:
-    """What was told last of each rover, tick by tick."""
+    """The last pose of each rover, tick by tick."""
     told: dict[str, Body] = {}
     ticks = []
     for tick in range(int(seconds * 10)):

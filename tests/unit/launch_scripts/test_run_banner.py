@@ -1,5 +1,5 @@
-"""What the live page says of a run that it does not keep up with, or that is over: our script in a real browser,
-beside a viewer whose answers are made here."""
+"""The banner of the live page for a run that it lags behind, or that is over: our script in a real browser, beside
+a viewer whose answers are made here."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def varint(value: int) -> bytes:
 
 
 def viewer_state(taken_s: float) -> list[int]:
-    """As rerun 0.41 answers: a recording, its timelines, each with its name and its first and last time."""
+    """The answer of rerun 0.41: a recording, its timelines, each with its name and its first and last time."""
 
     def timeline(name: str, last: int) -> bytes:
         return field(2, field(1, field(1, name.encode())) + field(2, 2) + field(3, field(1, 0) + field(2, last)))
@@ -67,7 +67,7 @@ def value(browser: Browser, expression: str) -> object:
 
 
 def banner(browser: Browser, run: dict[str, object] | None, taken_s: float | None, looks: int = 1) -> object:
-    """What is written there after some looks."""
+    """The text of the banner after some checks."""
     state = "null" if taken_s is None else f"{{viewer_state: () => new Uint8Array({viewer_state(taken_s)})}}"
     value(browser, f"window._handle = {state}; window.run = {json.dumps(run)};")
     for _ in range(looks):

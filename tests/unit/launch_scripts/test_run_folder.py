@@ -1,4 +1,4 @@
-"""What a run leaves behind: the scenario as run, results that add up, and which run was last."""
+"""The folder of a run: the scenario as run, results that add up, and the link to the last run."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Reader(html.parser.HTMLParser):
-    """What a browser would make of a page: its elements, what they would load, its text."""
+    """A browser's view of a page: its elements, their sources, its text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -113,11 +113,11 @@ def test_the_page_is_written_again_from_the_folder_alone(run: Path, tmp_path: Pa
     shutil.copytree(run, copy)
     before = (copy / "report.html").read_text()
     (copy / "report.html").unlink()
-    assert swarm("report r1 --runs", tmp_path)[0] == 0
+    assert swarm("runs report r1 --runs", tmp_path)[0] == 0
     assert (copy / "report.html").read_text() == before.replace(f"up {run.parent.name}/", f"up {tmp_path.name}/")
     for content, sentence in ((b"{}", "is damaged"), (b'{"series": 3, "by_vehicle": 7}', "is damaged")):
         (copy / "report.json").write_bytes(content)
-        code, _, told = swarm("report r1 --runs", tmp_path)
+        code, _, told = swarm("runs report r1 --runs", tmp_path)
         assert (code > 0, told.count("\n"), sentence in told) == (True, 1, True)
 
 
@@ -127,11 +127,11 @@ def test_a_comparison_says_first_what_makes_runs_unlike(run: Path, tmp_path: Pat
         report = json.loads((run / "report.json").read_text()) | changes
         (tmp_path / name / "report.json").write_text(json.dumps(report))
         shutil.copy(run / "scenario.toml", tmp_path / name)
-    code, told, _ = swarm("compare r1 r2 r3 --runs", tmp_path)
+    code, told, _ = swarm("runs compare r1 r2 r3 --runs", tmp_path)
     assert code == 0
     assert "The terrains differ" in told
     assert "The seeds differ (3, 9, 3)" in told
     (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
-    code, told, _ = swarm("compare r1 r2 --runs", tmp_path)
+    code, told, _ = swarm("runs compare r1 r2 --runs", tmp_path)
     assert (code, "\x1b" in told) == (0, False)
-    assert json.loads(swarm("compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []
+    assert json.loads(swarm("runs compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []

@@ -19,7 +19,7 @@ INFO = keeper_info(GridSpec(4, 5, 90.0))
 
 
 def told_by(**wire_versions: int) -> Status:
-    """What is told once agents with these wire versions have answered."""
+    """The status once agents with these wire versions have answered."""
     observer = OutsideObserver(SwarmModel().bus("status"), lambda _: None)
     for id, wire in wire_versions.items():
         info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire)

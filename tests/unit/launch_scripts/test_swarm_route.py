@@ -1,4 +1,4 @@
-"""`swarm route --target`: what is printed and written of a planner's answer."""
+"""`swarm route --target`: print and files of a planner's answer."""
 
 from __future__ import annotations
 

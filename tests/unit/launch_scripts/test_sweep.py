@@ -1,4 +1,5 @@
-"""`swarm sweep` without a cluster: what a study means, what a trial does, what is kept and told."""
+"""`swarm study run` without a cluster: the meaning of a study, the work of a trial, the kept results and the
+messages."""
 
 from __future__ import annotations
 
@@ -17,11 +18,9 @@ from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
 from launch_scripts.simulation.laws import BrokenLaw
-from launch_scripts.simulation.many_seeds import try_seed
 from launch_scripts.simulation.simulate import Simulation, simulate
 from launch_scripts.simulation.study import summary as statistics
 from launch_scripts.simulation.study.study import (
-    Study,
     combinations,
     load_study,
     parse_study,
@@ -96,12 +95,6 @@ def test_a_study_that_cannot_be_is_refused_with_the_key_and_what_was_expected(te
         parse_study(text, "s.toml")
     assert str(error.value).startswith("s.toml: ")
     assert said in str(error.value)
-
-
-def test_a_study_in_a_file_with_spaces_in_its_name_has_a_name(tmp_path):
-    path = tmp_path / ".my study.toml"
-    path.write_text(STUDY, encoding="utf-8")
-    assert load_study(path).name == "my-study"
 
 
 @pytest.mark.parametrize(
@@ -201,15 +194,6 @@ def test_a_trial_is_the_simulation_of_its_seed_and_every_number_of_its_report(tm
     )
 
 
-def test_a_trial_with_faults_is_that_of_swarm_simulate_seeds():
-    [trial] = plan(Study(scenarios=("small",), seeds="3:4", seconds=6.0, faults=True), Path(), "x")[0].trials
-    result = run_trial(trial)
-    verdict, _ = try_seed("small", 3, 6.0)
-    assert result.broken == verdict.broken
-    assert result.figures["longest_wait_s"] == verdict.longest_wait_s
-    assert result.figures["faults.crashes"] == verdict.faults["crashes"]
-
-
 def test_a_service_that_raises_is_a_broken_law_and_other_code_is_refused(tmp_path, monkeypatch):
     [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
 
@@ -300,20 +284,6 @@ def test_the_folder_of_a_study_holds_its_results_its_summary_and_its_pictures(tm
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["trials"] == 6
 
 
-def test_names_are_shown_as_they_are_whatever_they_mean_elsewhere(tmp_path, capsys):
-    name = "[/red] :warning: $\\foo{$"
-    text = STUDY.replace('"captures"', f"'{name}'")
-    path = write_study(tmp_path, f"{text}[variants.'{name}']\n")
-    out = tmp_path / "out [/b]"
-    sweep = Sweep(path, out)
-    for trial in sweep.missing:
-        sweep.store.add(Result(key=trial.key, figures={name: 1.0}, broken=[], wall_s=1.0, cpu_s=1.0))
-    assert sweep_study(str(path), None, 1, out, as_json=False)
-    said = capsys.readouterr()
-    assert name in said.out
-    assert "out [/b]" in said.err.replace("\n", "")
-
-
 def test_a_trial_that_broke_a_law_is_told_with_the_command_that_runs_it_again(tmp_path):
     out = tmp_path / "out"
     path = write_study(tmp_path)
@@ -378,20 +348,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert min(found.values()) >= 88
 
 
-def test_intervals_of_many_values_are_students_and_of_few_there_are_none():
-    many = np.random.default_rng(2).normal(5.0, 2.0, 4000)
-    found = statistics.mean(many)
-    assert found.high - found.low == pytest.approx(2 * 1.96 * 2.0 / np.sqrt(4000), rel=0.05)
-    assert statistics.mean([1.0, 2.0]).low is None
-    assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0]).low is None
-    assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).low == 1.0
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """As where it comes while a future is cleared away: Python tells of the exception there, and goes on."""
+    """The exception comes while a future is cleared away: Python reports it there, and goes on."""
     told_of: list[int] = []
 
     def run(sweep: Sweep, workers: int, scheduler: str | None, told: Callable[[Trial, None], None]) -> None:

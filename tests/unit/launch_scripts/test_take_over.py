@@ -70,7 +70,7 @@ class Machine:
             what(Health(Board(running.health)))
 
     def turn(self) -> None:
-        """What the launcher does in each turn: look, then start what may begin."""
+        """The work of the launcher in each turn: check, then start the processes that may begin."""
         self.over.advance(self.now_s)
         for index, each in enumerate(self.running):
             if each.process is None and (each.begins_when is None or each.begins_when()):

@@ -349,7 +349,7 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
     counts = ear.of(Stats)[0].counts  # declared before anything happens
     assert [counts[name] for name in ("captures", "collisions", "lethal_entries", "poses")] == [0, 0, 0, 0]
     world.run(2)
-    assert 2 <= len(ear.of(TargetPose)) <= 3  # one that stays is told twice a second
+    assert 2 <= len(ear.of(TargetPose)) <= 3  # a target at rest is reported twice a second
     cell = 20 * 50 + 25
     for n in range(4):
         for author, ids in (("a0.1", ["v", "x"]), ("a1.1", ["w"])):

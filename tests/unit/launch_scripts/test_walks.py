@@ -1,4 +1,4 @@
-"""How simulated targets walk: every step is legal, ways are the cheapest, evaders get away."""
+"""The walks of simulated targets: every step is legal, ways are the cheapest, evaders get away."""
 
 from __future__ import annotations
 

@@ -4,11 +4,13 @@ records nothing hears its own processes."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from support.bus_world import pose
 from support.makers import planner_status, stats
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
@@ -16,14 +18,17 @@ from support.target_reports import fleet
 from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
+from swarm.bus.bus import Disappeared
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.liveness import Peer, split_rank
+from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.orders import Order, Orders
 from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, STATS, STATUS
+from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, POSE, STATS, STATUS
 
 
 def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
@@ -87,10 +92,12 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
     watcher, _ = begun(swarm)
     bus = swarm.bus("monitor")
     for role, port in (("agent", 8080), ("monitor", 0), ("monitor", 9090)):
-        bus.publish(STATS, stats(role, "0", web_port=port), role=role, id="0")
+        bus.publish(STATS, stats(role, "0", web_port=port, gauges={VIEWERS: port}), role=role, id="0")
         swarm.run(3)
         watcher.listen(0.0)
-        assert watcher.web_port == (port if role == "monitor" else 0)
+        assert watcher.web_port == watcher.viewers == (port if role == "monitor" else 0)
+    watcher.take(Disappeared(Peer("monitor", "0", 1)), 0)
+    assert not watcher.viewers, "a demo goes on for viewers that are there"
 
 
 # --- a launcher that records nothing -----------------------------------------------------------------------------
@@ -108,9 +115,10 @@ def figures(spec: ProcessSpec, stamp_ns: int = 1, alarms: tuple[Alarm, ...] = ()
 class Part:
     """A launcher that looks after some processes, and a swarm whose processes all speak."""
 
-    def __init__(self, *own: ProcessSpec) -> None:
+    def __init__(self, *own: ProcessSpec, records: bool = False) -> None:
         self.swarm = SwarmModel()
-        self.known = OwnPart(self.swarm.terrain.grid, 0)
+        grid = self.swarm.terrain.grid
+        self.known: Any = Recorder(SCENARIO, grid, 0) if records else OwnPart(grid, 0)
         self.watcher = Watcher(self.swarm.bus("launcher"), self.known, self.swarm.scheduler.clock)
         self.watcher.begin()
         self.watcher.look_after(own)
@@ -129,12 +137,13 @@ class Part:
                 bus.publish(FLEET, report, region=0, author=report.author)
                 bus.publish(FOLLOWED, followed(), agent="a0", vehicle="a0-00")
             elif spec.role == "planner" and not split_rank(spec.id)[1]:
-                bus.publish(STATUS, planner_status(spec.id), target=spec.id)
+                bus.publish(STATUS, planner_status(spec.id, tracker_lost=self.said == 1), target=spec.id)
+                bus.publish(POSE, pose(spec.id, self.said), target=spec.id)
         self.swarm.run(0.2)
         self.watcher.listen(0.0)
 
     def deliveries(self) -> list[str]:
-        """Topics of what has arrived at the launcher."""
+        """Topics of the samples that have arrived at the launcher."""
         return [topic for _, _, to, topic, payload in self.swarm.deliveries if to == "launcher" and payload]
 
 
@@ -161,6 +170,22 @@ def test_whatever_processes_it_has_it_hears_those_and_no_others_also_after_they_
     assert part.watcher.routes_served
 
 
+@pytest.mark.parametrize("records", [True, False])
+def test_an_alarm_is_opened_only_by_a_launcher_that_hears_what_closes_it(records: bool) -> None:
+    part = Part(*PROCESSES, records=records)
+    for _ in range(2):
+        part.speak()  # that a target is lost, at first, and routes
+    part.swarm.deliveries.clear()
+    part.speak()
+    latest = part.known.observed
+    for kind in KINDS:
+        evidence = EVIDENCE.get(kind, (STATS,))
+        if set(evidence) <= set(latest.hears):
+            assert {topic.name for topic in evidence} <= set(part.deliveries()), kind
+    alarms = alarms_of(latest, ("t0", "t1", "t2"), part.swarm.now_ns)
+    assert not [alarm for alarm in alarms if alarm.kind == "target-lost"]
+
+
 def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_anywhere() -> None:
     part = Part(planner_spec("t0"))
     keeper = part.swarm.bus("keeper")
@@ -176,6 +201,9 @@ def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machin
     known = OwnPart(SwarmModel().terrain.grid, 0)
     known.look_after(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
     now_ns = 100 * NS_PER_S
+    known.started(Peer(mine.role, mine.id, 7))
+    known.alive(Peer(mine.role, mine.id, 6), True, now_ns)  # another run's
+    assert known.own_up() == []
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), True, now_ns)
         known.heard(figures(spec, now_ns), now_ns)

@@ -30,8 +30,8 @@ def stepped(
 
 ALLOWED: dict[str, Change] = {
     "nothing": lambda now: None,
-    "a field is added": lambda now: fields(now).append("colour | id | `None`"),
-    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append("colour | id | `None`"),
+    "a field is added": lambda now: fields(now).append("colour | id | None"),
+    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append("colour | id | None"),
     "a message and its key are added": lambda now: (
         now["messages"].update(new=copy.deepcopy(now["messages"]["fleet"])),
         now["keys"].update(new=copy.deepcopy(now["keys"]["fleet"])),
@@ -47,15 +47,15 @@ ALLOWED: dict[str, Change] = {
 REFUSED: dict[str, tuple[Change, str]] = {
     "a field goes": (lambda now: fields(now).pop(), "Fleet.vehicle_class was .* and is gone: fleet needs a step"),
     "bounds change": (
-        lambda now: fields(now).__setitem__(3, "seq | int 0 ... 7 | refused"),
-        r"Fleet.seq was seq \| int 0 ... 2\^62 - 1 \| refused and is seq \| int 0 ... 7 \| refused: fleet needs",
+        lambda now: fields(now).__setitem__(3, "seq | int(0..7) | required"),
+        r"Fleet.seq was seq \| int\(0..2\^62-1\) \| required and is seq \| int\(0..7\) \| required: fleet needs",
     ),
     "a default changes": (
-        lambda now: fields(now).__setitem__(-1, "vehicle_class | id | `'air'`"), "Fleet.vehicle_class was",
+        lambda now: fields(now).__setitem__(-1, "vehicle_class | id | 'air'"), "Fleet.vehicle_class was",
     ),
-    "a field is put in between": (lambda now: fields(now).insert(1, "x | id | `None`"), "Fleet.group was"),
+    "a field is put in between": (lambda now: fields(now).insert(1, "x | id | None"), "Fleet.group was"),
     "an added field has no default": (
-        lambda now: fields(now).append("colour | id | refused"), "Fleet.colour is added without a default",
+        lambda now: fields(now).append("colour | id | required"), "Fleet.colour is added without a default",
     ),
     "a key changes": (
         lambda now: now["keys"].update(fleet="fleets/{author}"), "topic fleet has changed: the wire version",

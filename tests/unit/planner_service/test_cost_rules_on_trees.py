@@ -50,7 +50,7 @@ def test_trees_and_certificates_hold_under_every_rule(rule: str) -> None:
     served = 0
     for version, root in enumerate(int(each) for each in rng.choice(free, 2, replace=False)):
         dirty = []
-        if version:  # marks: dearer, cheaper, and the target has moved
+        if version:  # marks: more expensive, cheaper, and the target has moved
             row, col = GRID.row_col(int(rng.choice(free)))
             part = pace[row : row + 4, col : col + 4]
             part[np.isfinite(part)] *= np.float32(rng.choice([0.3, 4.0]))

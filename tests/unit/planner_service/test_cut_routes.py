@@ -1,4 +1,4 @@
-"""What a route costs does not depend on how much of it is given."""
+"""The cost of a route does not depend on the length of the part that is given."""
 
 from __future__ import annotations
 

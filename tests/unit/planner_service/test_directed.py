@@ -155,7 +155,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     agent = Agent(plan, scenario, local_map, TruthSensor(grid, level, 20.0), holdings)
 
     def grant(seq: int, cells: list[int]) -> None:
-        """As the warden of the only plot, which has nobody else to consider."""
+        """Acts as the warden of the only plot, which has no other host to consider."""
         warden, grants = plots.warden(0, 1), {"a0-00": cells}
         granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
         agent.place(holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))

@@ -1,4 +1,4 @@
-"""Followers: whoever asks, from wherever, the planner keeps a bounded number of them, each on the grid."""
+"""Followers: the planner keeps a bounded number of them, each on the grid, whatever is asked from anywhere."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def random_windows(chance: random.Random) -> list[Window]:
 
 
 def crossed(route: Route, changed: list[Window]) -> bool:
-    """Whether a route passes windows or next to them, cell by cell."""
+    """True if a route passes windows or next to them, cell by cell."""
     if route.status is not RouteStatus.OK:
         return False
     on_route = [divmod(cell, GRID.cols) for cell in walk(GRID, route.start, route.directions)]
@@ -87,7 +87,7 @@ def crossed(route: Route, changed: list[Window]) -> bool:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_whom_a_change_concerns_is_what_looking_at_every_cell_of_every_route_finds(seed: int) -> None:
-    """Whoever comes, goes and is given another route meanwhile."""
+    """Followers come, go and are given other routes meanwhile."""
     chance = random.Random(f"followers/{seed}")
     followers = Followers("t", GRID, 10**9, 0)
     has: dict[str, tuple[Route, int]] = {}
@@ -148,7 +148,7 @@ def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None
 
 
 def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
-    """Of a route cut after 8 steps to the east, which goes on beyond them."""
+    """A route cut after 8 steps to the east, which goes on beyond them."""
     followers, start = Followers("t", GRID, 10, 0), GRID.cell(5, 5)
     cut = Route(status=RouteStatus.OK, start=start, directions=bytes([2] * 8), cost_s=9.0, remaining_s=5.0)
     followers.given("v", cut, 8, 0, 0)

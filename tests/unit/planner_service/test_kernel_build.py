@@ -148,7 +148,7 @@ def test_what_a_killed_builder_had_claimed_is_compiled_by_another(tmp_path: Path
 
 
 class Disk:
-    """Stands for what is compiled: names that can be loaded."""
+    """Stands for the compiled code: names that can be loaded."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.there: set[str] = set()
@@ -224,7 +224,7 @@ def test_a_builder_by_hand_builds_what_is_named_or_all(
     monkeypatch.setattr(sys, "argv", ["kernel_build", *options])
     kernel_build.main()
     assert [*map(name_of, built)] == [*map(name_of, wanted)]
-    monkeypatch.setattr(kernel_build, "can_build", lambda: False)  # nobody would find what is built
+    monkeypatch.setattr(kernel_build, "can_build", lambda: False)  # no process would find the results
     kernel_build.main()
     assert len(built) == len(wanted)
     monkeypatch.setattr(sys, "argv", ["kernel_build", "nothing"])

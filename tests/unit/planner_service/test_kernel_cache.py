@@ -174,7 +174,7 @@ def test_what_a_folder_that_can_only_be_read_lacks_is_compiled(folder: Path, rea
 
 
 def test_code_for_any_processor_is_called_whatever_the_processor(folder: Path) -> None:
-    """What is compiled for "generic" is found by every process that asks for that, and by no other."""
+    """Code that is compiled for "generic" is found by every process that asks for that, and by no other."""
     assert call(folder, NUMBA_CPU_NAME="generic") == (21, 0, 1)
     assert call(folder, NUMBA_CPU_NAME="generic") == (21, 1, 0)
     assert call(folder) == (21, 0, 1)

@@ -45,32 +45,6 @@ def test_a_tick_without_news_costs_nothing(ready: World) -> None:
     assert ready.tree.calls == []
 
 
-@settings(deadline=None)
-@given(st.permutations([(1, 1), (1, 2), (1, 9), (2, 1), (2, 2)]))
-def test_the_newest_pose_wins_in_whatever_order_poses_arrive(order: list[tuple[int, int]]) -> None:
-    world = World()
-    for incarnation, seq in order:
-        world.pose(incarnation, seq, seq, incarnation)
-    world.tick()
-    assert world.tree.target_cell == GRID.cell(2, 2)
-
-
-def test_a_tracker_whose_clock_was_put_back_is_followed_after_the_lease(ready: World) -> None:
-    ready.pose(10, 20, seq=500, incarnation=10**18)
-    for seq in range(1, 30):
-        ready.pose(12, seq, seq=seq, incarnation=10**18 - 3600 * NS_PER_S)
-        ready.tick()
-    assert ready.tree.target_cell == GRID.cell(12, 29)
-
-
-def test_no_single_pose_misleads_a_planner_for_longer_than_the_lease(ready: World) -> None:
-    ready.pose(1, 1, seq=(1 << 62) - 1, incarnation=(1 << 62) - 1)
-    for seq in range(2, 26):  # at ten a second, longer than the silence that ends a lie
-        ready.pose(10, 20, seq=seq)
-        ready.tick()
-    assert ready.tree.target_cell == GRID.cell(10, 20)
-
-
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
     world.watch.on_pose(pose(5, target="t1"), world.now_ns)
     assert world.tick() == []
@@ -234,6 +208,14 @@ def test_gaps_are_measured_at_full_growths_and_told(ready: World) -> None:
     assert status.gap_max == pytest.approx(1.1)
     assert ready.counters.histograms["gap"].count == 3
     assert ready.counters.histograms["gap_excess"].quantile(1.0) == pytest.approx(0.1, rel=0.03)
+
+
+def test_growths_of_its_own_thread_are_measured_once_in_a_period(ready: World) -> None:
+    ready.ask(GRID.cell(10, 5), vehicles=["v"])
+    for seq in range(2, 12):  # a second of ticks
+        ready.pose(10, 18 + seq, seq)
+        ready.tick()
+    assert ready.counters.histograms["gap"].count == 1
 
 
 def test_every_served_route_carries_its_proven_gap_into_the_books(ready: World) -> None:

@@ -1,4 +1,4 @@
-"""What the planners of a machine share: the same as each would compute, and never another map's."""
+"""Data that the planners of a machine share: the same as each would compute, and never another map's."""
 
 from __future__ import annotations
 

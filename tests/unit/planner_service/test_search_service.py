@@ -38,7 +38,7 @@ cost = { max_slope_deg = 15.0, vehicle_radius_m = 12.0 }
 
 
 class World(SwarmModel):
-    """The planner of a target that nobody has seen, and somebody who asks."""
+    """The planner of an unseen target, and a client that asks."""
 
     def __init__(self) -> None:
         scenario = parse_scenario(_TEXT)
@@ -60,7 +60,7 @@ class World(SwarmModel):
         )
 
     def route(self, vehicle: str, cell: int, vehicle_class: str = "ground") -> Route:
-        """What a vehicle is answered."""
+        """The answer for a vehicle."""
         self.ear.ended.clear()
         self.ear.replies.clear()
         request = RouteRequest(cells=[cell], vehicles=[vehicle], vehicle_class=vehicle_class)

@@ -39,8 +39,7 @@ GRID = GridSpec(96, 96, 1.0)
 
 
 def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[str]:
-    """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if strides were asked
-    for."""
+    """The growth at each move of one cell to the east; "!" if a full growth, "~" if strides were asked for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
     tree = TargetTree(GRID, config, chosen_by=row)
     tree.update(pace, GRID.cell(48, 20), [], 0)
@@ -90,7 +89,7 @@ def every_row() -> list[StrategyRow]:
 
 
 ASKED_TIMES = 7
-"""How often a strategy is asked in one history."""
+"""Number of calls of a strategy in one history."""
 
 
 class AnyRow:
@@ -129,7 +128,7 @@ def test_whatever_rows_a_strategy_chooses_routes_keep_the_laws(seed: int) -> Non
 
 
 def plugged(answer: Any) -> tuple[Any, list[str]]:
-    """A strategy whose plug-in answers with this, and what is told of it."""
+    """A strategy whose plug-in gives this answer, its messages."""
 
     class Answers:
         def row(self, growths: Growths) -> Any:
@@ -203,7 +202,7 @@ def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
 
 
 def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarray, GridSpec]:
-    """A tree in pieces of a map which only a worker may grow anew, and the paces that it was told."""
+    """A tree in pieces of a map which only a worker may grow again, and the paces that it was given."""
     grid = GridSpec(512, 512, 1.0)
     stopwatch = (lambda: 0) if clock is None else clock.__next__
     tree = TargetTree(grid, PlannerConfig(cpu_budget=0.1), has_worker=True, stopwatch=stopwatch)

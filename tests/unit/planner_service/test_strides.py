@@ -1,4 +1,4 @@
-"""WindowSchedule and strides: what is grown near the target, and what far from it."""
+"""WindowSchedule and strides: growth near the target, and far from it."""
 
 from __future__ import annotations
 

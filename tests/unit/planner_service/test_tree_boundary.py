@@ -1,4 +1,4 @@
-"""What kernels could not survive is refused before they are called: they check no index."""
+"""Input that kernels could not survive is refused before the call: they check no index."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When something can be where at the earliest, against scipy's Dijkstra over steps priced by the cell entered."""
+"""The earliest arrivals at every cell, against scipy's Dijkstra over steps priced by the cell entered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arrays that processes share: nobody's writing reaches the file, or another process."""
+"""Arrays that processes share: no write of a process reaches the file, or another process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RNG = np.random.default_rng(1)
 
 
 def _digest_after_marks(folder: Path) -> tuple[float, bool]:
-    """In another process: mark a cell, and say what was there before and whether the mark holds."""
+    """In another process: marks a cell, and returns the value before and whether the mark holds."""
     terrain = load_prepared(folder)
     assert terrain is not None
     before = float(terrain.pace_s_per_m[3, 4])

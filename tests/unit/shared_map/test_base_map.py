@@ -147,7 +147,7 @@ def test_where_a_mask_lies_makes_no_other_terrain(tmp_path: Path) -> None:
 
 
 class Network:
-    """A bus on which every question is answered at once by the servers, or by nobody."""
+    """A bus on which every question is answered at once by the servers, or not at all."""
 
     namespace = "swarm"
 

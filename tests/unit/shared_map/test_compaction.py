@@ -21,7 +21,7 @@ from support.map_strategies import (
 )
 from support.swarm_model import LossyLinks, SwarmModel
 
-from shared_map.keeper.compaction import CompactionPlan, compact, united, without
+from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.held_sets import REMEMBERED_NS, Tombstones
 from shared_map.replication.marks import base_seq, is_tombstone, mark_set, next_seq, statements
@@ -34,33 +34,8 @@ from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 
 
-def compacted_of(of: MarkSet, times: int = 1) -> tuple[int, int]:
-    return of.epoch, of.seq + times
-
-
 def cells_of(of: MarkSet) -> list[int]:
     return statements(of).cells.tolist()
-
-
-def test_of_two_dead_authors_only_the_newest_statement_about_a_cell_is_left() -> None:
-    old = set_of("a", 0, 3, {1: (LETHAL, 0, 10), 2: (LETHAL, 0, 10)})
-    new = set_of("b", 0, 1, {1: (CLEAR, 0, 20)})
-    (compacted,) = compact([old, new], {}, {"a", "b"}, 0)
-    assert cells_of(compacted) == [2]
-    assert (compacted.epoch, compacted.seq) == compacted_of(old)
-
-
-def test_on_a_tie_the_statement_of_the_larger_author_is_left() -> None:
-    one, other = (set_of(author, 0, 1, {1: (LETHAL, 0, 10)}) for author in "ab")
-    (compacted,) = compact([one, other], {}, {"a", "b"}, 0)
-    assert compacted.author == "a"
-    assert is_tombstone(compacted)
-
-
-def test_what_a_living_author_or_another_group_overrules_stays() -> None:
-    dead = set_of("a", 0, 1, {1: (LETHAL, 0, 10)})
-    assert compact([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)})], {}, {"a"}, 0) == []
-    assert compact([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)}, group="red")], {}, {"a", "b"}, 0) == []
 
 
 def test_a_statement_that_ends_by_itself_overrules_nothing_and_goes_when_it_has_ended() -> None:
@@ -71,32 +46,6 @@ def test_a_statement_that_ends_by_itself_overrules_nothing_and_goes_when_it_has_
     (compacted,) = compact([lasting, ending], {}, {"a", "b"}, 500)
     assert compacted.author == "b"
     assert is_tombstone(compacted)
-
-
-def test_what_was_dropped_comes_back_when_what_overruled_it_is_taken_back() -> None:
-    old, new = set_of("a", 0, 1, {1: (LETHAL, 0, 10)}), set_of("b", 0, 1, {1: (CLEAR, 0, 20)})
-    (tombstone,) = compact([old, new], {}, {"a", "b"}, 0)
-    dropped = {"a": without(old, tombstone)}
-    (again,) = compact([set_of("b", 0, 2, {2: (CLEAR, 0, 20)})], dropped, {"a", "b"}, 0)
-    assert again.author == "a"
-    assert cells_of(again) == [1]
-    assert (again.epoch, again.seq) > (tombstone.epoch, tombstone.seq)
-
-
-def test_an_old_set_of_a_deleted_author_is_deleted_again() -> None:
-    older, newer = set_of("a", 0, 1, {1: (LETHAL, 0, 10)}), set_of("a", 0, 2, {})
-    (tombstone,) = compact([newer], {}, {"a"}, 0)
-    (again,) = compact([older], {"a": without(newer, tombstone)}, {"a"}, 0)
-    assert is_tombstone(again)
-    assert again.seq > tombstone.seq > newer.seq > older.seq
-
-
-def test_an_old_set_that_was_heard_again_is_put_back_under_a_number_that_replicas_with_the_tombstone_take() -> None:
-    own = set_of("a", 0, 1, {1: (LETHAL, 0, 10)})
-    (tombstone,) = compact([own, set_of("b", 0, 1, {1: (CLEAR, 0, 20)})], {}, {"a", "b"}, 0)
-    (again,) = compact([own], {"a": without(own, tombstone)}, {"a"}, 0)
-    assert cells_of(again) == [1]
-    assert again.seq > tombstone.seq > own.seq
 
 
 def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> None:
@@ -177,7 +126,7 @@ class Disk:
         self.store.save(self.replica.merge(sets).sets)
 
     def compact(self, gone: set[str], killed: bool) -> list[MarkSet]:
-        """Compact all tiles; a keeper that is killed between its disk and the network tells nobody."""
+        """Compacts all tiles; a keeper that is killed between its disk and the network sends nothing."""
         tiles = range(GRID.tiles)
         compacted = [
             each
@@ -246,17 +195,6 @@ def test_a_store_sets_aside_what_a_compaction_drops_until_its_author_says_someth
     assert store.tiles_set_aside() == [0]
     store.save([set_of("a", 0, 2, {3: (LETHAL, 0, 30)})])
     assert store.set_aside(0) == {}
-
-
-def test_united_and_without_are_inverse() -> None:
-    whole = set_of("a", 0, 1, {n: (PACE, 1.0 + n, n) for n in range(9)})
-    part = mark_set("a", "all", 0, 1, whole.seq + 1, statements(set_of("a", 0, 1, {4: (PACE, 5.0, 4)})))
-    rest = without(whole, part)
-    assert len(rest.kinds) == 8
-    both = united(part, rest)
-    assert (both.cells, both.kinds, both.paces, both.stamps_ns) == (
-        whole.cells, whole.kinds, whole.paces, whole.stamps_ns,
-    )  # fmt: skip
 
 
 def test_tombstones_give_way_to_what_is_newer_and_are_forgotten_in_time() -> None:

@@ -1,4 +1,4 @@
-"""The cost map: any sequence of marks gives what is made from scratch, and dirty windows cover the change."""
+"""The cost map: any sequence of marks equals the map made from scratch, and dirty windows cover the change."""
 
 from __future__ import annotations
 

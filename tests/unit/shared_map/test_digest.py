@@ -1,4 +1,4 @@
-"""Digests: equal holdings give equal bytes, and a difference names exactly what is newer."""
+"""Digests: equal holdings give equal bytes, and a difference names exactly the newer sets."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_missing_and_ahead_name_exactly_what_is_newer(ours: Rows, theirs: Rows) 
     ledger = ledger_of(ours)
     held = ledger_of(theirs).held()
     newer = {at for at in theirs if at not in ours or theirs[at] > ours[at]}
-    for few in (64, 0, 64):  # as tuples of what is recorded, as arrays, as tuples of rows
+    for few in (64, 0, 64):  # as tuples of records, as arrays, as tuples of rows
         with mock.patch("shared_map.replication.digest._FEW", few):
             assert {(author, tile) for author, tiles in ledger.missing(held) for tile in tiles} == newer
     ahead = {(author, tile) for author, tiles in ledger.ahead(held, ["a", "b", "c"]) for tile in tiles}

@@ -1,4 +1,4 @@
-"""Files of others: systems, units, kinds of rasters, images. What is not understood is said."""
+"""Files of others: systems, units, kinds of rasters, images. Unknown input is reported."""
 
 from __future__ import annotations
 

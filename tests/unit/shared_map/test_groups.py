@@ -170,7 +170,7 @@ def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str])
     assert np.isinf(blue).all() == bool(writes)
     refused = world.agents["a1"].counters.counts["sets_foreign"]
     assert (refused > 0) == (not writes)
-    world.run(10.0)  # digests go on, and bring nothing more to refuse than what is put
+    world.run(10.0)  # digests go on, and bring no more refusals than puts
     assert world.agents["a1"].counters.counts["sets_foreign"] <= refused + 1
     world.assert_lawful()
     assert MARKS.key.endswith("/{author}")

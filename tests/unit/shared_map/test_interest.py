@@ -126,7 +126,7 @@ def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> Non
     simulation.run_until(18)
     for node in simulation.nodes.values():
         if isinstance(node.service, AgentService):
-            node.service.agent.drive = lambda: None  # type: ignore[method-assign]  # nobody finds more
+            node.service.agent.drive = lambda: None  # type: ignore[method-assign]  # no search finds more
     simulation.run_until(24)
     held, there = check_interest(simulation)
     assert 0 < held < 0.9 * there

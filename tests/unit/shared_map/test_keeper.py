@@ -57,7 +57,7 @@ def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
 
 
 def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_path: Path) -> None:
-    """Otherwise a small disk is full of it for good: pages of the log stay there until somebody cuts the file."""
+    """Otherwise a small disk stays full: pages of the log remain until the file is cut."""
     log = tmp_path / "map.sqlite-wal"
     longest = 0
     keeper = Keeper()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,7 @@ from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, written
 
 from shared_map.importers.cover.cover_codes import (
-    NO_COLOUR,
-    NOTHING,
-    SAME_COLOUR,
     TABLES,
-    legend_codes,
     read_cover_table,
 )
 from shared_map.importers.cover.land_cover import read_cover
@@ -73,28 +68,6 @@ def test_the_setting_names_the_tables_that_there_are() -> None:
 
 
 @pytest.mark.parametrize("key", list(TABLES))
-def test_water_is_lethal_and_no_two_colours_of_a_legend_are_taken_for_each_other(key: str) -> None:
-    grounds = TABLES[key].grounds
-    wet = [ground for ground in grounds.values() if "water" in ground.name.lower() and "wetland" not in ground.name]
-    assert wet
-    assert all(ground.kind == TerrainClass.WATER for ground in wet)
-    for one, other in itertools.combinations([ground.colour for ground in grounds.values()], 2):
-        assert one is not None
-        assert other is not None
-        assert max(abs(a - b) for a, b in zip(one, other, strict=True)) > 2 * SAME_COLOUR or key == "nlcd", (
-            one,
-            other,
-        )
-    codes = legend_codes(TABLES[key])
-    for code, ground in grounds.items():
-        assert ground.colour is not None
-        red, green, blue = ground.colour
-        assert codes[red << 16 | green << 8 | blue] == code
-    assert codes[0x123456] == NO_COLOUR
-    assert codes[0xFFFFFF] == NOTHING
-
-
-@pytest.mark.parametrize("key", list(TABLES))
 @pytest.mark.parametrize("dtype", ["uint16", "float32"])
 def test_codes_of_each_table_become_its_grounds(tmp_path: Path, dem: Path, key: str, dtype: str) -> None:
     codes = patches(list(TABLES[key].grounds))
@@ -124,13 +97,6 @@ def test_an_ambiguous_map_is_asked_for_and_the_place_may_answer(tmp_path: Path) 
         TerrainError, match=r"are those of ESA WorldCover, and of CORINE .*, and of GlobeLand30, and of"
     ):
         read_cover(both, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, EUROPE), TerrainConfig())
-
-
-@pytest.mark.parametrize("codes", [[80], [1, 2], [1, 2, 3, 4, 5, 6, 7, 8, 9], [10, 20, 30, 60, 80, 100]])
-def test_codes_that_other_maps_have_too_are_asked_for(tmp_path: Path, dem: Path, codes: list[int]) -> None:
-    cover = written(tmp_path / "a.tif", patches(codes), "uint8")
-    with pytest.raises(TerrainError, match=r"set terrain\.cover_codes = .*, or a CSV file of code and class$"):
-        load(dem, cover=str(cover))
 
 
 @pytest.mark.parametrize("evidence", ["palette", "names", "attributes", "metadata", "file name"])
@@ -329,7 +295,8 @@ def test_a_drawing_in_a_legends_colours_is_read_as_its_codes(
 def test_an_image_whose_palette_has_a_legends_colours_is_read_as_its_codes(
     tmp_path: Path, dem: Path, setting: str
 ) -> None:
-    """As programs for pictures write it: entries are counted from 0, and their colours are the legend's."""
+    """The file as programs for pictures write it: entries are counted from 0, and their colours are the
+    legend's."""
     grounds = TABLES["worldcover"].grounds
     entries = patches(range(len(grounds)))
     path = written(tmp_path / "drawn.tif", entries, "uint8")
@@ -350,19 +317,6 @@ def test_a_drawing_in_other_colours_is_refused_as_land_cover_and_not_read_as_a_p
     notes = load(dem, photo=str(path)).notes
     assert said(notes, "no classes are read from it")
     assert said(notes, "terrain.cover")
-
-
-@pytest.mark.parametrize("step", [13.0, 20.0, 31.0])
-def test_a_drawing_is_known_by_its_own_pixels_and_not_by_what_resampling_leaves(
-    tmp_path: Path, dem: Path, step: float
-) -> None:
-    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
-    with rasterio.open(path, "r+") as file:
-        file.write(file.read()[::-1] // 2)
-        file.transform = from_origin(500_000, 5_000_000, step, step)
-    source = load(dem, photo=str(path))
-    assert said(source.notes, "the photo is a drawn map: it has 3 colours")
-    assert (source.classes == TerrainClass.UNKNOWN).all()
 
 
 # --- a land-cover map as the terrain ------------------------------------------------------------------------

@@ -36,7 +36,7 @@ MODELS = {
 }
 RULES: tuple[SlopeRule, ...] = get_args(SlopeRule)
 POINTS = ((-30.0, 3.0), (0.0, 1.0), (20.0, 4.0))
-"""Of the rule `table`."""
+"""Points of the rule `table`."""
 
 
 def ruled(rule: str, **cost: object) -> CostConfig:
@@ -135,7 +135,7 @@ def test_the_merge_rule_cell_by_cell() -> None:
         zone("rough", 3, 4),
     )
     paint_zones(pace, zones, grid, cost, void=np.isnan(grades))
-    # rough doubles; forbidden beats what is painted later; a road bridges water and cliffs, never a void
+    # rough doubles; forbidden beats later paint; a road bridges water and cliffs, never a void
     np.testing.assert_allclose(pace, [[0.2, inf, 0.05, 0.1, 0.05, 0.05, inf, 0.05]])
 
 

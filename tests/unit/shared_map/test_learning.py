@@ -1,4 +1,4 @@
-"""What is learned of kinds of ground: equal at every replica, bounded against lies, and never of lethal ground."""
+"""Learned factors of kinds of ground: equal at every replica, bounded against lies, and never of lethal ground."""
 
 from __future__ import annotations
 

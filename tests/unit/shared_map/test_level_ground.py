@@ -75,7 +75,7 @@ def test_water_of_every_kind_of_model_is_found_and_dry_ground_is_left(name: str)
         assert shares["taken"] > 0.2
         return
     assert shares["taken"] <= 0.003
-    # What is missed where water is rough are ponds.
+    # The missed cells, where water is rough, are ponds.
     rough = "laser" in name or "packed" in name or "filter" in name
     assert (shares["missed"] or 0) <= (0.1 if rough else 0.002)
 

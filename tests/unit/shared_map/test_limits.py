@@ -1,4 +1,4 @@
-"""Quotas: an author that overdraws its budget waits, loses nothing and holds nobody up."""
+"""Quotas: an author that exceeds its budget waits, loses nothing and delays no other author."""
 
 from __future__ import annotations
 
@@ -68,6 +68,8 @@ def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
 def test_budgets_that_are_full_again_are_forgotten() -> None:
     quota = Quota(author_marks_per_s=1)
     quota.charge("a", 1, 0)
+    quota.forget(59 * NS_PER_S)
+    assert list(quota._owners) == ["a"], "it may have been counted just now"
     quota.forget(100 * NS_PER_S)
     assert quota._owners == {}
 

@@ -39,7 +39,7 @@ def photos() -> list[tuple[Bytes, Floats]]:
 
 
 def as_read(f: Features, gain: float, warm: float) -> Bytes:
-    """The class at one exposure: rules from general to particular, what is written later wins."""
+    """The class at one exposure: rules from general to particular, a later rule wins."""
     by, tint = np.float32(gain), np.float32(warm)
     red, green, blue = f.red * (by * tint), f.green * by, f.blue * by / tint
     light, around, texture = f.light * by, f.around * by, f.texture * by

@@ -1,4 +1,4 @@
-"""Plain formats: what is right is read, what is wrong is said with its line."""
+"""Plain formats: right files are read, and wrong ones are refused with the line."""
 
 from __future__ import annotations
 

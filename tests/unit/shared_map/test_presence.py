@@ -105,7 +105,8 @@ def test_a_parked_vehicle_is_driven_around_without_a_stop() -> None:
     world.run(3.0)
     assert world.states()["a1-00"] is VehicleState.ARRIVED
     took_s = world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=60)
-    # 21 cells of a second each, two of them diagonal, the first of which it has driven: nobody waits five seconds.
+    # 21 cells of a second each, two of them diagonal, the first of which it has driven: there is no wait of five
+    # seconds.
     assert took_s <= 20.5
     assert world.where()["a1-00"] == (2, 12)
     world.assert_lawful()

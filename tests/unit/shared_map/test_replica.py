@@ -35,7 +35,7 @@ def test_merge_returns_the_cells_that_changed_and_nothing_for_what_is_known() ->
 def test_a_set_off_the_grid_is_refused() -> None:
     replica, _ = replica_of([])
     assert merge_one(replica, set_of("a", 8 * 7, 0, {})) is None
-    assert merge_one(replica, set_of("a", 6, 0, {1: (LETHAL, 0, 70)})) is None  # of tile 6 words of what is learned
+    assert merge_one(replica, set_of("a", 6, 0, {1: (LETHAL, 0, 70)})) is None  # of tile 6, about learned factors
     assert replica.counts["sets_refused"] == 2
     assert replica.held.ledger.held() == {}
 
@@ -43,7 +43,7 @@ def test_a_set_off_the_grid_is_refused() -> None:
 def test_the_newest_stamp_is_that_of_marks_that_changed_the_map_since_last_asked() -> None:
     replica, _ = replica_of([set_of("a", 0, 1, {1: (LETHAL, 0, 70)})])
     replica.merge([set_of("b", 1, 1, {1: (LETHAL, 0, 60)})])
-    replica.merge([set_of("c", 0, 1, {1: (LETHAL, 0, 75)})])  # says what stands already
+    replica.merge([set_of("c", 0, 1, {1: (LETHAL, 0, 75)})])  # repeats an existing statement
     replica.merge([set_of("d", 0, 1, {2: (LETHAL, 0, 99)})], measured=False)
     assert replica.take_newest_stamp_ns() == 70
     assert replica.take_newest_stamp_ns() is None

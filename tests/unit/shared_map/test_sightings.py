@@ -1,4 +1,4 @@
-"""Target-sighted marks: told by who has a target in sight; the newest wins, they end by themselves."""
+"""Target-sighted marks: set while a target is in sight; the newest wins, they end by themselves."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 POINTS = ((-30.0, 3.0), (0.0, 1.0), (20.0, 4.0))
-"""Of the rule `table`."""
+"""Points of the rule `table`."""
 
 
 def ruled(rule: str, **given: object) -> CostConfig:
@@ -82,7 +82,7 @@ def test_minetti_is_the_published_polynomial_along_the_slope_and_least_at_some_1
     found = stepped("minetti", *rises) * 2.5 / np.sqrt(1 + rises**2)
     np.testing.assert_allclose(found, joules, rtol=1e-4)
     assert -0.2 <= rises[found.argmin()] <= -0.1
-    # A metre of height costs as much beyond what was measured as at its end.
+    # A metre of height costs the same beyond the measured range as at its end.
     steep = stepped("minetti", 0.45, 0.9, -0.45, -0.9)
     np.testing.assert_allclose(steep[1::2], 2 * steep[::2], rtol=1e-5)
 

@@ -1,8 +1,7 @@
-"""Every kind of file is read onto one metric grid; what is wrong with a file is said in one sentence."""
+"""Every kind of file is read onto one metric grid; each fault of a file is one sentence."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,10 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 from support.height_models import written
 
-from launch_scripts.commands.terrain_commands import info
 from shared_map.importers.georeference import metres_per_degree
-from shared_map.importers.sources import FILE_KINDS, Source, load_source
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.explain import meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
@@ -263,11 +260,6 @@ def test_real_pairs_come_onto_one_grid() -> None:
 def test_jacksboro_from_its_file_is_jacksboro() -> None:
     file = load(DATA / "dem/jacksboro/jacksboro_fault_dem.npz", resolution_m=75.0)
     np.testing.assert_array_equal(file.elevation_m, load("jacksboro").elevation_m)
-
-
-def test_the_words_about_kinds_of_files_name_every_reader() -> None:
-    for text in (meanings(TerrainConfig)["source"], info.__doc__ or ""):
-        assert set(re.findall(r"\.[a-z0-9]{2,4}\b", text)) >= set(FILE_KINDS.split(", "))
 
 
 def test_the_built_in_terrain_lies_where_its_degrees_are() -> None:

@@ -1,4 +1,4 @@
-"""Sync: marks reach everybody once links are back, whatever was lost, and hostile digests cost little."""
+"""Sync: marks reach every replica once links are back, whatever was lost, and hostile digests cost little."""
 
 from __future__ import annotations
 

@@ -162,10 +162,10 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     from pyogrio.raw import write
     from rasterio.transform import from_origin
 
-    text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
+    gis = Path(__file__).parents[3] / "docs" / "gis"
+    text = (gis / "terrain.md").read_text() + (gis / "vectors.md").read_text()
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 3
-    (tmp_path / "mine.toml").write_text("".join(blocks))
+    (tmp_path / "mine.toml").write_text("".join(blocks[:4]))
     # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
     (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
     base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(x_m - 900, y_m + 100, 20, 20)}

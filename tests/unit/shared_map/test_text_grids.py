@@ -198,7 +198,7 @@ def test_degrees_lie_where_they_say_in_text_and_in_rasters(tmp_path: Path) -> No
     ],
 )
 def test_gdal_makes_a_height_of_0_of_what_is_missing_or_no_number(tmp_path: Path, driver: str, text: str) -> None:
-    """Why points and ASCII grids have readers of our own. Where this fails, GDAL's can be used."""
+    """The reason for our own readers of points and ASCII grids. If this fails, GDAL's reader can be used."""
     import rasterio
 
     with rasterio.open(wrote(tmp_path / "a.txt", text), driver=driver) as dataset:

@@ -351,7 +351,7 @@ def test_no_road_crosses_a_river_without_a_bridge(
 def test_a_bridge_as_long_as_its_river_is_wide_joins_both_banks(
     tmp_path_factory: pytest.TempPathFactory, lean: float, col: float, row: float, turn: float, width_m: float
 ) -> None:
-    """Where road and river meet at 45 degrees or more."""
+    """Roads which meet the river at 45 degrees or more."""
     river = shapely.LineString([(col - 60 * lean, row - 60), (col + 60 * lean, row + 60)])
     slope = np.tan((turn - 0.5) * (np.pi / 2 - 2 * abs(np.arctan(lean))) * 0.9)
     road = shapely.LineString([(col - 60, row - 60 * slope), (col + 60, row + 60 * slope)])

@@ -1,4 +1,4 @@
-"""Files of zones in a scenario: checked as it is read, part of a terrain's identity, told by `terrain info`."""
+"""Files of zones in a scenario: checked when it is read, part of a terrain's identity, listed by `terrain info`."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_terrain_info_names_each_file_and_what_became_of_its_features(tmp_path: 
 def test_the_example_of_the_page_has_one_way_over_its_river() -> None:
     path = Path(__file__).parents[3] / "docs" / "examples" / "roads_and_water" / "roads_and_water.toml"
     scenario = load_scenario(path)
-    assert path.read_text().partition("[[cost.zones]]")[2] in (path.parents[2] / "zones.md").read_text()
+    assert path.read_text().partition("[[cost.zones]]")[2] in (path.parents[2] / "gis" / "vectors.md").read_text()
     terrain = build_terrain(scenario)
     used = [zone.file.used for zone in terrain.zones if zone.file is not None]
     assert used == [5, 3, 1]

@@ -34,7 +34,7 @@ def test_an_operator_reads_everything_and_changes_nothing(topic) -> None:
 
 
 def test_what_only_one_process_knows_only_that_process_says() -> None:
-    """Whoever may put or answer for others is named here, so that nobody joins them unnoticed."""
+    """Processes that may put or answer for others are named here, which makes an addition visible."""
     for_others = {
         (topic.name, name, grant.role)
         for topic in TOPICS

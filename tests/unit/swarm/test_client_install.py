@@ -1,14 +1,12 @@
-"""What a robot installs: the client library imports little, quickly, and reads every message without NumPy."""
+"""The install of a robot: the client library imports little, quickly, and reads every message without NumPy."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
@@ -96,29 +94,3 @@ def test_bulk_marks_without_numpy_are_refused_in_a_sentence() -> None:
         "except ProtocolError as error: print(error)\n"
     )
     assert python(code).stdout == "many sets at once are read with NumPy only: ask without `bulk`\n"
-
-
-@pytest.mark.parametrize("words", [[], ["status"], ["demo"], ["up", "demo"]])
-def test_the_command_on_a_small_install_says_what_to_install(words: list[str]) -> None:
-    done = python(BLOCKED + f"from launch_scripts.entry import main; sys.argv[1:] = {words}; sys.exit(main())")
-    assert done.returncode == 1
-    assert done.stdout == ""
-    [sentence] = done.stderr.splitlines()
-    assert sentence.startswith(
-        "swarm: the command needs typer, which is not installed: install the extra 'all' (docs/start/install.md)"
-    )
-
-
-def test_what_a_small_install_brings_is_zenoh_and_the_messages() -> None:
-    """38 MB with all that they need, where the whole takes 1 GB (`du -sm` of a new environment's site-packages)."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert {each.partition("=")[0].partition(">")[0] for each in project["dependencies"]} == {
-        "eclipse-zenoh", "msgpack", "msgspec",
-    }  # fmt: skip
-    assert project["scripts"] == {"swarm": "launch_scripts.entry:main"}
-
-
-def test_a_wheel_has_no_script_that_works_in_a_checkout_only() -> None:
-    built = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    scripts = (each for each in (ROOT / "launch_scripts").iterdir() if each.is_file() and "py" not in each.name)
-    assert sorted(built["exclude"]) == sorted(f"/launch_scripts/{each.name}" for each in scripts)

@@ -1,4 +1,4 @@
-"""A wrong scenario is refused with the file, the key, what was found, what is allowed and the nearest name."""
+"""A wrong scenario is refused with the file, the key, the found value, the allowed values and the nearest name."""
 
 from __future__ import annotations
 

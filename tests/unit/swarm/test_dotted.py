@@ -1,4 +1,4 @@
-"""Settings by dotted keys: what they change, and what a key that leads nowhere is told."""
+"""Settings by dotted keys: their changes, and the answer to a key that leads nowhere."""
 
 from __future__ import annotations
 

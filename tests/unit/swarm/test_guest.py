@@ -44,7 +44,7 @@ def entered(cell: int = 70) -> tuple[Guest, Warden]:
 
 
 def talk(guest: Guest, warden: Warden, now_ns: int = 0) -> None:
-    """What the guest says is heard, and what is granted is told, as if it were on file."""
+    """Passes messages between the guest and the warden as if they were on file."""
     for action in guest.tick(now_ns):
         assert isinstance(action, Tell)
         warden.take_standing(action.standing, now_ns)
@@ -184,7 +184,7 @@ def test_an_operator_frees_what_all_lives_of_a_guest_hold_and_its_next_life_ente
     assert back.cells == (90,)
     table = warden.tick(3_000_000_000)
     assert table is not None
-    assert table.shut == []  # nobody drove by the operator's life
+    assert table.shut == []  # no vehicle drove by the operator's incarnation
 
 
 def test_a_replaced_guest_says_nothing_and_takes_nothing() -> None:

@@ -1,4 +1,4 @@
-"""What a host holds by what wardens grant, and what it asks for."""
+"""The cells that a host holds by the grants of wardens, and its requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from swarm.wire.topics import STANDING
 
 
 def test_no_word_of_one_life_hides_that_of_another() -> None:
-    """Both are heard under one key; what says that an older one has ended is said by no other."""
+    """Both are heard under one key; no other message tells that an older one has ended."""
     assert not STANDING.newest
 
 
@@ -98,3 +98,13 @@ def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
     hear(holdings, table_of(1, 1, a0=lie))
     hear(holdings, table_of(1, 2, a0=[*lie, -16]))
     assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
+
+
+def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_warden_knows_it() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9]))
+    assert not holdings.gone
+    holdings.plots.clear()
+    assert not holdings.gone, "a vehicle still has a path"
+    holdings.leave("a0-00")
+    assert holdings.gone

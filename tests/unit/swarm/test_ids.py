@@ -1,4 +1,4 @@
-"""Ids: each is matched once and then known, and nobody makes a process know too many."""
+"""Ids: each is matched once and then known, and no sender grows the memory of a process without bound."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from swarm.wire import fields
 
 
 class Pattern:
-    """Counts what is matched."""
+    """Counts the matches."""
 
     matched = 0
 

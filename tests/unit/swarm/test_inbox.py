@@ -35,7 +35,7 @@ class Time:
 
 @dataclass(eq=False)
 class Asker:
-    """One that asks at a time and leaves when its timeout is over; writes down what it is told, and when."""
+    """One that asks at a time and leaves when its timeout is over; records the answers, and their times."""
 
     time: Time
     timeout_s: float = 2.0

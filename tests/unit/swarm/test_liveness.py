@@ -1,4 +1,4 @@
-"""Who is alive does not depend on the order in which we hear of it."""
+"""The set of live processes does not depend on the order of the messages about it."""
 
 from __future__ import annotations
 

@@ -37,14 +37,25 @@ class Node:
             self.failure = error
 
 
-def test_members_of_one_run_get_along():
+ROUTER = {"role": "router", "id": "0", "run_id": NO_RUN, "terrain": "", "rows": 0}
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        [{"id": id} for id in ("t0", "t1", "t2")],
+        [{"id": f"t{wire}", "wire_version": wire} for wire in (8, 9)],  # neighbouring builds
+        [ROUTER, {"id": "t0"}, {"id": "t1"}],  # a router belongs to no run
+    ],
+)
+def test_members_of_one_run_get_along(members):
     world = SwarmModel()
-    nodes = [Node(world, id=id) for id in ("t0", "t1", "t2")]
+    nodes = [Node(world, **each) for each in members]
     for node in nodes:
         node.member.join()
         world.settle()
-    assert [node.failure for node in nodes] == [None] * 3
-    assert [node.rest for node in nodes] == [[]] * 3
+    assert [node.failure for node in nodes] == [None] * len(nodes)
+    assert ROUTER in members or not any(node.rest for node in nodes)
 
 
 @pytest.mark.parametrize(
@@ -82,15 +93,6 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
     assert str(stranger.failure).startswith(words)
     assert stranger.failure.exit_code == 5
     assert first.failure is None
-
-
-def test_builds_of_neighbouring_wire_versions_share_a_run():
-    world = SwarmModel()
-    nodes = [Node(world, id=f"t{wire}", wire_version=wire) for wire in (8, 9)]
-    for node in nodes:
-        node.member.join()
-        world.settle()
-    assert [node.failure for node in nodes] == [None] * 2
 
 
 def test_a_process_that_does_not_say_its_wire_version_speaks_the_last_one_before_any_said_it():
@@ -177,7 +179,7 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
     liar = Node(world, role="agent", id="zz", run_id="another", terrain="bbbb")
     liar.bus.serve(RUN, liar.post, role="agent", id="zz")
     for turn in range(3):
-        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # everybody asks anew
+        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # every member asks again
         world.settle()
         for node in nodes:
             node.member.tick(world.scheduler.clock.now_ns())
@@ -198,15 +200,3 @@ def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
     late.member.join()
     world.settle()
     assert late.failure is None
-
-
-def test_a_router_belongs_to_no_run_and_ends_nobody():
-    world = SwarmModel()
-    router = Node(world, role="router", id="0", run_id=NO_RUN, terrain="", rows=0)
-    router.member.join()
-    world.settle()
-    runs = [Node(world, id="t0"), Node(world, id="t1")]
-    for node in runs:
-        node.member.join()
-        world.settle()
-    assert [node.failure for node in (router, *runs)] == [None] * 3

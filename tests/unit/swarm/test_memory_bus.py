@@ -29,7 +29,7 @@ def world() -> SwarmModel:
 
 
 class Links(PerfectLinks):
-    """Says what it is told to."""
+    """Acts as it is set."""
 
     def __init__(self, *delays_ms: float) -> None:
         self.delays = [int(delay * 1e6) for delay in delays_ms]

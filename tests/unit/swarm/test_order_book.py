@@ -67,7 +67,7 @@ class Keeper:
         self.now = NOW
 
     def give(self, **fields: Any) -> str | None:
-        """Why it is refused; None if it is not."""
+        """The reason of its refusal; None if it is not."""
         self.now += 1
         order = judged(GiveOrder(**fields), self.book, SCENARIO, VEHICLES, self.now)
         if isinstance(order, str):
@@ -107,6 +107,7 @@ def test_targets_come_move_and_go() -> None:
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"]
     assert keeper.give(subject="target", name="t0", off=True) is None
     assert keeper.book.targets_of("red", SCENARIO) == []
+    assert keeper.book.standing == ["target t0 is removed"], "a removed target of the scenario, not an added one"
     assert keeper.give(subject="target", name="t0", cell=3, new=True) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"]
 

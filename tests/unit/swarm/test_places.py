@@ -162,7 +162,7 @@ def test_a_client_reads_places_without_pyproj() -> None:
 
 
 def test_places_of_a_rotated_file_are_those_of_its_own_transform(tmp_path: Path) -> None:
-    """What a turned file holds at a longitude and latitude is found at the cell of that place."""
+    """A value of a turned file at a longitude and latitude is found at the cell of that place."""
     turned = Affine.translation(500_000, 5_200_000) @ Affine.rotation(-30) @ Affine.scale(30, -30)
     heights = np.zeros((60, 60), np.float32)
     heights[20:24, 40:44] = 100.0

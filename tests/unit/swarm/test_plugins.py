@@ -1,4 +1,4 @@
-"""How plug-ins are named and found, and the guard through which they are called."""
+"""The names and the discovery of plug-ins, and the guard through which they are called."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Key expressions: what is put together comes apart again, and only that."""
+"""Key expressions: a composed key comes apart again, and only a composed one."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_key_of_something_else_has_no_fields(key):
 
 def test_no_thread_meets_a_message_type_that_msgspec_has_not_finished_describing() -> None:
     # The first conversion to a struct type is not thread-safe in msgspec: another thread that meets the unfinished
-    # description crashes the process. So each type is converted to once, on import.
+    # description crashes the process. For this reason each type is converted to once, on import.
     program = """
 import msgspec, msgspec._utils as utils
 from swarm.wire import topics
@@ -122,7 +122,7 @@ for topic in topics.TOPICS:
 
 def test_a_token_names_a_process_or_is_refused_and_never_raises_anything_else() -> None:
     assert peer_of("swarm/alive/agent/a0/17") == Peer("agent", "a0", 17)
-    # Of 5000 digits Python makes no int, and \u0663 is a digit to it.
+    # Python refuses an int of 5000 digits, and \u0663 is a digit to it.
     for incarnation in ("9" * 5000, "9" * 19, str(1 << 62), "\u0663\u0663", "-1", "", "1.5", "x", "1/2"):
         with pytest.raises(ProtocolError):
             peer_of(f"swarm/alive/agent/a0/{incarnation}")

@@ -1,4 +1,4 @@
-"""What waits for a thread: in its order, bounded, with an end."""
+"""The queue of a thread: in order, bounded, with an end."""
 
 from __future__ import annotations
 

@@ -21,9 +21,8 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import RouteReply, TargetPose
+from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.traffic import Granted
-from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.route_columns import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
@@ -71,12 +70,6 @@ def agent() -> Agent:
     grant(agent, 1, v0=[GRID.cell(5, 5)], v1=[GRID.cell(5, 7)])
     agent.set_planners({"t0": 1, "t1": 1}, 0)
     return agent
-
-
-def pose(target: str, row: int, col: int, seq: int = 1, jumps: int = 0) -> TargetPose:
-    cell = GRID.cell(row, col)
-    x_m, y_m = GRID.centre_m(cell)
-    return TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m, jumps=jumps)
 
 
 def answer_costs(agent: Agent, asked: AskCosts, now_ns: int, **costs_s: list[float]) -> None:
@@ -151,16 +144,6 @@ def test_costs_of_the_wrong_length_or_request_are_nobodys(agent: Agent) -> None:
     agent.assignment.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
     agent.costs_ended(asked.request, 0)
     assert {vehicle.target for vehicle in agent.vehicles.values()} == {None}
-
-
-def test_an_old_pose_does_not_undo_a_newer_one(agent: Agent) -> None:
-    (asked,) = agent.decide(0)
-    assert isinstance(asked, AskCosts)
-    answer_costs(agent, asked, 0, t0=[5.0, 6.0])
-    agent.hear_pose(pose("t0", 5, 5, seq=2), 0)
-    agent.hear_pose(pose("t0", 11, 11, seq=1), 0)
-    agent.decide(S)
-    assert agent.vehicles["a0-00"].state is VehicleState.ARRIVED
 
 
 def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal() -> None:
@@ -275,7 +258,7 @@ def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
     assert not set(spawns["a1"].values()) & set(spawns["a0"].values())
 
 
-# --- what is told of them -----------------------------------------------------------------------------------
+# --- reports ----------------------------------------------------------------------------------------------------
 
 
 def test_a_region_that_the_vehicles_have_left_is_told_so_once() -> None:

@@ -1,4 +1,4 @@
-"""Which target each vehicle of an agent goes for."""
+"""The target of each vehicle of an agent."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_whatever_a_plugin_assigns_vehicles_go_only_where_they_have_a_route(
 
     class Says:
         def assign(self, table: CostTable) -> object:
-            table.costs_s[:] = -1.0  # what it does to its own table is nobody's loss
+            table.costs_s[:] = -1.0  # its changes to its own table harm no other
             return answer
 
     named = NamedPlugin(PLUGIN_KINDS["assignment"], "vehicles.assignment", "my:Own", {})

@@ -1,4 +1,4 @@
-"""What a body's report is taken for: bad ones are named once, counted, and open no cell."""
+"""Reports of bodies: bad ones are named once, counted, and open no cell."""
 
 from __future__ import annotations
 

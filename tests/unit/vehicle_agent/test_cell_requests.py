@@ -26,7 +26,7 @@ RESERVE = 1
 
 
 class Held:
-    """What `CellRequests` asks of a host's holdings."""
+    """The part of a host's holdings that `CellRequests` reads."""
 
     def __init__(self) -> None:
         self.paths: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""What an agent tells planners of their chasers: true at every tick, and told no more often than that takes."""
+"""Reports of an agent to planners about their chasers: true at every tick, and no more often than that takes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
                 driven[id] += chance.choice((0, 0, 0, 1))
                 if chance.random() < 0.02:
                     chased[id] = chance.choice((None, *planners))
-                # What it was granted: it drives no further than the end of its path.
+                # The granted cells: it drives no further than the end of its path.
                 vehicles.append((id, chased[id], range(driven[id], driven[id] + 4)))
             for message in report.reports(vehicles, now_ns):
                 messages += 1

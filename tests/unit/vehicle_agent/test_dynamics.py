@@ -23,7 +23,7 @@ TICK_S = 0.1
 
 
 def driven_by(speed: Any) -> tuple[PluginDynamics, list[str], list[Stretch]]:
-    """Dynamics whose plug-in says these speeds, what is told of it, and what it was asked."""
+    """Dynamics whose plug-in returns these speeds, its messages, and its calls."""
     told: list[str] = []
     asked: list[Stretch] = []
 

@@ -1,4 +1,4 @@
-"""What is kept of grants, by host and by cell, is what follows from the grants of all vehicles."""
+"""Kept grants, by host and by cell, equal those that follow from the grants of all vehicles."""
 
 from __future__ import annotations
 

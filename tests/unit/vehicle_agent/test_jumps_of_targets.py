@@ -1,4 +1,5 @@
-"""How often an agent asks all planners because targets jump: soon where they are few, seldom where many do."""
+"""The rate at which an agent asks all planners because targets jump: soon where they are few, seldom where many
+do."""
 
 from __future__ import annotations
 

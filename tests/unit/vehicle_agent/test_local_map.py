@@ -1,4 +1,4 @@
-"""Which places a change of the map concerns."""
+"""The places that a change of the map concerns."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def test_the_second_member_says_what_the_first_has_not_said_and_something_in_eac
 
 
 def warden_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
-    """A member that has just become warden, and the table that it told, which nobody has stored yet."""
+    """A member that has just become warden, and the table that it sent, which no member has stored yet."""
     member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0)
     member.hear_standing(standing("a0", [9], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
@@ -78,22 +78,22 @@ def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_i
         assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
     now_ns += 2 * BEAT_NS
     member.hear_standing(standing("a0", [9], seq=now_ns), now_ns)
-    assert member.tick(now_ns) == [table]  # nobody has answered the number
+    assert member.tick(now_ns) == [table]  # no member has answered the number
 
 
 def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
     first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0) for n in (2, 0))  # of epoch 1
     same = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=4)
     lags = [Stored(plot=0, agent=MEMBERS[2], epoch=0, seq=0)]
-    assert first.hear_stored(same, S) == lags  # it has to be told the whole
+    assert first.hear_stored(same, S) == lags  # it needs the whole table
     assert [first.hear_table(table_of(1, 4), S)[-1]] == first.hear_stored(same, S) == [first.on_file]
     second.hear_table(table_of(1, 4), S)
     assert second.tick(S) == [second.on_file]
     second.hear_stored(first.on_file, 2 * S)
     assert second.hear_stored(same, 2 * S) == []
     assert second.tick(2 * S) == [second.on_file]
-    assert second.hear_claim(2, 2 * S + BEAT_NS) == []  # who tells a number leads, as who tells a table
-    assert first.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # it came late
+    assert second.hear_claim(2, 2 * S + BEAT_NS) == []  # the sender of a number leads, too
+    assert first.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # the table came late
 
 
 def test_a_number_of_a_later_epoch_ends_a_warden_and_one_of_an_earlier_epoch_is_told_so() -> None:
@@ -111,11 +111,13 @@ def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
     member.hear_standing(standing("a1", [9], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
     assert isinstance(save, Save)
+    member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
+    assert member.warden is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
     first = member.warden
     assert first is not None
     member.hear_standing(standing("a1", [9], seq=3), 3 * S)
-    member.tick(3 * S)  # nobody has acknowledged anything: it resigns
+    member.tick(3 * S)  # no member has acknowledged anything: it resigns
     assert member.warden is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 3 * S)
     assert member.warden is None

@@ -1,4 +1,4 @@
-"""Vehicles of an added agent enter the map where nobody stands: no body, and not in a zone."""
+"""Vehicles of an added agent enter the map on free cells: no body, and no zone."""
 
 from __future__ import annotations
 

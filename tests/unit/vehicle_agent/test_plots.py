@@ -45,6 +45,13 @@ def test_a_large_plot_is_made_of_whole_regions(cell: int, regions: int) -> None:
     corner = row // REGION_CELLS * REGION_CELLS * GRID.cols + col // REGION_CELLS * REGION_CELLS
     assert small.of(cell) == small.of(corner)
     assert large.of(cell) == large.of(corner)
+    side = regions * REGION_CELLS
+    assert large.of(cell) == large.all[row // side * -(-GRID.cols // side) + col // side]
+
+
+def test_plots_of_one_region_need_no_quorum_and_larger_ones_all_agents_but_two() -> None:
+    assert Plots(GRID, FIVE).has_quorum([])
+    assert [Plots(GRID, FIVE, WIDE).has_quorum(FIVE[:n]) for n in range(6)] == 3 * [False] + 3 * [True]
 
 
 def test_an_agent_whose_plots_are_of_another_size_gets_no_seat_by_the_others_and_gives_them_none() -> None:

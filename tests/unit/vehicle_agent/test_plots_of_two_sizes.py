@@ -47,7 +47,7 @@ class Sized(Process):
 
 
 class Mixed(TrafficWorld):
-    """Some agents have plots of another size; nobody is told that they do not belong."""
+    """Some agents have plots of another size; none is called a stranger."""
 
     def __init__(
         self, seed: int, agents: int, per_agent: int, side: int, others: set[str], other_side: int

@@ -1,4 +1,4 @@
-"""The file of an agent's promises: what was written is there after a kill, and nobody else writes it."""
+"""The file of an agent's promises: records survive a kill, and no other process writes it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("written", [0, 1, 20, None], ids=["nothing", "a byte", "a part", "all but its length"])
 def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int | None) -> None:
-    """Its length is written last; and what is left of it does not spoil the next one."""
+    """Its length is written last; the remains do not spoil the next one."""
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)
     store.save(3, table(0, 1))

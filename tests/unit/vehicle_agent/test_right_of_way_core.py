@@ -53,7 +53,7 @@ def test_a_silent_warden_sends_no_table_and_its_host_still_tells_where_its_vehic
 
 
 def _through(rights: RightOfWay, ticks: range) -> list[Action]:
-    """All that is said in some ticks; what the host says is heard by its own seat."""
+    """All messages of some ticks; the host's own messages are heard by its own seat."""
     said: list[Action] = []
     for tick in ticks:
         for action in rights.tick({}, tick * S // 10):
@@ -64,7 +64,7 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
 
 
 def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
-    """Nobody else can: the later life has another file. It had left that plot long ago."""
+    """No other process can: the later incarnation has another file. It had left that plot long ago."""
     table = msgspec.structs.replace(table_of(1, 1), shut=[Shut("a4", 1 << 32, [9])])
     member = rights_of(MEMBERS[0], {0: (1, table)})
     (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
@@ -77,7 +77,7 @@ def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there
     assert older.settled
     older.holdings.plots.clear()
     older.holdings.replaced = True
-    assert not older.settled  # so it is asked again what is known of it
+    assert not older.settled  # the question about it is repeated
     older.hear_known(known)
     (told,) = older.tick({}, S)
     assert isinstance(told, Tell)

@@ -61,13 +61,6 @@ def test_a_route_ends_before_the_first_step_ahead_that_is_closed() -> None:
     assert route.ahead() == [13]
 
 
-def test_a_dropped_route_has_nothing_ahead() -> None:
-    route = following(11, 12)
-    route.drop()
-    assert route.ahead() == []
-    assert route.left == 0
-
-
 @given(st.integers(1, 10), st.integers(0, 99), st.lists(st.integers(0, 8), max_size=12).map(bytes))
 def test_directions_from_the_network_become_cells_and_back_or_nothing(cols: int, start: int, codes: bytes) -> None:
     grid = GridSpec(10, cols, 10.0)

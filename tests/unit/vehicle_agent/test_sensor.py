@@ -1,4 +1,4 @@
-"""What is seen, and which marks follow from it."""
+"""Observations, and the marks which follow from them."""
 
 from __future__ import annotations
 

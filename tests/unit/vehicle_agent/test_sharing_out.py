@@ -124,7 +124,7 @@ def test_where_all_can_be_reached_every_target_gets_its_pursuers_if_vehicles_suf
 def test_nobody_changes_for_less_than_15_percent(
     targets: int, pursuers: int, more: int, chance: random.Random
 ) -> None:
-    """Once every target has its pursuers, costs that differ by less than the hysteresis move nobody."""
+    """Once every target has its pursuers, costs that differ by less than the hysteresis move no vehicle."""
     vehicles = targets * pursuers + more
     draw = np.random.default_rng(chance.getrandbits(32))
     costs_s = draw.uniform(86.0, 100.0, (targets, vehicles))
@@ -139,7 +139,7 @@ def test_a_vehicle_changes_for_more_than_15_percent() -> None:
 
 
 def test_costs_beyond_all_bounds_leave_the_differences_of_the_others() -> None:
-    """Whoever says that it needs 1e38 s changes nothing for the rest."""
+    """A vehicle that claims to need 1e38 s changes nothing for the rest."""
     costs_s = np.array([[3e38, 10.0, 20.0], [3e38, 11.0, 18.0]])
     assert need_first(costs_s, [-1, -1, -1], 1).tolist() == [-1, 0, 1]
 
@@ -247,7 +247,7 @@ NEAR_T0 = {"a0": [[10.0, 12.0], [100.0, 90.0]], "a1": [[14.0, 16.0], [60.0, 95.0
 
 
 def test_two_agents_share_out_the_targets_between_all_of_their_vehicles() -> None:
-    """a1's first vehicle is the nearest to t1, so that nobody of a0 has to go there."""
+    """a1's first vehicle is the nearest to t1, so no vehicle of a0 has to go there."""
     two = Two(NEAR_T0)
     for n in range(3):
         two.reassign("a0", 2 * n * PERIOD_NS)

@@ -108,7 +108,8 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
 @given(st.integers(0, 1 << 32), st.sampled_from([0.5, 1.5, 3.0]))
 @settings(max_examples=few(60), deadline=None)
 def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, relief_m: float) -> None:
-    """Up a steep slope a route winds beside cells of its own that are too steep, or too dear, to go to at once."""
+    """Up a steep slope a route winds beside cells of its own that are too steep, or too expensive, to go to at
+    once."""
     rng = np.random.default_rng(seed)
     climb = climb_on(rng.normal(0, relief_m, (8, 8)))
     pace = np.where(rng.random((8, 8)) < 0.1, np.inf, LEVEL).astype(np.float32)
@@ -129,7 +130,7 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
         wish = steering.wish(vehicle, [here], 0, 1, (), lambda *_: False, seed)
         assert wish.better > 0
         assert wish.wants[0] == after == wish.ahead[0]
-        # Somebody in the way is pushed on, or passed; to stay is no answer.
+        # A vehicle in the way is pushed on, or passed; to stay is no answer.
         assert after in steering.wish(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: wish.better]
         vehicle.route.moved(after)
 

@@ -1,4 +1,4 @@
-"""What a plot's warden grants, frees and says."""
+"""The grants, releases and messages of a plot's warden."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
 
 
 def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
-    """As all are that began the run together: those of the last agent must not always give way."""
+    """All agents that began the run together have one age: vehicles of the last agent must not always give way."""
     places = {"a0": 18, "a1": 19, "a2": 20, "a3": 26, "a4": 28}
     first = set()
     for step in range(30):
@@ -105,7 +105,7 @@ def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_beat(
     assert warden.tick(BEAT_NS // 2) is None
     assert warden.tick(BEAT_NS) is first
     warden.take_standing(standing("a1", [10], seq=3), BEAT_NS)
-    assert warden.tick(BEAT_NS + 1) is None  # what is only freed can wait
+    assert warden.tick(BEAT_NS + 1) is None  # a mere release can wait
     freed = warden.tick(2 * BEAT_NS)
     assert freed is not None
     assert (freed.seq, freed.hosts["a1"], freed.grants["a1-00"].cells) == (2, (1, 3), [10])

@@ -1,4 +1,4 @@
-"""Vehicles and zones: whoever stands in one drives out, nobody drives in, and what they see there is no news."""
+"""Vehicles and zones: a vehicle inside one drives out, none drives in, and its observations there are no news."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def test_inflated_borders_of_a_zone_are_left_too_and_walls_are_not_crossed() -> 
 
 
 def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None:
-    """By the map all of a zone is lethal, so it cannot say what is so in truth, and nobody marks it there."""
+    """By the map all of a zone is lethal, so the map does not show which cells are lethal in truth, and no vehicle
+    marks them there."""
     truth = ["." * 20 for _ in range(20)]
     for row in (7, 8):  # further than the vehicle sees from where it starts
         truth[row] = "." * 6 + "#" * 9 + "." * 5

@@ -1,4 +1,4 @@
-//! A node of hiroz, a ROS 2 stack in Rust with CDR and type hashes of its own, beside `swarm ros2`:
+//! A node of hiroz, a ROS 2 stack in Rust with CDR and type hashes of its own, beside `swarm gateway ros2`:
 //! hears what a vehicle of the swarm does, is a vehicle itself, and asks for a plan.
 //! Usage: hiroz_peer ROUTER VEHICLE ROBOT TARGET
 

@@ -1,0 +1,175 @@
+"""Commands and programs of the pages, run in order, in a folder and an environment of the page.
+
+The environment has the extras which the page installs, or `all`. A comment before a block says why it is not run,
+or what it needs: `<!-- not run: two machines -->`, `<!-- beside: swarm demo -->`. A comment before the title is for
+all blocks of the page.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from support.installed import ROOT, environment
+
+from launch_scripts.cli import command
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+WRITTEN = {ROOT / "docs" / folder for folder in ("design", "reference", "plugins")}
+"""Folders of pages which are generated, are about the code, or whose programs other tests run."""
+PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|grep|journalctl|zenohd|uv|git"
+_COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
+_SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
+_HEAVY = re.compile(r"swarm (up|demo|run|simulate|study|sweep|replay|compare)\b")
+_SYNTH = "swarm terrain generate --rows 200 --cols 240 --out dem.tif --photo photo.tif"
+
+
+class Block(NamedTuple):
+    """Commands or a file of a page, with the comment before it: ("not run" or "beside", text)."""
+
+    line: int
+    language: str
+    text: str
+    said: tuple[str, str]
+
+
+def blocks(page: Path) -> list[Block]:
+    """Fenced blocks, and indented ones which begin with a command."""
+    lines = [*page.read_text(encoding="utf-8").split("\n"), ""]
+    whole = _SAID.fullmatch(lines[0])
+    found, said, n = [], None, 0
+    while n < len(lines):
+        begins = n
+        language, body = "", lines[n].strip()
+        if fence := re.match(r" *```(\w*)", lines[n]):
+            language = fence[1]
+            n = next(k for k in range(n + 1, len(lines)) if lines[k].strip().startswith("```"))
+            body = "\n".join(line.removeprefix(fence[0][: fence[0].index("`")]) for line in lines[begins + 1 : n])
+        elif lines[n].startswith("    ") and not lines[n - 1].strip() and _COMMAND.match(body):
+            language = "sh"
+            n = next(k for k in range(n, len(lines)) if not lines[k].startswith("    ")) - 1
+            body = "\n".join(line[4:] for line in lines[begins : n + 1])
+        if language:
+            comment = said or whole
+            found.append(Block(begins + 1, language, body, (comment[1], comment[2]) if comment else ("", "")))
+        if body or language:
+            said = _SAID.fullmatch(body)
+        n += 1
+    return found
+
+
+def commands(page: Path) -> list[Block]:
+    """Blocks of a page to run: commands, and Python which is a whole program."""
+    return [
+        each
+        for each in blocks(page)
+        if each.language == "sh" or (each.language == "python" and re.search(r"^(import|from) ", each.text, re.M))
+    ]
+
+
+def is_written(page: Path) -> bool:
+    return WRITTEN.isdisjoint(page.parents)
+
+
+def options(group: Any) -> set[str]:
+    return {name for param in group.params for name in (*param.opts, *param.secondary_opts)} | {"-h", "--help"}
+
+
+@pytest.mark.parametrize("page", list(filter(is_written, PAGES)), ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_page_has_the_name_and_the_options_of_one(page: Path) -> None:
+    text = "\n".join(each.text for each in blocks(page) if each.language == "sh").replace("\\\n", " ")
+    for line in re.findall(r"(?:^|[\s$]|\.venv/bin/)swarm (.*?)(?: # |&& |\| |$)", text, re.M):
+        group: Any = command()
+        for word in shlex.split(line):
+            if word.startswith("-"):
+                assert word.partition("=")[0] in options(group), line
+            elif hasattr(group, "list_commands"):
+                group = group.get_command(None, word)
+                assert group is not None, line
+
+
+class Bench:
+    """A folder with an environment, in which blocks of a page are run."""
+
+    def __init__(self, folder: Path, *extras: str) -> None:
+        environment(folder / ".venv", *extras)
+        (folder / "docs").symlink_to(ROOT / "docs")
+        self.folder = folder
+        self.around = {"PATH": f"{folder}/.venv/bin:{os.environ['PATH']}", "HOME": str(folder)}
+        self.around |= {"PYTHONPATH": str(ROOT)}  # with the kernels which it has compiled
+
+    def run(self, text: str, *begin: str) -> None:
+        done = subprocess.run(
+            [*(begin or ("bash", "-ec")), text], cwd=self.folder, env=self.around, text=True, timeout=120,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{text}\n{done.stdout}"
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The demo, for all blocks beside it. It is the newest swarm of its folder, so commands find it."""
+    bench = Bench(tmp_path_factory.mktemp("beside"), "all")
+    words = ["swarm", "demo", "--port", "0", "--seconds", "600", "--no-live"]
+    demo = subprocess.Popen(
+        words, cwd=bench.folder, env=bench.around, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        for _ in range(60):
+            time.sleep(1.0)
+            asked = subprocess.run(["swarm", "status"], cwd=bench.folder, env=bench.around, capture_output=True)
+            if asked.returncode == 0:
+                break
+        yield bench
+        demo.send_signal(signal.SIGINT)
+        demo.communicate(timeout=120)
+    finally:
+        demo.kill()
+
+
+def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
+    for page in filter(is_written, PAGES):
+        for block in (each for each in commands(page) if each.said == ("beside", "swarm demo")):
+            beside.run(block.text)
+
+
+def runs(page: Path) -> list[Block]:
+    return [each for each in commands(page) if not each.said[0]] if is_written(page) else []
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.thorough] * bool(heavy), id=str(page.relative_to(ROOT)))
+        for page in PAGES
+        if (found := runs(page))
+        for heavy in [page.name != "README.md" and any(_HEAVY.search(each.text) for each in found)]
+    ],
+)
+def test_each_block_of_a_page_runs_in_its_order(page: Path, tmp_path: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    extras = {each for names in re.findall(r"pip install '\.\[([\w,]+)\]'", text) for each in names.split(",")}
+    bench = Bench(tmp_path, *(extras or {"all"}))
+    if "dem.tif" in text and _SYNTH not in text:
+        bench.run(_SYNTH)
+    for block in blocks(page):
+        if named := re.match(r"# ([\w.-]+\.\w+)\n", block.text):
+            (tmp_path / named[1]).write_text(block.text, encoding="utf-8")
+        elif block.said[0] or block not in commands(page):
+            continue
+        elif block.language == "python":
+            bench.run(block.text, "python", "-c")
+        else:
+            # The environment is what `pip` makes; a run is as short as shows that it starts and ends in order.
+            lines = (line for line in block.text.split("\n") if not line.startswith(("pip ", "source ")))
+            bench.run(re.sub(r"swarm (up|demo)\b[^\n#]*", r"\g<0> --seconds 2 --port 0 ", "\n".join(lines)))
