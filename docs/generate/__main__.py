@@ -39,7 +39,7 @@ _QOS = {
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
 _OPTION = re.compile(r"^\* `.*", re.MULTILINE)
 _OPTIONS = re.compile(r"(?:^\* `.*\n)+", re.MULTILINE)
-SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
 _SHARED = 2
 """An option with one text in this number of commands is explained once."""
@@ -74,17 +74,22 @@ def _load(group: Any) -> None:
 def _shared_once(text: str) -> tuple[list[str], str]:
     """Returns the rows of options that many commands share, and the page with names in place of these rows."""
     times = Counter(_OPTION.findall(text))
-    usual = {row.split("`")[1].partition(" ")[0]: row for row, _ in reversed(times.most_common())}
+    usual = {_name(row): row for row, _ in reversed(times.most_common())}
     shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
 
     def named(block: re.Match[str]) -> str:
         rows = block[0].splitlines()
-        names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
+        names = [_name(row) for row in rows if row in shared]
         told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[the swarm](#shared-options)")
         link = [f"* {told}"] if names else []
         return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
 
     return shared, _OPTIONS.sub(named, text)
+
+
+def _name(row: str) -> str:
+    """Returns the long name of an option."""
+    return re.sub(r"^-\w, ", "", row.split("`")[1]).partition(" ")[0]
 
 
 def measurements() -> str:
