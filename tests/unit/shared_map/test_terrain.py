@@ -25,7 +25,7 @@ from shared_map.terrain.terrain import build_terrain, build_truth, terrain_of_pa
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
-from swarm.errors import TerrainError
+from swarm.errors import StoreError, TerrainError
 from swarm.runtime.role import RoleSetup
 
 SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
@@ -99,7 +99,7 @@ def test_a_damaged_prepared_terrain_is_refused_with_a_sentence(tmp_path: Path, d
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     terrain = terrain_of_pace(np.ones((4, 4), np.float32))
-    with pytest.raises(TerrainError, match="cannot write"):
+    with pytest.raises(StoreError, match="cannot write"):
         save_prepared(tmp_path / "file" / "run", terrain, terrain.pace_s_per_m)
 
 
