@@ -21,15 +21,9 @@ from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, connec
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs" / "vehicle"
+EXAMPLES = ROOT / "docs" / "examples"
 ALSO = '\n[[targets]]\nname = "fox"\nwalk = "external"\n'
 RUST = os.environ.get("RUST_VEHICLE", "")
-
-
-def script(page: str) -> str:
-    """The one script of a page."""
-    (found,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
-    return str(found)
 
 
 class Run:
@@ -49,14 +43,14 @@ class Run:
             self.process.kill()
 
 
-@pytest.mark.parametrize("page", ["join.md", "tracker.md"])
-def test_a_complete_program_has_twenty_lines_at_most(page: str) -> None:
-    assert len([line for line in script(page).splitlines() if line.strip()]) <= 20
+@pytest.mark.parametrize("name", ["vehicle.py", "target.py"])
+def test_a_complete_program_has_twenty_lines_at_most(name: str) -> None:
+    assert len([line for line in (EXAMPLES / name).read_text().splitlines() if line.strip()]) <= 20
 
 
 def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live: LiveSwarm, swarm: Swarm) -> None:
     with swarm.observer() as watching:
-        run = Run(script("join.md"), live.endpoint)
+        run = Run((EXAMPLES / "vehicle.py").read_text(), live.endpoint)
         eventually(lambda: "rover" in watching.vehicles, 20, "the rover's first word")
         first = watching.vehicles["rover"]
         # On a busy machine an answer may be late: that is said, and asked again.
@@ -74,7 +68,7 @@ def test_the_tracker_of_the_page_moves_its_target_and_the_planner_follows(live: 
     with swarm.observer() as watching, swarm.vehicle("asker") as asker:
         asker.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
         assert asker.route("fox").status == "no_target"
-        run = Run(script("tracker.md"), live.endpoint)
+        run = Run((EXAMPLES / "target.py").read_text(), live.endpoint)
         eventually(lambda: asker.route("fox").ok, 20, "a route to the fox")
         place = watching.targets["fox"]
         eventually(lambda: watching.targets["fox"].x_m != place.x_m, 10, "its moving")

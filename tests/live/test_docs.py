@@ -10,9 +10,9 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import signal
 import subprocess
 import time
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,13 +23,14 @@ from launch_scripts.cli import command
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 WRITTEN = {ROOT / "docs" / folder for folder in ("design", "reference", "plugins")}
 """Folders of pages which are generated, are about the code, or whose programs other tests run."""
 PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|grep|journalctl|zenohd|uv|git"
 _COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
 _SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
-_HEAVY = re.compile(r"swarm (up|demo|run|simulate|study|sweep|replay|compare)\b")
+_HEAVY = re.compile(r"swarm (up|demo|runs|simulate|study)\b")
+SHELL = ("sh", "bash", "console")
 _SYNTH = "swarm terrain generate --rows 200 --cols 240 --out dem.tif --photo photo.tif"
 
 
@@ -72,7 +73,7 @@ def commands(page: Path) -> list[Block]:
     return [
         each
         for each in blocks(page)
-        if each.language == "sh" or (each.language == "python" and re.search(r"^(import|from) ", each.text, re.M))
+        if each.language in SHELL or (each.language == "python" and re.search(r"^(import|from) ", each.text, re.M))
     ]
 
 
@@ -84,10 +85,12 @@ def options(group: Any) -> set[str]:
     return {name for param in group.params for name in (*param.opts, *param.secondary_opts)} | {"-h", "--help"}
 
 
-@pytest.mark.parametrize("page", list(filter(is_written, PAGES)), ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if is_written(page)], ids=lambda page: str(page.relative_to(ROOT))
+)
 def test_every_command_of_a_page_has_the_name_and_the_options_of_one(page: Path) -> None:
-    text = "\n".join(each.text for each in blocks(page) if each.language == "sh").replace("\\\n", " ")
-    for line in re.findall(r"(?:^|[\s$]|\.venv/bin/)swarm (.*?)(?: # |&& |\| |$)", text, re.M):
+    text = "\n".join(each.text for each in blocks(page) if each.language in SHELL).replace("\\\n", " ")
+    for line in re.findall(r"(?:^|[\s$]|\.venv/bin/)swarm (.*?)(?:&& |\| |$)", re.sub(" +# .*", "", text), re.M):
         group: Any = command()
         for word in shlex.split(line):
             if word.startswith("-"):
@@ -101,7 +104,9 @@ class Bench:
     """A folder with an environment, in which blocks of a page are run."""
 
     def __init__(self, folder: Path, *extras: str) -> None:
-        environment(folder / ".venv", *extras)
+        site = environment(folder / ".venv", *extras)
+        about = next(file for file in distribution("terrain-swarm").files or () if file.name == "METADATA").locate()
+        (site / Path(str(about)).parent.name).symlink_to(Path(str(about)).parent)
         (folder / "docs").symlink_to(ROOT / "docs")
         self.folder = folder
         self.around = {"PATH": f"{folder}/.venv/bin:{os.environ['PATH']}", "HOME": str(folder)}
@@ -131,16 +136,15 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
             if asked.returncode == 0:
                 break
         yield bench
-        demo.send_signal(signal.SIGINT)
-        demo.communicate(timeout=120)
     finally:
-        demo.kill()
+        demo.kill()  # its processes end with it
+        demo.communicate(timeout=60)
 
 
 def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
     for page in filter(is_written, PAGES):
         for block in (each for each in commands(page) if each.said == ("beside", "swarm demo")):
-            beside.run(block.text)
+            beside.run(re.sub(r"swarm top\b", r"\g<0> --once", block.text))
 
 
 def runs(page: Path) -> list[Block]:

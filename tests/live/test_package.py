@@ -74,7 +74,7 @@ def test_what_the_wheel_says_of_itself_is_true(built: Path, wheel: Path) -> None
     )
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         inside = {each.partition("/")[2] for each in archive.getnames()}
-    links = re.findall(r"\]\((?!https?:)([^)#]+)", about.get_payload())
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", str(about.get_payload()))
     assert links
     assert set(links) <= inside
 

@@ -21,7 +21,8 @@ _SCRIPT = "#!{}\nimport sys\nfrom launch_scripts.entry import main\nsys.exit(mai
 @cache
 def packages(*extras: str) -> dict[str, Distribution]:
     """Distributions which the base and these extras install, by name."""
-    waiting, found = [*PROJECT["dependencies"], *(line for each in extras for line in EXTRAS[each])], {}
+    found: dict[str, Distribution] = {}
+    waiting = [*PROJECT["dependencies"], *(line for each in extras for line in EXTRAS[each])]
     while waiting:
         wanted = Requirement(waiting.pop())
         name = canonicalize_name(wanted.name)
@@ -39,7 +40,7 @@ def megabytes(found: dict[str, Distribution]) -> float:
 
 
 def environment(folder: Path, *extras: str) -> Path:
-    """Makes an environment with these extras and without the project. Returns the folder of its packages."""
+    """Makes an environment with these extras, and with the command. Returns the folder of its packages."""
     venv.create(folder, symlinks=True)
     site = folder / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
     for each in packages(*extras).values():
