@@ -255,7 +255,7 @@ def test_a_folder_that_cannot_be_written_is_a_failure_and_the_exit_code(
     (tmp_path / "file").write_text("")
     code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path / "file"))
     assert code == 1
-    assert "is not a folder" in " ".join(said.split())
+    assert "Not a directory; choose another --runs" in " ".join(said.split())
     code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path), "--json")
     assert (code, '"ok": true' in said) == (0, True)
 
