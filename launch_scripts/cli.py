@@ -45,7 +45,7 @@ class Root(TyperGroup):
       demo                  Run the built-in example
       new FILE              Write a scenario
       check SCENARIO        Check a scenario and this machine
-      up SCENARIO           Start a run
+      up SCENARIO [-d]      Start a run [in the background]
       down [RUN]            Stop a run
       ps [-a]               List running (all) runs
       status [--watch]      Show a running swarm

@@ -10,7 +10,11 @@ from swarm.errors import EXTRAS, ConfigError, require
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 _RUNS = ("demo", "up")
 """Commands that start processes."""
-_NEEDED = [package for package, extra in EXTRAS.items() if extra in ("planner", "terrain", "roles")]
+_NEEDED = [
+    package
+    for package, extra in EXTRAS.items()
+    if extra in ("planner", "terrain", "roles") and package != "setproctitle"  # it only names processes
+]
 """Packages of their processes."""
 _SAYS_MORE = ("-h", "--help", "--only", "-d", "--detach")
 """With words that begin so it is for the command to say which processes, if any."""

@@ -7,16 +7,16 @@ python -m docs.generate --check    exit code 1 if a file is not what the code sa
 from __future__ import annotations
 
 import argparse
+import inspect
 import re
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import typer
-from typer.cli import get_docs_for_click
 
 from docs.generate import scenario_page, wire_page
 from docs.generate.templates import filled
@@ -29,7 +29,7 @@ from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"
-_MEASUREMENTS = Path(__file__).with_name("measurements.toml")
+_MEASUREMENTS = tomllib.loads(Path(__file__).with_name("measurements.toml").read_text(encoding="utf-8"))
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
     "LATCHED": "reliable, transient local, last 1",
@@ -37,59 +37,43 @@ _QOS = {
     "TRANSFORMS": "reliable, volatile, last 100",
 }
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
-_OPTION = re.compile(r"^\* `.*", re.MULTILINE)
-_OPTIONS = re.compile(r"(?:^\* `.*\n)+", re.MULTILINE)
-SWARM = "`--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
 _SHARED = 2
 """An option with one text in this number of commands is explained once."""
-_LEFT_OUT = re.compile(r"\*\*(?:Usage|Commands)\*\*:\n\n(?:```[^`]*```\n|(?:\* .*\n)+)\n?")
-"""Parts of Typer's text which say nothing that the examples and the next sections do not say."""
-_OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `(?:-h, )?--help`.*\n", re.MULTILINE)
 
 
 def command_line() -> str:
-    """Returns the page of the command `swarm`: what Typer writes, with the examples of a command as code."""
-    root = cli.command()
-    _load(root)
-    text = get_docs_for_click(obj=root, ctx=typer.Context(root, info_name="swarm"), name="swarm")
-    text = _OF_EVERY_COMMAND.sub("", _LEFT_OUT.sub("", text.partition("\n")[2]))
-    text = re.sub(r"(?<=[a-z]) range(?=>)|  \[required\]|\n\*\*\w+\*\*:\n(?=\n\* )", "", text)
-    text = re.sub(r"(\n\* .*\n)\n+(?=\* )", r"\1", text)
-    text = re.sub(r"(?<=\n\* `)([^-`]\S*) <.*?>`", r"\1`", text)
-    text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
-    shared, text = _shared_once(text.strip())
-    return filled("cli", commands=text, shared=shared)
-
-
-def _load(group: Any) -> None:
-    """Puts the groups themselves in place of families, which are loaded when one is called."""
-    for name, each in group.commands.items():
-        if isinstance(each, Family):
-            each.group.name = name
-            group.commands[name] = each.group
-            _load(each.group)
-
-
-def _shared_once(text: str) -> tuple[list[str], str]:
-    """Returns the rows of options that many commands share, and the page with names in place of these rows."""
-    times = Counter(_OPTION.findall(text))
-    usual = {row.split("`")[1].partition(" ")[0]: row for row, _ in reversed(times.most_common())}
+    """Returns the page of the command `swarm`; an option which commands share is explained once."""
+    commands = [(words, _about(each), _rows(each)) for words, each in _commands("swarm", cli.command())]
+    times = Counter(row for _, _, rows in commands for row in rows)
+    usual = {row[0]: row for row, _ in reversed(times.most_common())}
     shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
-
-    def named(block: re.Match[str]) -> str:
-        rows = block[0].splitlines()
-        names = [row.split("`")[1].partition(" ")[0] for row in rows if row in shared]
-        told = ", ".join(f"`{name}`" for name in names).replace(SWARM, "[the swarm](#shared-options)")
-        link = [f"* {told}"] if names else []
-        return "\n".join([*(row for row in rows if row not in shared), *link]) + "\n"
-
-    return shared, _OPTIONS.sub(named, text)
+    return filled("cli", commands=commands, shared=shared, swarm=SWARM)
 
 
-def measurements() -> str:
-    """Returns the page of measurements."""
-    return filled("measurements", **tomllib.loads(_MEASUREMENTS.read_text(encoding="utf-8")))
+def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:
+    """Yields the words of each command, and the command; a group before its own."""
+    for name, each in group.commands.items():
+        command = each.group if isinstance(each, Family) else each
+        if not command.hidden:
+            yield f"{words} {name}", command
+            yield from _commands(f"{words} {name}", command) if hasattr(command, "commands") else ()
+
+
+def _about(command: Any) -> str:
+    """Returns the prose of a command, with its examples as code."""
+    text = inspect.cleandoc(command.help or "")
+    return _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
+
+
+def _rows(command: Any) -> list[tuple[str, str, str]]:
+    """Returns name, name with its type, and meaning of each argument and option."""
+    found, ctx = [], typer.Context(command)
+    for label, text in filter(None, (each.get_help_record(ctx) for each in command.params if each.name != "help")):
+        label = label.replace(" range>", ">") if label.startswith("-") else label.partition(" ")[0]
+        found.append((re.findall(r"--[\w-]+|^\S+", label)[-1], label, text.replace("  [required]", "")))
+    return found
 
 
 def ros2() -> str:
@@ -115,7 +99,7 @@ PAGES: dict[Path, Callable[[], str]] = {
     _REFERENCE / "cli.md": command_line,
     _REFERENCE / "land-cover.md": lambda: filled("land-cover", tables=TABLES.values()),
     _REFERENCE / "ways.md": lambda: filled("ways", kinds=BUILT_IN, columns=COLUMNS),
-    _REFERENCE.with_name("method") / "measurements.md": measurements,
+    _REFERENCE.with_name("method") / "measurements.md": lambda: filled("measurements", **_MEASUREMENTS),
     _REFERENCE / "ros2.md": ros2,
     _DESIGN / "index.md": design,
 }

@@ -141,11 +141,8 @@ def _nearest(runs: Path) -> Path:
 
 def _unwritable(runs: Path) -> str | None:
     """Reason why no run can be left in a folder of runs; None if one can."""
-    folder = _nearest(runs)
-    if not folder.is_dir():
-        return f"{folder} is not a folder; choose another --runs"
     try:
-        check_writable(folder)
+        check_writable(_nearest(runs))
     except StoreError as error:
         return f"{error}; choose another --runs"
     return None

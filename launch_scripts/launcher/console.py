@@ -157,8 +157,6 @@ def _counts(value: Any) -> bool:
 
 
 def _plain(value: Any) -> str:
-    if value is None:
-        return "not measured"
     if isinstance(value, dict):
         return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"

@@ -40,7 +40,7 @@ from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
-from launch_scripts.web.live_page import LivePage
+from launch_scripts.web.live_page import LivePage, when_free
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
@@ -169,7 +169,7 @@ class _Run:
         if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
             name = f"{self._scenario.name}, run {run_id}"
             told = {"life": "", "at_s": 0.0, "name": name}
-            self._page = LivePage(view.web_port, lambda: {**told, "state": self._doing()})
+            self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
             self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")

@@ -281,7 +281,8 @@ def load_view(
         give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
         life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
         told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
-        sinks.tell_page(lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said})
+        if sinks.page is not None:
+            sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
         return service
 
     return make

@@ -252,11 +252,6 @@ class Sinks:
         waits = self.page is not None and self.page.is_open
         return Audience(sum(one.now for one in each) or int(waits), sum(one.ever for one in each))
 
-    def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
-        """Sets the page's information about the run beside the view, asked once a second for each open page."""
-        if self.page is not None:
-            self.page.run = run
-
     def begin_file(self, path: Path) -> None:
         """Sends later logs of `streams` to this file, too. On a stream of its own: new sinks for `rec` would close
         the live view's port. Raises StoreError where nothing can be written to it."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from launch_scripts.observe.run_alarms import Alarm, is_serious
+from launch_scripts.observe.run_alarms import SERIOUS, Alarm
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
 from launch_scripts.plain_text import Duration
@@ -281,11 +281,8 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     reached += [] if captures is None else [_many(captures, "capture")]
     reached += [] if collisions is None else [_many(collisions, "collision")]
     forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
-    serious = [
-        alarm["text"]
-        for alarm in report.get("alarms") or []
-        if is_serious(alarm["kind"]) and alarm["over_s"] is None
-    ]
+    alarms = [alarm for alarm in report.get("alarms") or [] if alarm["over_s"] is None]
+    serious = [alarm["text"] for alarm in alarms if alarm["kind"] in SERIOUS]
     wrong = list(dict.fromkeys([*failures, *forbidden, *serious, *left_behind(report)]))
     more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
     how = f"Not all went well: {'; '.join(wrong[:_NAMED])}{more}." if wrong else WELL

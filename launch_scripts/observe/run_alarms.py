@@ -25,11 +25,13 @@ from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 SILENT_NS = 4 * NS_PER_S
 """Every process tells its counts once a second: one that has not for so long hangs, or cannot be heard."""
+_OLD_NS = 30 * NS_PER_S
+"""Evidence that is older is said to be so. Clocks of machines in one swarm differ by less."""
 STARTING_S = 30.0
 """A process that has not been seen yet is no alarm in the first seconds of a run."""
 
 
-_SERIOUS: Mapping[str, str] = {
+SERIOUS: Mapping[str, str] = {
     "collision": "collision",  # two vehicles were on one cell at one time
     "lethal-entry": "lethal entry",  # a vehicle entered a cell that is lethal in truth
     "body-collision": "hit a body",  # a vehicle and a body that reports its place met
@@ -38,7 +40,7 @@ _SERIOUS: Mapping[str, str] = {
     "keeper-behind": "keeper behind",  # marks wait to be stored, as on a full disk
 }
 KINDS: Mapping[str, str] = {
-    **_SERIOUS,
+    **SERIOUS,
     "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
     "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
     "behind": "behind",  # a process skips ticks: the machine is too slow for it
@@ -62,7 +64,7 @@ class Alarm:
     over_s      time of the run at which it was over; None while it lasts
     heard_s     time of the run of its last evidence
     began_ns    time when the run began, from which these count; None if it is not known
-    is_old      whether the last evidence is older than that of a process which is well
+    is_old      whether the last evidence is from long before the observer looks
     """
 
     kind: str
@@ -82,7 +84,7 @@ class Alarm:
 
     @property
     def serious(self) -> bool:
-        return is_serious(self.kind)
+        return self.kind in SERIOUS
 
     @property
     def label(self) -> str:
@@ -129,24 +131,12 @@ class Alarm:
         }  # fmt: skip
 
 
-def is_serious(kind: str) -> bool:
-    """Returns True of what must not be, or stops a part of the run."""
-    return kind in _SERIOUS
-
-
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
     """Returns all alarms of a run at an instant: open ones, the serious first, then closed ones, the newest
     first."""
     began_ns, wanted = latest.plan.started_ns or 0, list(targets)
-    found = [
-        (told, heard_ns)
-        for told, heard_ns in (
-            *((each, now_ns) for each in (*_missing(latest, wanted, now_ns), *_silent(latest, now_ns))),
-            *_lost(latest, wanted, now_ns),
-            *_told(latest),
-        )
-        if set(EVIDENCE.get(told.kind, (STATS,))) <= set(latest.hears)
-    ]
+    by_tokens = ((each, now_ns) for each in (*_missing(latest, wanted, now_ns), *_silent(latest, now_ns)))
+    found = (*by_tokens, *_lost(latest, wanted, now_ns), *_told(latest))
 
     def seconds(stamp_ns: int | None) -> float | None:
         return None if stamp_ns is None else max(stamp_ns - began_ns, 0) / NS_PER_S
@@ -162,9 +152,10 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
             told.target,
             seconds(heard_ns),
             began_ns,
-            is_old=now_ns - heard_ns > SILENT_NS,
+            is_old=now_ns - heard_ns > _OLD_NS,
         )
         for told, heard_ns in found
+        if set(EVIDENCE.get(told.kind, (STATS,))) <= set(latest.hears)
     ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))

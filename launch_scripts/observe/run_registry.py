@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from psutil import Process
 
 LAUNCHER_LOG = "launcher.log"
-_SAME_START_S = 0.05
+_SAME_START_S = 0.005
 """Starts of processes are known to a hundredth of a second."""
 
 
@@ -77,7 +78,9 @@ def registry() -> Path:
 
 def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
     """Registers this process as a launcher of the run in a folder, or changes its entry. Returns a sentence if that
-    is impossible."""
+    is impossible. An install without psutil, which has no launcher, registers nothing."""
+    if find_spec("psutil") is None:
+        return None
     try:
         entry = _Entry(
             folder=str(folder.resolve()),
@@ -144,6 +147,8 @@ def _started_s(pid: int) -> float:
 
 def _runs(entry: _Entry) -> bool:
     """Returns True if the launcher still runs: another process may have its pid by now."""
+    if find_spec("psutil") is None:
+        return False
     import psutil
 
     with suppress(psutil.Error):

@@ -327,7 +327,7 @@ def classified(source: Source, config: TerrainConfig, progress: Progress) -> Sou
         doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
         note = (
             f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
-            " exposed a little differently, is unknown and costs what the dearest of these classes does: see"
+            " exposed a little differently, is unknown and costs as the costliest of these classes: see"
             " terrain.labels and cost.class_factor.unknown"
         )
     else:

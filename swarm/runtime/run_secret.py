@@ -10,6 +10,7 @@ from pathlib import Path
 
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import ConfigError
+from swarm.files import writing
 from swarm.wire.access import Authenticator
 
 _SECRET_BYTES = 32
@@ -37,16 +38,12 @@ def _path() -> Path:
 
 def _secret(path: Path) -> bytes:
     """The secret in a file, which is made if there is none: by one of several processes that begin at once."""
-    try:
+    with writing(path):
         if not path.exists():
             _make(path)
         if path.stat().st_mode & 0o077:
             raise ConfigError(f"{path}: others may read this secret: chmod 600, or delete it to get a new one")
         secret = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot keep the secret of this user's swarms there: {error.strerror}"
-        ) from error
     if len(secret) != _SECRET_BYTES:
         raise ConfigError(
             f"{path}: {len(secret)} bytes, where {_SECRET_BYTES} were expected: delete it to get a new one"

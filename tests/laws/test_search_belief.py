@@ -59,17 +59,6 @@ def test_a_belief_sums_to_one_and_lies_where_the_target_can_be(
 
 
 @settings(max_examples=few(40), deadline=None)
-@given(_SIDES, _SIDES, _SEEDS)
-def test_what_moves_is_neither_lost_nor_made(rows: int, cols: int, seed: int) -> None:
-    blocks = blocks_of(GridSpec(rows, cols, METRES), _pace(rows, cols, seed), 20.0)
-    belief = Belief(blocks, 2.0)
-    for _ in range(20):
-        belief._drive(belief.step_s)
-    assert abs(float(belief.mass.sum(dtype=np.float64)) - 1.0) < 1e-4
-    assert not belief.total[~blocks.open].any()
-
-
-@settings(max_examples=few(40), deadline=None)
 @given(st.integers(2, 26), st.integers(2, 26), _SEEDS, st.booleans(), _PLACES)
 def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones_again(
     rows: int, cols: int, seed: int, known: bool, places: list[tuple[float, float]]

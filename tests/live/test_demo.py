@@ -38,13 +38,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     assert 1.0 <= report["gap"]["mean"] <= report["gap"]["max"] < 1.5
     assert report["payloads_dropped"] == 0
     assert len(read_tracks(run_dir / TRACKS_FILE).routes) >= 100, "routes that vehicles began are kept"
-    for name in (
-        "run.rrd",
-        "report.png",
-        "router-0.log",
-        "monitor-0.log",
-        "agent-a3.log",
-        "agent-a4.log",
-        "planner-ghost.log",
-    ):
+    for log in ("router-0", "monitor-0", "agent-a3", "agent-a4", "planner-ghost"):
+        assert (run_dir / f"{log}.log").stat().st_size > 0, log
+    for name in ("run.rrd", "report.png"):
         assert (run_dir / name).stat().st_size > 0, name

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from launch_scripts.deploy import certificates
@@ -32,18 +31,6 @@ def test_a_certificate_is_signed_by_the_folders_authority_and_names_its_bearer_a
     assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     good_for = made.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
     assert 29 <= good_for.days <= 30
-
-
-def test_keys_are_for_their_owner_only_and_the_authority_is_made_once(tmp_path: Path) -> None:
-    for name in ("a0", "a1"):
-        issue(tmp_path, name, [], 30)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        f"{n}.{k}" for n in ("ca", "a0", "a1") for k in ("pem", "key")
-    }
-    for key in tmp_path.glob("*.key"):
-        assert stat.S_IMODE(key.stat().st_mode) == 0o600
-    assert read(tmp_path / "a0.pem").issuer == read(tmp_path / "a1.pem").issuer
-    assert isinstance(authority(tmp_path).key, ec.EllipticCurvePrivateKey)
 
 
 def test_what_is_there_is_replaced_only_when_asked(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from launch_scripts.launcher.local_swarm import Backoff
 from launch_scripts.launcher.options import chosen_processes
-from launch_scripts.process_table import ROLES, STOP_ORDER, TABLE, processes_of
+from launch_scripts.process_table import ROLES, STOP_ORDER, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
 from swarm.errors import ConfigError
@@ -20,12 +20,6 @@ def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
         *("targets-0", "agent-a0", "agent-a1", "agent-a2"),
     ]
     assert [spec.name for spec in processes_of(scenario, ("router", "agent"))][:2] == ["router-0", "agent-a0"]
-
-
-def test_the_table_says_of_every_role_how_urgent_it_is_and_none_before_those_that_drive() -> None:
-    assert (
-        TABLE["agent"].niceness == TABLE["targets"].niceness == min(role.niceness for role in TABLE.values()) == 0
-    )
 
 
 def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:

@@ -92,7 +92,7 @@ def test_every_command_and_option_of_the_command_line_is_on_the_page():
         section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
         assert section
         for param in (each for each in command.params if not getattr(each, "hidden", False)):
-            assert param.opts[0] in section or param.name.upper() in section or param.metavar in section
+            assert any(name in section for name in (*param.opts, param.metavar or param.name.upper()))
         if isinstance(command, Family):
             assert all(f"### `swarm {name} {inner}`" in section for inner in command.group.commands)
 

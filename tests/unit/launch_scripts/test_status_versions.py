@@ -22,7 +22,7 @@ def told_by(**wire_versions: int) -> Status:
     """The status once agents with these wire versions have answered."""
     observer = OutsideObserver(SwarmModel().bus("status"), lambda _: None)
     for id, wire in wire_versions.items():
-        info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire)
+        info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire, crew=["agent-gone"])
         observer.take(Replied("observer-run", RUN, {}, info), 0)
     observer.take(AskEnded("observer-run", RUN, len(wire_versions), None), 0)
     return status_of(observer, 0)
@@ -38,6 +38,7 @@ def printed(status: Status) -> str:
 def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:
     status = told_by(a0=8, a1=9, a2=9)
     assert "an upgrade is under way: wire version 9, but 8 of agent-a0" in printed(status)
+    assert "1 of 4 did not answer within 4 s: agent-gone" in printed(status)
     assert {each["id"]: each["wire_version"] for each in status_fields(status)["processes"]} == {
         "a0": 8, "a1": 9, "a2": 9,
     }  # fmt: skip

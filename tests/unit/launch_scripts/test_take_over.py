@@ -105,16 +105,9 @@ class Machine:
 
 
 EVENTS = (
-    "t0 answers",
-    "t1 answers",
-    "t1 has no map",
-    "agent starts",
-    "agent waits",
-    "ten seconds pass",
-    "one ends",
-    "keeper crashes",
-    "keeper starts again",
-)
+    "t0 answers", "t1 answers", "t1 has no map", "agent starts", "agent waits", "ten seconds pass", "one ends",
+    "keeper crashes", "keeper starts again",
+)  # fmt: skip
 
 
 @settings(max_examples=few(200), deadline=None)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import random
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from planner_service import followers as module
-from planner_service.followers import Followers
+from planner_service.followers import Followers, MapIntake
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import Route, RouteOutline, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteOutline, RouteStatus
 
 GRID = GridSpec(20, 30, 10.0)
 
@@ -183,4 +184,10 @@ def test_a_change_concerns_routes_through_it_and_in_the_row_or_column_beside_it(
     route = Route(status=RouteStatus.OK, start=GRID.cell(7, 7), directions=directions, cost_s=1.0)
     followers.given("v", route, 0, 0, 0)
     row, col = (9, 7 + side * away) if across else (7 + side * away, 9)
-    assert followers.any_due_in([Window(row, col, row + 1, col + 1)], 0) == (away <= 1)
+    changed, concerned = [Window(row, col, row + 1, col + 1)], away <= 1
+    assert followers.any_due_in(changed, 0) == concerned
+    intake = MapIntake(SimpleNamespace(dirty=changed, grid=GRID, take_dirty=list), followers)  # type: ignore[arg-type]
+    assert intake.is_due(5, 9), "nothing was taken yet"
+    intake.take(5)
+    assert [intake.is_due(now_ns, 9) for now_ns in (4, 6, 14)] == [True, concerned, True]
+    assert intake.concerns(RouteBatch.of([route])) == concerned

@@ -78,11 +78,6 @@ def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
     assert not made.photo.any()
 
 
-def test_a_piece_takes_two_thirds_of_its_bytes_or_less() -> None:
-    raw = TERRAIN.grid.cells * 9
-    assert sum(len(tile.data) for tile in pieces(NEEDED)) < 0.7 * raw
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

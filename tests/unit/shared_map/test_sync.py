@@ -13,7 +13,7 @@ from shared_map.keeper.service import KeeperService
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
-from swarm.bus.bus import Asked
+from swarm.bus.bus import Asked, Event, Replied
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest
 from swarm.wire.topics import DIGEST, MARKS
@@ -66,6 +66,19 @@ def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -
     assert late.sync.joined
     assert all_equal([late, dead, alive])
     assert late.replica.take_newest_stamp_ns() is None  # old news say nothing about latency
+
+
+def test_a_keeper_answers_for_all_authors_and_an_agent_for_itself() -> None:
+    swarm = SwarmModel()
+    swarm.keeper("keeper", KeeperStore(":memory:"))
+    for name in ("a1.1", "a2.1"):
+        write(swarm.writer(name), swarm, [5])
+    swarm.run(1)
+    for named, authors in (({}, ["a1.1", "a1.1", "a2.1", "a2.1"]), ({"author": "a1.1"}, ["a1.1", "a1.1"])):
+        events: list[Event] = []
+        swarm.bus("asker").ask(MARKS, MarksRequest(), events.append, tag="t", **named)
+        swarm.run(1)
+        assert sorted(event.message.author for event in events if isinstance(event, Replied)) == authors  # type: ignore[attr-defined]
 
 
 def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import msgspec
@@ -26,7 +25,7 @@ from shared_map.terrain.terrain import build_terrain, build_truth, terrain_of_pa
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
-from swarm.errors import TerrainError
+from swarm.errors import StoreError, TerrainError
 from swarm.runtime.role import RoleSetup
 
 SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
@@ -64,12 +63,10 @@ def test_the_same_scenario_gives_the_same_digest_and_another_rule_another() -> N
     assert build_terrain(msgspec.structs.replace(SMALL, seed=3)).digest != digest
 
 
-def test_a_prepared_terrain_is_the_same_and_loads_in_a_blink(tmp_path: Path) -> None:
+def test_a_prepared_terrain_is_the_same(tmp_path: Path) -> None:
     scenario = with_cost(vehicle_radius_m=40.0)
     terrain, truth = prepare(tmp_path / "run", scenario)
-    started = time.perf_counter()
     again = load_prepared(tmp_path / "run", scenario_key(scenario))
-    assert time.perf_counter() - started < 0.05
     assert again is not None
     assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
     for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
@@ -102,7 +99,7 @@ def test_a_damaged_prepared_terrain_is_refused_with_a_sentence(tmp_path: Path, d
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     terrain = terrain_of_pace(np.ones((4, 4), np.float32))
-    with pytest.raises(TerrainError, match="cannot write"):
+    with pytest.raises(StoreError, match="cannot write"):
         save_prepared(tmp_path / "file" / "run", terrain, terrain.pace_s_per_m)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.config.scenario import NetworkConfig, TlsConfig
-from swarm.errors import ConfigError, ProtocolError
+from swarm.errors import ConfigError, ProtocolError, StoreError
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.topics import POSE, TABLE
@@ -81,13 +81,13 @@ def test_a_secret_that_others_may_read_or_that_is_cut_is_refused_by_name(secret:
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_that_cannot_be_written_is_named(secret: Path) -> None:
     secret.parent.parent.chmod(0o500)
-    with pytest.raises(ConfigError, match="cannot keep the secret"):
+    with pytest.raises(StoreError, match=f"cannot write {secret}"):
         authenticator_of(NetworkConfig(), "run")
 
 
 def test_a_file_in_the_place_of_the_folder_is_named(secret: Path) -> None:
     secret.parent.write_text("")
-    with pytest.raises(ConfigError, match=f"{secret}: cannot keep the secret"):
+    with pytest.raises(StoreError, match=f"cannot write {secret}"):
         authenticator_of(NetworkConfig(), "run")
 
 

@@ -37,7 +37,7 @@ from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.vehicles import Body
 from swarm.wire.route_columns import Route as WireRoute
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import BODY, FLEET, NOTE, RUN
+from swarm.wire.topics import BODY, FLEET, NOTE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE
 NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5.0), (500.1, -5.0), (5.0, -400.1)]
@@ -75,6 +75,7 @@ def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_le
         world.run(3.0)
         stamps = [body.stamp_ns for body in bodies]
         assert max(b - a for a, b in pairwise(stamps)) < 0.35e9, "well within the lease"
+        assert len(bodies) <= 13, "and no more often than every quarter of it"
         assert [body.seq for body in bodies] == list(range(1, len(bodies) + 1))
     world.run(0.01)
     assert bodies[-1].lease_s == 0
@@ -686,3 +687,11 @@ def test_a_stream_is_read_by_a_thread_and_by_asyncio_and_ends_when_closed() -> N
     for n in range(5):
         bounded.put(n)
     assert (bounded.next(0), bounded.next(0), bounded.next(0)) == (3, 4, None)
+
+
+def test_poses_of_a_target_go_out_twice_a_second(world: Swarm) -> None:
+    heard: list[Any] = []
+    world.bus("ear2").subscribe(POSE, heard.append, target="x")
+    Program(world).swarm.target("x").at(5.0, -5.0)
+    world.run(3.0)
+    assert 7 <= len(heard) <= 8

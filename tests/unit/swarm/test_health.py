@@ -225,6 +225,15 @@ def select_ready(manager: socket.socket) -> bool:
     return bool(select.select([manager], [], [], 0)[0])
 
 
+def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        name = f"terrain-swarm-test-{os.getpid()}"
+        listening.bind(f"\0{name}")
+        listening.settimeout(10)
+        supervisor_of({"NOTIFY_SOCKET": f"@{name}"}).turned(1)
+        assert listening.recv(100) == b"READY=1"
+
+
 @given(st.text(max_size=300))
 def test_no_text_makes_a_word_of_its_own(text: str) -> None:
     reading, writing = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)

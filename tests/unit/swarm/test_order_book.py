@@ -177,6 +177,13 @@ def test_the_last_target_stays() -> None:
     assert "is the last one" in refusal
 
 
+def test_no_target_is_added_where_no_process_moves_targets() -> None:
+    tracked = parse_scenario('[[targets]]\nname = "real"\nwalk = "external"')
+    refusal = judged(GiveOrder(subject="target", name="x", cell=1, new=True), OrderBook(), tracked, [], NOW)
+    assert isinstance(refusal, str)
+    assert "all of its scenario have trackers" in refusal
+
+
 def test_a_book_is_bounded_and_no_stamp_is_beyond_reach() -> None:
     book = OrderBook()
     assert book.merge([Order(subject="pause", name="", stamp_ns=NOW + MAX_AHEAD_NS + 1)], NOW) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -49,8 +51,16 @@ def test_a_large_plot_is_made_of_whole_regions(cell: int, regions: int) -> None:
     assert large.of(cell) == large.all[row // side * -(-GRID.cols // side) + col // side]
 
 
+def test_cells_are_adjacent_if_one_step_leads_from_one_to_the_other() -> None:
+    grid = GridSpec(4, 5, 1.0)
+    plots = Plots(grid, FIVE)
+    for one, other in itertools.product(range(grid.cells), repeat=2):
+        assert plots.adjacent(one, other) == (other in [cell for _, cell in grid.neighbours(one)])
+
+
 def test_plots_of_one_region_need_no_quorum_and_larger_ones_all_agents_but_two() -> None:
     assert Plots(GRID, FIVE).has_quorum([])
+    assert [Plots(GRID, FIVE[:n]).majority for n in (1, 2, 3, 5)] == [1, 1, 2, 2]
     assert [Plots(GRID, FIVE, WIDE).has_quorum(FIVE[:n]) for n in range(6)] == 3 * [False] + 3 * [True]
 
 
