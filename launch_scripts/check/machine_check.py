@@ -24,8 +24,6 @@ from swarm.errors import StoreError, SwarmError
 from swarm.files import check_writable
 
 PACKAGE = "terrain-swarm"
-_EXTRAS = ("all", "roles", "vectors")
-"""Packages that the command needs beyond the base install."""
 _ENOUGH_BYTES = 1 << 30
 """Minimum of free memory, and of free disk."""
 _ENOUGH_FILES = 1024
@@ -180,8 +178,7 @@ def _packages(runs: Path) -> Said:
 
     wrong, fine = [], 0
     for wanted in map(Requirement, importlib.metadata.requires(PACKAGE) or ()):
-        asked = wanted.marker is None or any(wanted.marker.evaluate({"extra": extra}) for extra in _EXTRAS)
-        if wanted.name == PACKAGE or not asked:
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": "all"}):
             continue
         here = _version(wanted.name)
         if here is None:
@@ -192,7 +189,7 @@ def _packages(runs: Path) -> Said:
             fine += 1
     if wrong:
         return "failure", f"{'; '.join(wrong)}: install the extra 'all' (docs/start/install.md)"
-    return "ok", f"{fine} are as pinned; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}"
+    return "ok", f"{fine} fit; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}"
 
 
 def _version(package: str) -> str | None:

@@ -54,6 +54,7 @@ def test_the_example_is_valid_by_the_schemas_of_kubernetes(version: str) -> None
 def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> None:
     spec, (container,) = PODS[name]["spec"], PODS[name]["spec"]["containers"]
     assert restricted(spec) == []
+    assert takes(container["args"], "0.0.0.0")
     assert container["securityContext"]["readOnlyRootFilesystem"]
     assert not spec["automountServiceAccountToken"]
     written = {mount["mountPath"] for mount in container["volumeMounts"] if not mount.get("readOnly")}
@@ -70,12 +71,11 @@ def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> 
     assert [volume["secret"]["secretName"] for volume in spec["volumes"] if "secret" in volume] == [name]
 
 
-@pytest.mark.parametrize("name", PODS)
-def test_the_command_line_takes_the_words_of_a_pod(name: str) -> None:
-    _, role, *words = PODS[name]["spec"]["containers"][0]["args"]
-    taken = command().commands["role"].commands[role].make_context(role, words).params
-    assert (taken["health_port"], taken["signals_address"], taken["log_format"]) == (HEALTH_PORT, "0.0.0.0", "json")
-    assert taken["scenario"] == "/etc/swarm/scenario.toml"
+def takes(words: list[str], address: str) -> bool:
+    """The command line has a role which takes the words of a container."""
+    taken = command().commands["role"].commands[words[1]].make_context(words[1], words[2:]).params
+    given = [taken[name] for name in ("health_port", "signals_address", "log_format", "scenario")]
+    return given == [HEALTH_PORT, address, "json", "/etc/swarm/scenario.toml"]
 
 
 def test_the_example_lets_pods_reach_routers_and_a_node_be_emptied() -> None:
@@ -130,6 +130,7 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
         for each in containers:
             service = compose["services"][each.name]
             assert service["command"][:2] == ["role", each.process.role]
+            assert takes(service["command"], "127.0.0.1")
             assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001:10001", True, ["ALL"])
             assert "privileged" not in service
             assert service["restart"] == "unless-stopped"

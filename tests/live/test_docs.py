@@ -23,9 +23,10 @@ from launch_scripts.cli import command
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-WRITTEN = {ROOT / "docs" / folder for folder in ("design", "reference", "plugins")}
+ELSEWHERE = {ROOT / "docs" / folder for folder in ("design", "reference", "plugins")}
 """Folders of pages which are generated, are about the code, or whose programs other tests run."""
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [page for page in PAGES if ELSEWHERE.isdisjoint(page.parents)]
 PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|grep|journalctl|zenohd|uv|git"
 _COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
 _SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
@@ -77,24 +78,15 @@ def commands(page: Path) -> list[Block]:
     ]
 
 
-def is_written(page: Path) -> bool:
-    return WRITTEN.isdisjoint(page.parents)
-
-
-def options(group: Any) -> set[str]:
-    return {name for param in group.params for name in (*param.opts, *param.secondary_opts)} | {"-h", "--help"}
-
-
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if is_written(page)], ids=lambda page: str(page.relative_to(ROOT))
-)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_of_a_page_has_the_name_and_the_options_of_one(page: Path) -> None:
     text = "\n".join(each.text for each in blocks(page) if each.language in SHELL).replace("\\\n", " ")
     for line in re.findall(r"(?:^|[\s$]|\.venv/bin/)swarm (.*?)(?:&& |\| |$)", re.sub(" +# .*", "", text), re.M):
         group: Any = command()
         for word in shlex.split(line):
             if word.startswith("-"):
-                assert word.partition("=")[0] in options(group), line
+                known = {name for param in group.params for name in (*param.opts, *param.secondary_opts)}
+                assert word.partition("=")[0] in known | {"-h", "--help"}, line
             elif hasattr(group, "list_commands"):
                 group = group.get_command(None, word)
                 assert group is not None, line
@@ -142,13 +134,9 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
-    for page in filter(is_written, PAGES):
+    for page in PAGES:
         for block in (each for each in commands(page) if each.said == ("beside", "swarm demo")):
             beside.run(re.sub(r"swarm top\b", r"\g<0> --once", block.text))
-
-
-def runs(page: Path) -> list[Block]:
-    return [each for each in commands(page) if not each.said[0]] if is_written(page) else []
 
 
 @pytest.mark.parametrize(
@@ -156,7 +144,7 @@ def runs(page: Path) -> list[Block]:
     [
         pytest.param(page, marks=[pytest.mark.thorough] * bool(heavy), id=str(page.relative_to(ROOT)))
         for page in PAGES
-        if (found := runs(page))
+        if (found := [each for each in commands(page) if not each.said[0]])
         for heavy in [page.name != "README.md" and any(_HEAVY.search(each.text) for each in found)]
     ],
 )

@@ -15,14 +15,10 @@ import yaml
 from rasterio.transform import from_origin
 from typer.testing import CliRunner, Result
 
-from launch_scripts.cli import command
 from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy.certificates import check_signed, hosts_of
-from launch_scripts.deploy.hosts import parse_hosts
-from launch_scripts.deploy.machine_plan import make_plan
-from launch_scripts.deploy.service_files import containers_of
 from launch_scripts.launcher.options import as_process
-from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.load import load_scenario
 from swarm.errors import ConfigError
 
 SCENARIO = """
@@ -63,18 +59,6 @@ def folder(tmp_path: Path) -> Path:
 def plan(folder: Path, *more: str) -> Result:
     line = f"plan {folder}/small.toml --hosts {folder}/hosts.toml --out {folder}/kits"
     return CliRunner().invoke(app, [*line.split(), *more], catch_exceptions=True)
-
-
-def test_the_command_line_takes_the_words_of_every_container() -> None:
-    scenario = parse_scenario('[[targets]]\ncount = 2\n[[groups]]\nname = "all"\nvehicles = 30')
-    made = make_plan(scenario, parse_hosts(HOSTS), "small-1")
-    for each in (each for host in made.hosts for each in containers_of(made, host)):
-        _, role, *words = each.words
-        taken = command().commands["role"].commands[role].make_context(role, words).params
-        assert taken["health_port"] == 9464
-        assert taken["signals_address"] == "127.0.0.1"
-        assert taken["log_format"] == "json"
-        assert taken["scenario"] == "/etc/swarm/scenario.toml"
 
 
 def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(folder: Path) -> None:

@@ -112,13 +112,15 @@ _FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")
 _FOLDER = re.compile(
     r"`((?:swarm|shared_map|planner_service|vehicle_agent|launch_scripts|tests|docs)/(?:[\w-]+/)*)`"
 )
+_RUN = re.compile(r"(?:python|pytest) ((?:[\w-]+/)+[\w-]+\.py)")
 _PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
 @pytest.mark.parametrize("page", _PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_file_and_folder_that_a_page_names_exists(page):
     text = page.read_text(encoding="utf-8")
-    named = [name for name in (*_FILE.findall(text), *_FOLDER.findall(text)) if not name.startswith("runs/")]
+    found = (*_FILE.findall(text), *_FOLDER.findall(text), *_RUN.findall(text))
+    named = [name for name in found if not name.startswith("runs/")]
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
@@ -133,9 +135,3 @@ def test_every_scenario_of_the_pages_is_accepted(folder):
     pages = [page.read_text(encoding="utf-8") for page in _PAGES if page.parent.name == folder]
     blocks = re.findall(r"^```toml\n(.*?)^```", "\n".join(pages), re.M | re.S)
     assert [msgspec.convert(tomllib.loads(block), Scenario) for block in blocks]
-
-
-def test_file_names_in_commands_exist():
-    for page in _PAGES:
-        for name in re.findall(r"(?:python|pytest) ((?:[\w-]+/)+[\w-]+\.py)", page.read_text(encoding="utf-8")):
-            assert (ROOT / name).is_file(), f"{page.name}: {name}"
