@@ -64,15 +64,22 @@ def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:
 def _about(command: Any) -> str:
     """Returns the prose of a command, with its examples as code."""
     text = inspect.cleandoc(command.help or "")
-    return _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
+    return _EXAMPLES.sub(lambda found: re.sub(r"^|\n+", lambda end: end[0][:1] + "    ", found[0]), text)
 
 
 def _rows(command: Any) -> list[tuple[str, str, str]]:
     """Returns name, name with its type, and meaning of each argument and option."""
     found, ctx = [], typer.Context(command)
     for label, text in filter(None, (each.get_help_record(ctx) for each in command.params if each.name != "help")):
-        label = label.replace(" range>", ">") if label.startswith("-") else label.partition(" ")[0]
-        found.append((re.findall(r"--[\w-]+|^\S+", label)[-1], label, text.replace("  [required]", "")))
+        value = r"=\1" if label.startswith("-") else ""
+        label = re.sub(r"(?<=[\w.\]]) <?([^<>]+?)(?: range)?>?$", value, label)
+        found.append(
+            (
+                re.findall(r"--[\w-]+|^\S+", label)[-1],
+                label,
+                text.replace("  [required]", "").replace("  [default: ", " ["),
+            )
+        )
     return found
 
 
