@@ -39,8 +39,6 @@ _QOS = {
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
 SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
-_SHARED = 2
-"""An option with one text in this number of commands is explained once."""
 
 
 def command_line() -> str:
@@ -48,7 +46,7 @@ def command_line() -> str:
     commands = [(words, _about(each), _rows(each)) for words, each in _commands("swarm", cli.command())]
     times = Counter(row for _, _, rows in commands for row in rows)
     usual = {row[0]: row for row, _ in reversed(times.most_common())}
-    shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
+    shared = sorted(row for row in usual.values() if times[row] > 1)
     return filled("cli", commands=commands, shared=shared, swarm=SWARM)
 
 
@@ -73,13 +71,8 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
     for label, text in filter(None, (each.get_help_record(ctx) for each in command.params if each.name != "help")):
         value = r"=\1" if label.startswith("-") else ""
         label = re.sub(r"(?<=[\w.\]]) <?([^<>]+?)(?: range)?>?$", value, label)
-        found.append(
-            (
-                re.findall(r"--[\w-]+|^\S+", label)[-1],
-                label,
-                text.replace("  [required]", "").replace("  [default: ", " ["),
-            )
-        )
+        text = text.replace("  [required]", "").replace("  [default: ", " [")
+        found.append((re.findall(r"--[\w-]+|^\S+", label)[-1], label, text))
     return found
 
 
