@@ -29,19 +29,19 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 PAGES = [page for page in PAGES if ELSEWHERE.isdisjoint(page.parents)]
 PROGRAMS = "swarm|pip|python|source|ssh|podman|kubectl|tar|cargo|curl|dask|kill|grep|journalctl|zenohd|uv|git"
 _COMMAND = re.compile(rf"(machine |another\$|\./launch_scripts/|\.venv/bin/|\w+=\S* |({PROGRAMS}) )")
-_SAID = re.compile(r"<!-- (not run|beside): (.+) -->")
+_SAID = re.compile(r"<!-- (not run: .+|beside: swarm demo) -->")
 _HEAVY = re.compile(r"swarm (up|demo|runs|simulate|study)\b")
 SHELL = ("sh", "bash", "console")
 _SYNTH = "swarm terrain generate --rows 200 --cols 240 --out dem.tif --photo photo.tif"
 
 
 class Block(NamedTuple):
-    """Commands or a file of a page, with the comment before it: ("not run" or "beside", text)."""
+    """Commands or a file of a page, with the comment before it."""
 
     line: int
     language: str
     text: str
-    said: tuple[str, str]
+    said: str
 
 
 def blocks(page: Path) -> list[Block]:
@@ -62,7 +62,7 @@ def blocks(page: Path) -> list[Block]:
             body = "\n".join(line[4:] for line in lines[begins : n + 1])
         if language:
             comment = said or whole
-            found.append(Block(begins + 1, language, body, (comment[1], comment[2]) if comment else ("", "")))
+            found.append(Block(begins + 1, language, body, comment[1] if comment else ""))
         if body or language:
             said = _SAID.fullmatch(body)
         n += 1
@@ -135,7 +135,7 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
     for page in PAGES:
-        for block in (each for each in commands(page) if each.said == ("beside", "swarm demo")):
+        for block in (each for each in commands(page) if each.said.startswith("beside")):
             beside.run(re.sub(r"swarm top\b", r"\g<0> --once", block.text))
 
 
@@ -144,7 +144,7 @@ def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
     [
         pytest.param(page, marks=[pytest.mark.thorough] * bool(heavy), id=str(page.relative_to(ROOT)))
         for page in PAGES
-        if (found := [each for each in commands(page) if not each.said[0]])
+        if (found := [each for each in commands(page) if not each.said])
         for heavy in [page.name != "README.md" and any(_HEAVY.search(each.text) for each in found)]
     ],
 )
@@ -157,7 +157,7 @@ def test_each_block_of_a_page_runs_in_its_order(page: Path, tmp_path: Path) -> N
     for block in blocks(page):
         if named := re.match(r"# ([\w.-]+\.\w+)\n", block.text):
             (tmp_path / named[1]).write_text(block.text, encoding="utf-8")
-        elif block.said[0] or block not in commands(page):
+        elif block.said or block not in commands(page):
             continue
         elif block.language == "python":
             bench.run(block.text, "python", "-c")
