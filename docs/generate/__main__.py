@@ -39,8 +39,6 @@ _QOS = {
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
 SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
-_SHARED = 2
-"""An option with one text in this number of commands is explained once."""
 
 
 def command_line() -> str:
@@ -48,7 +46,7 @@ def command_line() -> str:
     commands = [(words, _about(each), _rows(each)) for words, each in _commands("swarm", cli.command())]
     times = Counter(row for _, _, rows in commands for row in rows)
     usual = {row[0]: row for row, _ in reversed(times.most_common())}
-    shared = sorted(row for row in usual.values() if times[row] >= _SHARED)
+    shared = sorted(row for row in usual.values() if times[row] > 1)
     return filled("cli", commands=commands, shared=shared, swarm=SWARM)
 
 
@@ -64,15 +62,17 @@ def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:
 def _about(command: Any) -> str:
     """Returns the prose of a command, with its examples as code."""
     text = inspect.cleandoc(command.help or "")
-    return _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
+    return _EXAMPLES.sub(lambda found: re.sub(r"^|\n+", lambda end: end[0][:1] + "    ", found[0]), text)
 
 
 def _rows(command: Any) -> list[tuple[str, str, str]]:
     """Returns name, name with its type, and meaning of each argument and option."""
     found, ctx = [], typer.Context(command)
     for label, text in filter(None, (each.get_help_record(ctx) for each in command.params if each.name != "help")):
-        label = label.replace(" range>", ">") if label.startswith("-") else label.partition(" ")[0]
-        found.append((re.findall(r"--[\w-]+|^\S+", label)[-1], label, text.replace("  [required]", "")))
+        value = r"=\1" if label.startswith("-") else ""
+        label = re.sub(r"(?<=[\w.\]]) <?([^<>]+?)(?: range)?>?$", value, label)
+        text = text.replace("  [required]", "").replace("  [default: ", " [")
+        found.append((re.findall(r"--[\w-]+|^\S+", label)[-1], label, text))
     return found
 
 

@@ -3,7 +3,6 @@ is built (whether its locations are on passable ground, and connected)."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
+from swarm.config.explain import nearest
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
@@ -47,10 +47,8 @@ def files_named(scenario: Scenario) -> Iterator[Finding]:
 def _of_source(name: str) -> Iterator[Finding]:
     path, key = Path(name), "terrain.source"
     if not path.exists():
-        close = difflib.get_close_matches(path.name, BUILT_IN_TERRAINS, n=1, cutoff=0.6)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
         built_in = " or ".join(map(repr, BUILT_IN_TERRAINS))
-        yield failure(key, f"no such file {name}{hint}; built in are {built_in}")
+        yield failure(key, f"no such file {name}{nearest(path.name, BUILT_IN_TERRAINS)}; built in are {built_in}")
     elif path.is_file() and not is_terrain(path):
         yield failure(key, f"found {path.name}, expected elevation: {FILE_KINDS}, or a raster that GDAL reads")
     else:

@@ -170,9 +170,8 @@ def size(
 
     swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
 
-    Machines are used to 60 % of cores and memory, and links to half. A process that is too small for its load is
-    named: more machines do not help it. Beyond the measured swarms the table is extrapolated. They had the speeds
-    and the density of the scenario `thousand`; see docs/design/measurement.md for the table and its errors.
+    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured
+    swarms the table is extrapolated; docs/design/measurement.md has it and its errors.
 
     Exit code 1 if a process has to do more than one core can: more machines do not help it.
 

@@ -45,7 +45,7 @@ AsScenario = Annotated[bool, typer.Option(hidden=True)]
 def pause(where: Where, as_json: AsJson = False) -> int:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
-    Vehicles drive to the middle of the cell that they are entering and stop there. Planners go on planning.
+    Vehicles stop in the middle of the cell that they are entering.
 
     swarm order pause
 

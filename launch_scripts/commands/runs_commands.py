@@ -80,8 +80,9 @@ def down(run: RunArgument = None) -> int:
     run  Name of the run, or its folder; if not given, the one that runs.
     """
     from launch_scripts.launcher.console import Terminal, what_is_left
+    from launch_scripts.observe.run_folder import read_report
     from launch_scripts.observe.run_registry import registered
-    from swarm.errors import ConfigError
+    from swarm.errors import ConfigError, SwarmError
 
     running = [each.name for each in registered() if each.launchers]
     if run is None and len(running) > 1:
@@ -99,6 +100,8 @@ def down(run: RunArgument = None) -> int:
     if left:
         terminal.say(f"run {found.name} still ends after {_DOWN_S:g} s; `swarm down` once more kills it", "red")
         return 1
+    with suppress(SwarmError):
+        terminal.say(str(read_report(found.folder).get("verdict", "")))
     for line in [f"run {found.name} has ended; its folder is {found.folder}", *what_is_left(found.folder)]:
         terminal.say(line)
     return 0

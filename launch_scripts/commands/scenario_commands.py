@@ -200,8 +200,7 @@ def check(
 ) -> int:
     """Check a scenario before a run: files, terrain, ports and this machine.
 
-    It checks keys and values, files, the terrain and the locations on it, certificates, ports, plug-ins, and
-    whether this machine is large enough. Exit code 1 if the scenario cannot run. Runs the modules of its plug-ins.
+    Exit code 1 if the scenario cannot run. Runs the modules of its plug-ins.
 
     swarm check my.toml
 

@@ -32,7 +32,7 @@ ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="A .toml file, or the name of a built-in scenario such as jacksboro.",
+        help="A .toml file, or a built-in scenario such as jacksboro.",
         autocompletion=complete.scenarios,
     ),
 ]
@@ -61,7 +61,7 @@ SignalsAddress = Annotated[
     str,
     typer.Option(
         metavar="ADDRESS",
-        help="Where the port of figures and health listens: 0.0.0.0 for probes from other machines.",
+        help="Address of the port of figures and health; 0.0.0.0 for other machines.",
     ),
 ]
 LogFormatOption = Annotated[

@@ -43,12 +43,6 @@ if TYPE_CHECKING:
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
-    swarm terrain info dem.tif
-    swarm terrain cost jacksboro --picture cost.png
-    swarm terrain classify dem.tif photo.tif --picture classes.png
-    swarm terrain rules --picture rules.png
-    swarm terrain generate --out dem.tif --photo photo.tif
-
     Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()

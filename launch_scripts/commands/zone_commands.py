@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
 
-    A zone is held by the shared map: every planner and vehicle goes by it, processes that start later do, too, and
-    what vehicles find there does not change it.
+    The shared map holds a zone: all planners and vehicles go by it, also later ones.
     """)
 _LASTS = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}

@@ -356,7 +356,7 @@ class RecordingWatch:
         try:
             check_space(self._path.parent)
         except StoreError as error:
-            return str(error)
+            return str(error).rpartition(": ")[2]  # which file it is stands before
         return "it does not grow"
 
 

@@ -34,5 +34,5 @@ def test_where_nothing_more_can_be_written_the_swarm_goes_on_and_says_so(tmp_pat
     assert f"monitor-0: the recording {recording} has ended: File too large" in told.stdout
     lines = [" ".join(line.split()) for line in told.stdout.splitlines()]
     assert "vehicles that had a route 12" in lines
-    assert "restarts 0" in lines
+    assert not [line for line in lines if line.startswith("restarts ")]
     assert lines[-1] == f"cannot write {run_dir / 'report.png'}: File too large"

@@ -118,6 +118,7 @@ def test_a_person_gives_an_order_by_a_selector_and_reads_json(live: LiveSwarm) -
     [
         (("zone", "add", "--polygon", "0,0 5,5 0,5 5,0"), "cross"),
         (("set", "seed", "4"), "cannot change while the swarm runs"),
+        (("set", "time_scale", "-3"), "-3.0 is not in 0.001 ... 1000"),
     ],
 )
 def test_a_bad_order_gets_a_sentence(live: LiveSwarm, words: tuple[str, ...], says: str) -> None:

@@ -119,12 +119,10 @@ def complaint(arguments: list[str]) -> str:
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
-    assert "there is no store" in complaint(["show", str(tmp_path / "none")])
     assert "write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
     assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
     junk = tmp_path / "junk"
     junk.write_text("no map")
-    assert "cannot read the store" in complaint(["show", str(junk)])
     assert "not an exported map: file" in complaint(["import", str(junk), str(tmp_path / "x.sqlite")])
 
 

@@ -191,8 +191,3 @@ def test_a_mistake_is_answered_with_what_to_do(
     assert len(said.splitlines()) <= 2, said
     assert len(said) <= LONGEST_ANSWER, said
     assert not any(place.glob("runs/*")), "what was refused is no run, and leaves none"
-
-
-def test_there_are_a_hundred_mistakes() -> None:
-    assert len(MISTAKES) >= 100
-    assert len({name_of(mistake) for mistake in MISTAKES}) > 100, "they differ"

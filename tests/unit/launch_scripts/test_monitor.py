@@ -371,8 +371,7 @@ sinks.close()
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
     ).stdout.splitlines()
-    why = f"cannot write {tmp_path}: File too large; another begins when there is space"
-    ended = f"the recording {tmp_path / 'run.rrd'} has ended: {why}"
+    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
     begun = f"True the recording goes on in {tmp_path / 'run-2.rrd'}"
     assert told == [f"5 False {ended}", f"65 False {ended}", f"76 {begun}"]
     assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 3

@@ -29,7 +29,7 @@ def run(*words: object) -> str:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     size = ("--rows", 300, "--cols", 280, "--seed", 4, "--rivers", 0, "--roads", 0)
-    run("synth", *size, "--out", folder / "dem.tif", "--photo", folder / "photo.tif")
+    run("generate", *size, "--out", folder / "dem.tif", "--photo", folder / "photo.tif")
     return folder
 
 
@@ -124,12 +124,12 @@ def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) 
     [
         (("info", "nowhere.tif"), "does not exist"),
         (("cost", "nowhere"), "no scenario 'nowhere'"),
-        (("synth", "--out", "dem.xyz", "--rows", 9, "--cols", 9), "write .tif or .tiff or .npz"),
-        (("synth", "--out", "/nowhere/dem.tif", "--rows", 9, "--cols", 9), "cannot write"),
+        (("generate", "--out", "dem.xyz", "--rows", 9, "--cols", 9), "write .tif or .tiff or .npz"),
+        (("generate", "--out", "/nowhere/dem.tif", "--rows", 9, "--cols", 9), "cannot write"),
         (("cost", "synthetic", "--picture", "/nowhere/cost.png"), "--picture .* cannot write there, the folder"),
         (("rules", "--picture", "/proc/rules.png"), r"cannot write /proc/rules\.png: No such file"),
         (("cost", "synthetic", "--picture", "/tmp"), "it is a folder"),
-        (("synth", "--out", "d.tif", "--photo", "photo.png", "--rows", 9, "--cols", 9), "write .tif or .tiff"),
+        (("generate", "--out", "d.tif", "--photo", "photo.png", "--rows", 9, "--cols", 9), "write .tif or .tiff"),
     ],
 )
 def test_a_mistake_is_a_sentence(words: tuple[object, ...], sentence: str) -> None:

@@ -12,7 +12,7 @@ from support import slow_twins as naive
 from support.effort import few
 from support.kernel_oracle import find_strides
 from support.planner_play import Play
-from support.planner_strategies import RULES, Job, Marks, Move, random_pace
+from support.planner_strategies import RULES, Job, Move, random_pace
 
 from planner_service import growth_times
 from planner_service.growth_times import WindowSchedule
@@ -52,19 +52,7 @@ def test_strides_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: d
     rng = np.random.default_rng(3)
     config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, **rules)  # type: ignore[arg-type]
     play = Play(thin_walls(rng, 32, 0.5), config)
-    kinds = set()
-    for step in range(36):
-        play.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
-        if step % 5 == 4:
-            play.happen(Marks(step, 2))
-        if step == 2:
-            play.happen(Job("begin"))
-            play.happen(Job("end"))
-        if play.tree.ready:
-            kinds.add(play.last.kind)
-        if step % 9 == 8:
-            play.check()
-    assert "coarse" in kinds
+    assert "coarse" in play.walk(rng, 36, 5)
     play.check()
 
 

@@ -197,14 +197,13 @@ def test_the_first_job_of_a_worker_is_as_urgent_as_its_process_and_later_ones_gi
 
 
 def test_closing_a_worker_waits_for_no_job_and_begins_no_other():
-    inbox, began, release = Inbox(), threading.Event(), threading.Event()
+    inbox, began, release, ended = Inbox(), threading.Event(), threading.Event(), threading.Event()
     worker = ThreadWorker("w", inbox)
-    worker.submit("kernel", lambda: (began.set(), release.wait(10.0)), inbox.post)
+    worker.submit("kernel", lambda: (began.set(), release.wait(10.0), ended.set()), inbox.post)
     worker.submit("forgotten", lambda: 1 // 0, inbox.post)
     assert began.wait(5.0)
-    began_s = time.monotonic()
     worker.close()
-    assert time.monotonic() - began_s < 0.2
+    assert not ended.is_set()
     release.set()
     assert isinstance(inbox.take(5.0), WorkDone)
     assert inbox.take(0.1) is None
@@ -321,10 +320,8 @@ def test_a_stop_waits_for_no_kernel():
     process = subprocess.Popen([sys.executable, "-c", WORKING], stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline() == b"up\n"
-    began_s = time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=30)
-    assert time.monotonic() - began_s < 2.0
     assert (out, process.returncode) == (b"stopped\n", 0)
 
 
