@@ -141,14 +141,15 @@ def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:
 
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(page, marks=[pytest.mark.thorough] * bool(heavy), id=str(page.relative_to(ROOT)))
-        for page in PAGES
-        if (found := [each for each in commands(page) if not each.said])
-        for heavy in [page.name != "README.md" and any(_HEAVY.search(each.text) for each in found)]
-    ],
+    [page for page in PAGES if any(not each.said for each in commands(page))],
+    ids=lambda page: str(page.relative_to(ROOT)),
 )
-def test_each_block_of_a_page_runs_in_its_order(page: Path, tmp_path: Path) -> None:
+def test_each_block_of_a_page_runs_in_its_order(page: Path, tmp_path: Path, pytestconfig: pytest.Config) -> None:
+    """Runs of swarms only with `--thorough`, but those of the README."""
+    everything = pytestconfig.getoption("--thorough") or page.name == "README.md"
+    todo = [each for each in commands(page) if not each.said and (everything or not _HEAVY.search(each.text))]
+    if not todo:
+        pytest.skip("runs of swarms only, for --thorough")
     text = page.read_text(encoding="utf-8")
     extras = {each for names in re.findall(r"pip install '\.\[([\w,]+)\]'", text) for each in names.split(",")}
     bench = Bench(tmp_path, *(extras or {"all"}))
@@ -157,11 +158,9 @@ def test_each_block_of_a_page_runs_in_its_order(page: Path, tmp_path: Path) -> N
     for block in blocks(page):
         if named := re.match(r"# ([\w.-]+\.\w+)\n", block.text):
             (tmp_path / named[1]).write_text(block.text, encoding="utf-8")
-        elif block.said or block not in commands(page):
-            continue
-        elif block.language == "python":
+        elif block in todo and block.language == "python":
             bench.run(block.text, "python", "-c")
-        else:
+        elif block in todo:
             # The environment is what `pip` makes; a run is as short as shows that it starts and ends in order.
             lines = (line for line in block.text.split("\n") if not line.startswith(("pip ", "source ")))
             bench.run(re.sub(r"swarm (up|demo)\b[^\n#]*", r"\g<0> --seconds 2 --port 0 ", "\n".join(lines)))

@@ -68,7 +68,7 @@ def test_what_the_wheel_says_of_itself_is_true(built: Path, wheel: Path) -> None
     # No index and no address has it yet; both would be wrong somewhere else too.
     assert {"Home-page", "Author", "Author-email", "Project-URL"}.isdisjoint(about.keys())
     assert {name.partition("/")[0] for name in names} == {*OURS, names[-1].partition("/")[0]}
-    # What works in a checkout only stays there.
+    # Scripts of a checkout are not in it.
     assert {"demo", "test", "docs", "bench"}.isdisjoint(
         Path(n).name for n in names if n.startswith("launch_scripts/")
     )
