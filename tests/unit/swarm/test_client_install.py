@@ -1,4 +1,4 @@
-"""The install of a robot: the client library imports little, quickly, and reads every message without NumPy."""
+"""The install of a robot: the client library imports little, and reads every message without NumPy."""
 
 from __future__ import annotations
 
@@ -36,12 +36,11 @@ BLOCKED = f"import sys; sys.modules.update(dict.fromkeys({LARGE!r}))\n"
 """Makes them as good as not installed."""
 
 
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    at_home = {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
     return subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **at_home, **environment}, capture_output=True, text=True,
-        timeout=60, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 def test_the_client_imports_nothing_large() -> None:
@@ -49,12 +48,6 @@ def test_the_client_imports_nothing_large() -> None:
     assert python(code).stdout == "[]\n"
     done = python(BLOCKED + "import swarm.client.connection, swarm.bus.zenoh_bus, swarm.config.load; print('fine')")
     assert done.stdout == "fine\n", done.stderr
-
-
-def test_the_client_imports_within_a_third_of_a_second() -> None:
-    """The processor's time, the best of five: 0.13 s on two shared virtual cores, with its bytecode compiled."""
-    code = "import time; began_s = time.process_time(); import swarm.client; print(time.process_time() - began_s)"
-    assert min(float(python(code, PYTHONDONTWRITEBYTECODE="").stdout) for _ in range(5)) < 0.33
 
 
 def test_without_numpy_every_message_is_read_as_with_it() -> None:
