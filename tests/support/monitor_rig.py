@@ -18,7 +18,6 @@ from launch_scripts.monitor.view_outputs import Pen, Sinks
 from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
-from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
 from swarm.wire.messages import Message
@@ -30,7 +29,6 @@ from swarm.wire.topics import BELIEVED, BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
 
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
-FRAME_NS = NS_PER_S // 10
 NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
 
 

@@ -14,7 +14,9 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
+from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.orders import Order
 from swarm.wire.topics import MARKS
 
 GRID = GridSpec(96, 96, 10.0)
@@ -70,6 +72,12 @@ targets = ["t1"]
     scenario = parse_scenario(text)
     assert readable_for_target(scenario, "t0") == {"red", "blue", "grey"}
     assert readable_for_target(scenario, "t1") == {"blue", "grey"}
+    book = OrderBook()
+    book.merge([Order(subject="group", name="blue", stamp_ns=1, targets=["t1"])], 1)
+    ordered = [
+        readable_for_target(scenario, t, lambda group: book.targets_of(group, scenario)) for t in ("t0", "t1")
+    ]
+    assert ordered == [{"red"}, {"blue", "grey"}]
 
 
 @pytest.mark.parametrize(

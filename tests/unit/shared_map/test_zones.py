@@ -15,14 +15,12 @@ from support.swarm_model import SwarmModel
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
-from shared_map.replication.mark_filter import readable_for_target
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
-from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.map_data import MarkKind
-from swarm.wire.messages.orders import Order, Zone, ZoneOrder, Zones
+from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
 from swarm.wire.topics import ZONES
 
 ROWS, COLS = 40, 70
@@ -277,31 +275,6 @@ def test_who_hears_other_groups_forgets_those_it_does_not_hear_any_more_and_keep
     replica.read_groups(None)
     replica.merge([set_of("red.a1.1", 0, 1, {0: (MarkKind.LETHAL, 0.0, 5)}, group="red")])
     assert world.lethal() == SQUARE_CELLS | {0}
-
-
-def test_the_planner_of_a_target_hears_the_groups_that_were_ordered_to_chase_it() -> None:
-    scenario = parse_scenario("""
-[[targets]]
-name = "t"
-count = 2
-[[groups]]
-name = "red"
-writes = []
-targets = ["t0"]
-[[groups]]
-name = "blue"
-reads = []
-targets = ["t1"]
-""")
-    book = OrderBook()
-
-    def heard(target: str) -> frozenset[str] | None:
-        return readable_for_target(scenario, target, lambda group: book.targets_of(group, scenario))
-
-    assert heard("t1") == readable_for_target(scenario, "t1") == {"blue"}
-    book.merge([Order(subject="group", name="red", stamp_ns=1, targets=["t1"])], 1)
-    assert heard("t1") is None, "that is all groups"
-    assert heard("t0") == set()
 
 
 def test_rows_of_no_sets_are_none() -> None:

@@ -59,3 +59,10 @@ def test_a_part_of_a_value_is_no_column(struct: type[Bounded]) -> None:
     with pytest.raises(ValueError, match=re.escape(f"values has {width - 1} bytes, not a column of")):
         struct(b"\0" * (width - 1))
     assert msgspec.structs.asdict(struct(b"\0" * width)) == {"values": b"\0" * width}
+
+
+def test_a_refusal_names_the_bounds_and_of_floats_that_nan_is_none() -> None:
+    assert fault(Floats, np.array([100], "<f8").tobytes()) == (
+        "values has 100.0, expected float64 of -2.5 ... 7, without NaN"
+    )
+    assert fault(Whole, np.array([100], "<i8").tobytes()) == "values has 100, expected int64 of -3 ... 9"

@@ -1,4 +1,4 @@
-"""What a process asks when it starts, and what it answers to operators and to other processes."""
+"""Questions of a process that starts, and its answers to operators and to other processes."""
 
 from __future__ import annotations
 
