@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.pulled_routes import Puller
+from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb
+from swarm.config.explain import choice
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import Route, RouteStatus, directions_of
@@ -80,7 +83,9 @@ class RouteFinder:
     Raises
     ------
     ValueError
-        On a pace that is NaN, zero or negative, or an array without two dimensions.
+        On a pace that is NaN, zero or negative, an array without two dimensions, or an unknown strategy.
+    TypeError
+        On a row or column that is no whole number.
     """
 
     def __init__(
@@ -97,16 +102,18 @@ class RouteFinder:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, resolution_m)
-        self._config = PlannerConfig(**{"strategy": "full", **settings})
+        if (strategy := settings.setdefault("strategy", "full")) not in STRATEGIES:
+            raise ValueError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
+        self._config = PlannerConfig(**settings)
         self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
         self._version = 0
-        self._target = self.grid.cell(*target)
+        self._target = self._cell(*target)
         self._update([])
 
     def move(self, target: tuple[int, int]) -> None:
         """The target is in another cell. Raises OutsideGridError, and changes nothing, outside the grid."""
-        self._target = self.grid.cell(*target)
+        self._target = self._cell(*target)
         self._update([])
 
     def change(self, pace: Any, row: int = 0, col: int = 0) -> None:
@@ -126,12 +133,16 @@ class RouteFinder:
 
     def route(self, row: int, col: int) -> FoundRoute:
         """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status."""
-        cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
+        cell = self._cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
         cells = np.array([(row, col)], np.int64)
         if found.status is RouteStatus.OK:
             cells = np.stack(np.divmod(np.array(walk(self.grid, cell, found.directions)), self.grid.cols), axis=1)
         return FoundRoute(found.status, cells, found.cost_s, found.lower_bound_s, found.length_m)
+
+    def _cell(self, row: int, col: int) -> int:
+        """The index of a cell. Raises TypeError on a row or column that is no integer, OutsideGridError outside."""
+        return self.grid.cell(operator.index(row), operator.index(col))
 
     def pull(self, route: FoundRoute) -> PulledRoute:
         """A route pulled straight: fewer turns, less time, no lethal cell and no corner that its steps may not cut.

@@ -174,7 +174,14 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         "seconds": chosen.seconds,
         "terrain": terrain,
         "cost": cost if chosen.preset else {**cost, "max_slope_deg": 35.0},
-        "targets": [{"name": "t", "count": chosen.targets, "walk": chosen.walk, "speed_m_per_s": 4.0}],
+        "targets": [
+            {
+                "name": "t" if (chosen.targets or 0) > 1 else "t0",
+                "count": chosen.targets,
+                "walk": chosen.walk,
+                "speed_m_per_s": 4.0,
+            }
+        ],
         "groups": [{"name": "all", "vehicles": chosen.vehicles, "start": "spread"}],
         "vehicles": {
             "per_agent": min(max(_LEAST_PER_AGENT, -(-(chosen.vehicles or 0) // _AGENTS)), MOST_PER_AGENT),

@@ -289,6 +289,6 @@ def tunnel(port: int) -> str:
 def _shown(path: Path) -> str:
     """A path as one would type it here: relative to the present folder if it is below that."""
     try:
-        return str(path.relative_to(Path.cwd()))
+        return str(path.relative_to(here)) if (here := Path.cwd()) != Path("/") else str(path)
     except (ValueError, OSError):
         return str(path)

@@ -23,6 +23,8 @@ from swarm.errors import ConfigError, StoreError
 from swarm.files import check_writable, write_file
 
 SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
+_USUAL = Path("runs")
+"""The folder of all runs, if no other is given. Runs which are elsewhere are in the registry."""
 LAST = "LAST"
 """In the folder of all runs: a link to the newest; where links are impossible a file that holds its name."""
 _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
@@ -111,8 +113,8 @@ def point_last(folder: Path) -> str | None:
 
 
 def find_run(name: str, runs: Path) -> Path:
-    """The folder of a run: a path, its name in `runs`, or else the name of one that is registered; `LAST` where it
-    is a file, too. Raises ConfigError."""
+    """The folder of a run: a path, or its name in `runs`, where `LAST` may be a file. If `runs` is the usual folder,
+    also the name of a registered run, of which `LAST` is the newest. Raises ConfigError."""
     for path in (Path(name), runs / name):
         if path.is_dir():
             return path
@@ -120,12 +122,10 @@ def find_run(name: str, runs: Path) -> Path:
             named = path.parent / read_text(path, FileKind.RUN).strip()
             if named.is_dir():
                 return named
-    for run in registered():
+    for run in registered() if runs == _USUAL else ():
         if name in (run.name, LAST):
             return run.folder
-    raise ConfigError(
-        f"there is no run {name!r}: neither a folder nor in {runs}, nor registered (`swarm ps -a` lists yours)"
-    )
+    raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}; `swarm ps -a` lists your runs")
 
 
 def lacks(folder: Path, file: str) -> ConfigError:

@@ -7,7 +7,7 @@ import pytest
 from support.bus_world import Box, World, answering, asked, marks, note, pose
 from support.makers import run_info
 
-from docs.generate.wire_page import PATH as WIRE_PAGE
+from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied

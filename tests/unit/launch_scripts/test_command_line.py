@@ -171,6 +171,7 @@ def test_ids_come_from_the_scenario_that_is_named_or_from_the_newest_run(newest_
 
 def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SWARM_STATE", str(tmp_path))
     (tmp_path / "broken.toml").write_text("seed = ")
     assert offered("role", "planner", "broken.toml", "--target", "") == []
     assert offered("runs", "compare", "") == []
