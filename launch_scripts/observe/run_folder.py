@@ -113,8 +113,8 @@ def point_last(folder: Path) -> str | None:
 
 
 def find_run(name: str, runs: Path) -> Path:
-    """The folder of a run: a path, or its name in `runs`, where `LAST` may be a file. If `runs` is the usual folder,
-    also the name of a registered run, of which `LAST` is the newest. Raises ConfigError."""
+    """The folder of a run: a path, or its name in `runs`, where `LAST` may be a file. In the usual folder also the
+    name of a registered run, of which `LAST` is the newest. Raises ConfigError."""
     for path in (Path(name), runs / name):
         if path.is_dir():
             return path

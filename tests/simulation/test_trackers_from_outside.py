@@ -176,7 +176,7 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     line = next(each for each in simulation.recorder.summary(_now_ns(simulation)).targets if each.id == "x")
     assert line.lost
     assert line.pose_age_s == pytest.approx(simulation.now_s - 12, abs=0.8)
-    assert line.title == f"x (lost {line.pose_age_s:.0f} s)"
+    assert line.title == f"x (lost for {line.pose_age_s:.0f} s)"
     before = captures_of_x(simulation)
     simulation.run_until(25)
     assert captures_of_x(simulation) == before, "nobody captures a target that is lost"
