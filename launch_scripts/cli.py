@@ -120,7 +120,7 @@ def help_(
     swarm help order zone add
 
     words  The command to explain.
-    every  List all commands, not only the twelve for a start.
+    every  List all commands, not only the twelve for beginners.
     """
     root = command()
     root.all = every

@@ -30,8 +30,9 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, with the ending of the other, whose place it takes at one instant. Half a file is removed: a
-    full disk needs the space. A device or pipe is written in place. Raises StoreError, which names `path`."""
+    """Yields a temporary path with the suffix of `path`. When the block ends without an error, the temporary file
+    replaces `path` atomically; after an error it is removed, to free the space. A device or pipe is written in
+    place. Raises StoreError, which names `path`."""
     partial = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
     with writing(path):
         if path.exists() and not (path.is_file() or path.is_dir()):

@@ -189,8 +189,8 @@ class GridSpec:
         return self.region_of_tile(self.tile_of(cell))
 
     def tile_for(self, tile: int, class_number: int) -> int:
-        """Returns the tile of one class of vehicles, for marks which hold for that class alone. Each class has its
-        tiles behind those of the previous one, with one tile between, which holds the learned factors.
+        """Returns the number of the tile under which marks for one class of vehicles are stored. The numbers of a
+        class follow those of the previous class, after one extra number for that class's learned factors.
 
         class_number  0 for all vehicles; 1 is the first of the scenario's `[[classes]]`
         """

@@ -74,9 +74,9 @@ POSE_SILENCE_NS = 2_000_000_000
 class Newest:
     """Detection of new messages in each stream: those numbered above the last new one.
 
-    Once there has been no news for `silence_ns`, any other number is: so no single message outweighs all that
-    follow it, and a sender whose clock was set back is heard. A message that comes so late as to be taken for news
-    then stands only until the next.
+    After `silence_ns` without a new message, a message with any different number counts as new, also a lower one.
+    So one message with a very high number cannot block the stream for ever, and a sender whose clock was set back
+    is heard again. A very late message can be accepted by mistake; the next message replaces it.
     """
 
     def __init__(self, most: int = 4096, silence_ns: int = SILENCE_NS) -> None:

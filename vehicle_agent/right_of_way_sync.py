@@ -195,8 +195,8 @@ class RightOfWaySync:
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
     def _known_ended(self, now_ns: int) -> None:
-        """Begin, once all who could be asked have answered and promises can be kept; ask on, ever more rarely, as
-        long as it is needed."""
+        """Called when a round of queries has ended. Starts voting if this life has none yet and the promise file
+        can be written. Schedules the next round, each time after twice the delay, up to a limit."""
         self._asking = False
         self.core.silent = not self._store.ready
         if not self.core.holdings.life and not self.core.silent:

@@ -77,9 +77,11 @@ def places_counted(scenario: Scenario) -> Iterator[Finding]:
 
 
 def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
-    """Endpoints that cannot meet, and certificates that are missing or are not of one authority.
+    """Yields faults of the monitor's ports, and of certificates that are missing or not signed by the same
+    authority.
 
-    whole  whether all processes are to run here; else those of others need no certificate here
+    whole  True if all processes run on this machine. Otherwise processes of other machines need no certificate
+           here.
     """
     net, view = scenario.network, scenario.monitor
     if view.live and view.grpc_port == view.web_port != 0:

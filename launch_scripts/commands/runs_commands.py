@@ -73,11 +73,11 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 def down(run: RunArgument = None) -> int:
     """End a run of this machine as Ctrl-C does, and wait for its report.
 
-    A second `swarm down` kills what still runs.
+    If the run has not ended, a second `swarm down` kills the processes that are left.
 
     swarm down
 
-    run  Name of the run, or its folder; if not given, the one that runs.
+    run  Name of the run, or its folder. May be omitted if exactly one run is running here.
     """
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folder import read_report

@@ -208,9 +208,10 @@ class Ends(NamedTuple):
 
 
 def between(source: str, start: str, end: str, preset: str | None = None) -> Ends:
-    """The terrain of a file, a scenario or a built-in one, and the cells of two places on it.
+    """Returns the terrain of a file, a scenario or a built-in scenario, with the cells of two places on it.
 
-    Places are read before the terrain is built: a mistake in one takes no time. Raises ConfigError or TerrainError.
+    The places are parsed before the terrain is built, so that a mistake in one is reported at once. Raises
+    ConfigError or TerrainError.
     """
     places = read_place(start, "--from"), read_place(end, "--to")
     scenario = find_scenario(source, preset)

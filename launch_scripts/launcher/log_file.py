@@ -116,7 +116,8 @@ def log_to(
 ) -> None:
     """Logs to a file, or to standard error if there is none.
 
-    speaker  author of the log, if that is known: title of this process in `ps` and `top` of the system, too
+    speaker  process that writes the log, if known. Also sets the title of this process, as the system's `ps` and
+             `top` show it
     """
     if speaker is not None:
         with contextlib.suppress(ImportError):  # of a small install

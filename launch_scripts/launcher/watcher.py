@@ -131,8 +131,8 @@ class Watcher(RunObserver):
             self.ask_gone()  # of a run that this is a part of
 
     def look_after(self, processes: Collection[ProcessSpec]) -> None:
-        """Receives these processes and no others, where another launcher records the run; call it again whenever
-        they may have changed."""
+        """If another launcher records the run, receives only the messages of these processes. Call it again
+        whenever the processes may have changed."""
         if not isinstance(self.known, OwnPart) or self.known.own == (own := frozenset(processes)):
             return
         for spec in self.known.own - own:

@@ -324,8 +324,8 @@ class LatestState(Counts):
         return any(self.is_well(role, each) for each in known if not split_rank(each)[1])
 
     def silent(self, before_ns: int) -> list[tuple[str, str, int]]:
-        """Returns (role, id, time) of processes that are alive and have not published their counts since then,
-        though they did before."""
+        """Returns (role, id, time of the last counts) of each process that is alive and published counts, but none
+        after `before_ns`."""
         return [
             (*key, told_ns)
             for key, told_ns in sorted(self._told_ns.items())

@@ -166,9 +166,9 @@ def logging_into(folder: Path, processes: Iterable[Process] | None = None) -> di
 
 
 def open_logs(processes: Iterable[Process] | None = None) -> Iterator[tuple[int, Path]]:
-    """Yields (pid, file) for each log that a process of this user has open so that it may write to it.
+    """Yields (pid, file) for each log file that a process of this user has open for writing.
 
-    processes  those that are looked at; None: all of this machine
+    processes  the processes to search; None: all processes of this machine
     """
     import psutil
 

@@ -99,7 +99,7 @@ class Track:
 class GivenRoute:
     """A route that a vehicle began.
 
-    gap    cost over its proven lower bound; inf without one
+    gap    ratio of the route's cost to its proven lower bound; inf if there is no bound
     cells  int64 (n,), from where the vehicle stood to the target
     """
 

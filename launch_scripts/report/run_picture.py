@@ -262,10 +262,10 @@ through the strongest."""
 
 
 def learned_pixels(terrain: Terrain, factors: Floats) -> NDArray[np.uint8]:
-    """uint8 (rows, cols, 4): nothing where the prior stands, and where it is lethal. On a large terrain every n-th
-    cell.
+    """Returns an RGBA picture, uint8 (rows, cols, 4), of the learned factors. Cells are transparent if their factor
+    is 1 or the ground is lethal. On a large terrain it has only every n-th row and column.
 
-    factors  float32 (KEYS,)  of each kind of ground
+    factors  float32 (KEYS,), the learned factor of each kind of ground
     """
     grid = terrain.grid
     side = max(1, math.ceil(math.sqrt(grid.cells / _MOST_PIXELS)))

@@ -31,8 +31,8 @@ _NS_PER_MS = 1_000_000
 class Partition:
     """Cuts these nodes off from all others for a while. Among themselves they stay connected.
 
-    one_way  the others do not hear them, but they hear the others; a session that stays half open for longer than
-             the lease ends, and then the cut is one of both ways
+    one_way  the others do not hear them, but they hear the others. After the lease a half-open session is closed.
+             From then on the link is cut in both directions.
     """
 
     from_s: float

@@ -131,7 +131,8 @@ def world_of(name: str, seed: int) -> str:
 def run_seeds(
     name: str, seeds: Sequence[int], jobs: int, seconds: float = SECONDS, given: Scenario | None = None
 ) -> Iterator[Verdict]:
-    """Try each seed; yields verdicts as they come. A seed's run depends on nothing but its world and number.
+    """Try each seed; yields verdicts as they come. The result depends only on world, seed and `seconds`, not on
+    `jobs` or on other seeds.
 
     name   a world, `MIX`, or the name of the scenario that is `given`
     """

@@ -34,8 +34,8 @@ from swarm.wire.messages.processes import Stats
 
 
 def setup_of(head: Head, folder: Path) -> RoleSetup:
-    """Returns the arguments of a recorded process. Raises ConfigError where its scenario cannot be read here, and
-    ProtocolError on counts that are none."""
+    """Returns the arguments of a recorded process. Raises ConfigError if this version cannot read its scenario, and
+    ProtocolError if its recorded counters are not a valid `Stats` message."""
     return RoleSetup(
         scenario=parse_scenario(head.scenario),
         run_id=head.run_id,

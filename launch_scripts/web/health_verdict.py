@@ -20,8 +20,8 @@ class Process(NamedTuple):
     """One process, as its watcher sees it.
 
     name    role and id, such as planner-t0
-    vitals  what it has said last; None: nothing yet
-    ended   why it does not run; None: it runs
+    vitals  its last report of its own state; None if it has sent none yet
+    ended   why it ended, as a sentence; None while it runs
     """
 
     name: str

@@ -203,13 +203,15 @@ def _begin_anew(keys, behind, heads, overflow, inverse):
 
 @helper
 def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, heads):
-    """Spreads costs that have fallen, until no cell is offered less than it costs.
+    """Propagates lower costs through the tree until no neighbour offers a cell a lower cost than it has.
 
-    buckets  width: up to the lowest cell cost no cell is served twice; beyond, costs are right too
-    lowered  `count` cells whose cost has fallen; taken over
-    Notes the cells that have fallen in `rows`. Returns (cells served; the largest cost served). -1 cells beyond
-    `limit`: then costs have fallen as far as offers went, all of it noted; -2 beyond the queue's room, not all
-    noted.
+    buckets  (width, number) of the queue's buckets. Up to a width of the lowest cell cost no cell is processed
+             twice; with wider ones some are, and the costs are still correct
+    lowered  its first `count` entries are the cells whose cost has fallen; used as work space, so its content is
+             lost
+    Notes the cells that have fallen in `rows`. Returns (cells served; the largest cost served). Instead of the
+    number of cells it returns -1 if more than `limit` cells were processed (all changes so far are in `rows`), and
+    -2 if the queue is full (some changes are not in `rows`).
     """
     cell_cost, offsets, stride, rule, corners = grid
     first, last = rows

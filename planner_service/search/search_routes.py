@@ -85,11 +85,13 @@ class Ways:
         return steps_s
 
     def arrivals_s(self, cell: int) -> Floats:
-        """float32 (rows, cols), s: earliest arrival on a cell from any passable cell.
+        """Returns float32 (rows, cols), s: for each cell, the earliest time at which something that starts on
+        `cell`, which must be passable, can be there.
 
-        Over large maps, and with direction-dependent costs, it is a lower bound from the ways back: each of their
-        cells is priced by another step, at most a diagonal one for a straight one, and the cell of the start is
-        entered.
+        For large maps and direction-dependent costs it returns a lower bound, computed from paths in the reverse
+        direction. A reverse path charges each cell for a different step, which can be diagonal instead of straight,
+        so the cost is divided by sqrt(2). It also charges the start cell, so one diagonal step there is subtracted
+        first.
         """
         costs, grid = self._costs, self.grid
         if costs.climbs is None and costs.size <= _MOST_CELLS:

@@ -112,11 +112,12 @@ class TargetSearch:
         pace: Floats,
         now_ns: int,
     ) -> None:
-        """Begins or end the search if it is time to, and follow what vehicles have looked at.
+        """Begins or ends the search when it is due, and records what vehicles have looked at.
 
         pose     the newest; None before the first
         place_m  its (east, south) from the grid's corner
-        age_ns   time since it was heard; lost: whether it holds no more
+        age_ns   time since the pose was received
+        lost     True if no tracker lives
         pace     (rows, cols) float32, the map
         """
         if self._first_ns is None:

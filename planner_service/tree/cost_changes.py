@@ -105,11 +105,12 @@ class Rounding:
         return type(self)(self.classes + more - fewer)
 
     def at(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
-        """Returns the largest relative error of float32 in an exact label of a cell with a path of this cost, s.
+        """Returns a bound on the relative float32 rounding error of the label (cost-to-go) of a cell whose cheapest
+        path has this cost (s).
 
-        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
-        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
-        that, where the lowest cell cost alone would say a step for each of it.
+        One rounding per step, plus a constant. A path enters no cell twice, so it has at most as many steps as
+        there are cheapest cells of the map whose sum reaches this cost. A few very cheap cells therefore change the
+        bound little. Dividing the cost by the lowest cell cost would give far more steps.
         """
         return np.minimum((np.interp(cost, *self.cheapest) + 8.0) * 2.0**-24, 1.0)
 

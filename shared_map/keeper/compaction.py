@@ -94,11 +94,12 @@ class CompactionPlan:
 def compact(
     sets: Sequence[MarkSet], dropped: Mapping[str, MarkSet], gone: Collection[str], ended_ns: int
 ) -> list[MarkSet]:
-    """Returns the sets to publish, so that only possible winners are left of a tile's dead authors; none if that is
-    so already.
+    """Returns the mark sets to publish so that, for dead authors, only marks which can still win remain in the
+    tile. Returns an empty list if nothing is to be removed.
 
     sets      all sets of one tile
-    dropped   author -> marks dropped from its set of this tile before, under the number of that compacted set
+    dropped   author -> marks which an earlier compaction removed from its set of this tile, with the (epoch, seq)
+              of the compacted set
     gone      dead authors
     ended_ns  statements which expired by then are dropped, too
     """

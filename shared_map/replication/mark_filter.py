@@ -65,7 +65,8 @@ class MarkFilter:
     """Filter of sets by author and by tile. Either limit may be absent. Zones of operators concern
     every group.
 
-    groups   whose statements count, by the id of their author and by what the set says; None: everybody's
+    groups   only sets of these groups are accepted; both the author's id and the set's `group` must match. None:
+             all groups
     regions  about which regions; None: all
     """
 

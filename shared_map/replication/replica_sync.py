@@ -58,20 +58,20 @@ well."""
 class MapSync:
     """Keeps a replica equal to the others.
 
-    The service calls `on_map_event` and `tick` before its own work, and `publish` with what `replica.write`
-    returns. A replica with an author serves and digests its own sets. A keeper serves all sets and digests
-    those it has committed.
+    The owning service calls `on_map_event` and `tick` before its own work, and `publish` with the result of
+    `replica.write`. A replica with an author answers requests for its own sets and announces them in digests. A
+    keeper answers for all sets and announces those that it has written to disk.
 
     name         sender of digests; default: the replica's author; without one no digests are sent
     serves_all   answer for all authors
-    committed    what whole digests tell; default: the replica's own sets
+    committed    function that returns the contents of a full digest; default: the digest of the replica's own sets
     on_accepted  called with every set that is merged
     on_digest    called with the author of every digest that is heard, and when
     near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
                  can matter there (`DigestInterest`)
     at_ticks     merge received sets at the next tick, all together, without waking a thread: for a service that
                  uses the map at ticks only
-    joined       the late join is over: an answer came, or every try failed
+    joined       True once the initial request for existing marks is over: a reply came, or all attempts failed
     """
 
     def __init__(

@@ -59,7 +59,7 @@ def cost_world(grid: GridSpec, elevation_m: Floats, classes: Bytes, photo: Bytes
 def apply_cost_layers(scenario: Scenario, pace: Floats, world: CostWorld) -> Floats:
     """The pace with all layers of a scenario, one after the other.
 
-    There is no map without them: raises TerrainError where one fails, and ConfigError where one cannot be made.
+    A layer that fails is not skipped: raises TerrainError if one fails, ConfigError if one cannot be created.
     """
     for named in cost_layers_of(scenario):
         pace = checked_layer(find_plugin(named, scenario.plugin_folder), world, pace)

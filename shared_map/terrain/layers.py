@@ -160,7 +160,7 @@ def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
     """Returns the largest deviation of the eight neighbours from the plane through a cell, in metres: 0 on any even
     slope.
 
-    The array brings its own border of one cell; a void beside a cell does not count.
+    `padded_m` has a border of one cell, which the result lacks. A neighbour without a height (NaN) is ignored.
     """
     east, north = gradient_of_padded(padded_m, resolution_m)
     centre = padded_m[1:-1, 1:-1]

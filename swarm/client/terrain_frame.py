@@ -121,8 +121,8 @@ class Frame:
         return cells
 
     def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
-        """(x_m, y_m) of a latitude and longitude. Raises ConfigError where the terrain has no coordinates, and
-        without pyproj, which the extra `wgs84` brings."""
+        """Returns (x_m, y_m) of a latitude and longitude in degrees. Raises ConfigError if they are out of range,
+        if the terrain has no geographic reference, or if pyproj (extra `wgs84`) is not installed."""
         if not (-90 <= lat_deg <= 90 and -360 <= lon_deg <= 360):
             raise ConfigError(f"lat_deg {lat_deg!r}, lon_deg {lon_deg!r} is no place on Earth")
         return self._transforms[0](lon_deg, lat_deg)

@@ -109,27 +109,29 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Sources of elevation and photo.
 
-    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
-                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .csv, .xyz, .map (MovingAI), .yaml or
-                   .yml (ROS)
+    source         "jacksboro" (built in), "synthetic", or a file. Rasters: .tif, .tiff, .img, .hgt, .bil, .flt,
+                   .dem, .dt2, .nc, .vrt; each of these may be in a .zip. Others: .asc, .npz, .png, .csv, .xyz, .map
+                   (MovingAI), .yaml or .yml (ROS map)
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
     cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
                    own; also an image of such a map in the colours of its published legend
-    cover_codes    what the codes mean, where they do not show it: "worldcover", "corine", "corine-level-3", "nlcd",
-                   or a CSV file with lines of code and class (or pace relative to open ground, or "lethal")
-    cover_classes  single codes with the class (or pace, or "lethal") that counts instead of the table's
+    cover_codes    the legend of `cover`, if it cannot be recognised from the file: "worldcover", "corine",
+                   "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to open
+                   ground, or "lethal")
+    cover_classes  codes whose class (or pace, or "lethal") differs from the legend `cover_codes`: code = class
     resolution_m   cell size to bring everything to; the source's own if not given
     crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
     height_scale   metres per unit of height, where the file does not say it (.png)
     elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
                         Terrain-RGB or Terrarium tiles
-    nodata         voids are lethal, or filled from their surroundings
-    nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
-    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
-                   on lakes and the sea
+    nodata         cells without a height: "lethal", or "fill" to interpolate them from their surroundings
+    nodata_values  stored values that mean "no height", in addition to the value which the file declares
+    level_is       meaning of exactly flat areas of an elevation file, if no photo shows it: surveys level lakes and
+                   the sea
     water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
-    roads          how many roads to lay between seeded places, as there is no map of them
+    roads          number of invented roads, laid between random places (by the seed) on any terrain, real ones too;
+                   0 lays none
     rows           synthetic: cells from north to south
     cols           synthetic: cells from west to east
     relief_m       synthetic: height of the highest cell above the lowest

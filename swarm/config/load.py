@@ -36,9 +36,10 @@ def parse_scenario(
     base: Path | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Like `load_scenario`, from a text. Relative paths in it are made relative to `base`, if given.
+    """Like `load_scenario`, but from a string. Relative paths in it are resolved against `base`, if given. `source`
+    names the text in errors.
 
-    settings  as of `read_scenario`
+    settings  see `read_scenario`
     """
     scenario, faults = read_scenario(text, source, base, most=1, settings=settings)
     if scenario is None or faults:
@@ -298,8 +299,10 @@ def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]
 
 
 def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Returns the content of a file with other values at dotted keys. Missing tables are made; an unknown setting
-    is left to the check of types. Raises ConfigError, which begins with `source`."""
+    """Returns a copy of `raw` (a parsed scenario file) in which each dotted key of `settings`, such as
+    "map.learning", has its new value. Creates missing tables. Does not check names: the later type check refuses
+    unknown ones. Raises ConfigError, whose text begins with `source`, if a key is too deep or leads through a value
+    that is no table."""
     changed: dict[str, Any] = copy.deepcopy(dict(raw))
     for key, value in settings.items():
         if key.count(".") >= MAX_DEPTH:

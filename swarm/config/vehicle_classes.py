@@ -176,8 +176,8 @@ def flies(scenario: Scenario, name: str) -> bool:
 
 
 def of_class(scenario: Scenario, name: str) -> Scenario:
-    """The scenario as it is for vehicles of one class: its cost is theirs, and how far they see. `GROUND` is the
-    scenario itself. Raises ConfigError on an unknown class."""
+    """Returns the scenario for vehicles of one class: with the class's cost, speed limit and sensing range. For
+    `GROUND` it is the scenario unchanged. Raises ConfigError on an unknown class."""
     own = class_named(scenario, name)
     if own is None:
         return scenario

@@ -42,7 +42,7 @@ def commented(settings: Mapping[str, Any], head: str) -> str:
 def _table(table: Mapping[str, Any], path: tuple[str, ...], section: Any) -> Iterator[str]:
     """The lines of a table: its own values first, as TOML wants it, then the tables inside.
 
-    section  type of the table, whose docstring has the comments; None for none
+    section  type of the table; its docstring gives the comments. None: the table is written without comments
     """
     inner = [key for key, value in table.items() if _is_table(value) or _is_tables(value)]
     if section is not None:

@@ -226,12 +226,12 @@ class RecordWriter:
 
 
 class RecordReader:
-    """Reads a recording from its beginning. Raises StoreError on a file that is none.
+    """Reads a recording from its beginning. Raises StoreError if the file cannot be opened or is not a recording.
 
     head     its first record
     at       how many of its bytes are read
     damaged  why it cannot be read further, in a sentence; None until that is found
-    torn     whether it ends within a block, as where a process was killed; found at its end
+    torn     True if the file ends within a block, as after a kill; known once all records have been read
     """
 
     def __init__(self, path: Path) -> None:

@@ -29,7 +29,7 @@ def run_role(
 ) -> None:
     """Runs a role's service until SIGTERM, SIGINT or the end of the launcher.
 
-    terrain    digest
+    terrain    digest (hash) of the terrain on which the role runs
     stop_when  blocks until the process has to end; None to run until a signal comes
     phase      as of `Process`
     """

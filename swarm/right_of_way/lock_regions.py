@@ -30,22 +30,25 @@ def _count(rows: int, cols: int, side: int) -> int:
 
 
 class Plots:
-    """The plots of a grid and their members: fixed for a run, and the same in every process.
+    """The plots of a grid and their members. Both follow from the grid, the agents and the side alone, so processes
+    with the same side agree.
 
-    The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998); of fewer
-    than three agents one, because two of two are harder to keep alive than one.
+    The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998). With
+    fewer than three agents there is one member: a majority of two would need both to be alive.
 
     Ground and air are two layers, with plots and agents of their own: no vehicle in one requests, holds or waits
     for anything in the other.
 
     agents  those of the layer
-    side    of a plot, in cells: `map.plot_regions`. Messages go by plot, so that smaller ones cost more of them
+    side    side of a plot in cells: `map.plot_regions` times 256. Each plot has its own messages, so smaller plots
+            mean more messages
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no guest may take their names
 
-    all    the numbers of the layer's plots. Numbers of plots of two sides are never equal: a statement about plots
-           of another side is not understood, and cannot be mistaken for a release of cells
-    spare  how many agents of the layer may have plots of another side while ours have seats (`has_quorum`)
+    all    the numbers of the layer's plots. Plots of different sizes have different numbers, so a statement about a
+           plot of another size is ignored and cannot release cells
+    spare  how many agents may use another plot size while agents with this size act as members (for plots larger
+           than a region, see `has_quorum`)
 
     Raises ConfigError where the numbers of so narrow a grid do not fit into a message.
     """

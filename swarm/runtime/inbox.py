@@ -97,9 +97,11 @@ class Inbox:
     def _put(
         self, event: Event | BaseException, name: str, newest: Hashable | None = None
     ) -> Event | BaseException | None:
-        """Adds an event to a queue. Returns the one that is dropped for it.
+        """Adds an event to the queue `name`. If the queue is full, removes its oldest event and returns it;
+        otherwise returns None.
 
-        newest  what only the newest event counts of; None if each counts
+        newest  key under which only the newest event is kept: it replaces an unread one with the same key, which is
+                not returned. None: every event is kept
         """
         dropped = None
         with self._lock:

@@ -51,7 +51,8 @@ class Acknowledged:
 
 
 class Operator:
-    """Gives orders over a bus. Every method waits for answers; none may be called on the bus's own threads.
+    """Sends operators' orders over the bus. Every method blocks until the replies arrive. Do not call one on a
+    thread of the bus: it would wait for itself.
 
     patience_s  how long to wait for processes to obey
     """

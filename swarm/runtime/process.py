@@ -84,12 +84,12 @@ class Service(Protocol):
 
 class ThreadWorker:
     """A `Worker` on one thread. Kernels release the interpreter's lock, so the process goes on meanwhile. An error
-    in a job is raised in the process's own thread, by its next `take`.
+    in a job is raised in the process's main thread, by the next `Inbox.take`.
 
     The first job is as urgent as the process: until its result is there, the process has nothing to answer from.
     Later jobs yield to threads that answer or drive. A thread cannot become more urgent again.
 
-    turns  in which long jobs of this machine are run; each at once if not given
+    turns  limits how many long jobs run at the same time on this machine; without it, no job waits
     """
 
     def __init__(self, name: str, inbox: Inbox, turns: JobSlots | None = None) -> None:

@@ -34,9 +34,9 @@ MEMBERS_OWN = " ".join(f"{role}:role,id" for role in MEMBERS.split())
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A role that may do something.
+    """Permission of one role for one action on a topic.
 
-    own  fields of the key that must be the process's own: its id, its role, or its name as an author
+    own  fields of the key which must be the process's own: its id, its role, or its name as an author
     """
 
     role: str

@@ -75,7 +75,7 @@ class Topic:
         object.__setattr__(self, "_repeated", repeated)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
-        """All fields as chunks of a key; those not given become `*`.
+        """Returns each field of the topic as one part of a Zenoh key; fields that are not given become `*`.
 
         Raises TypeError on an unknown field, ValueError on a value that is not one chunk.
         """

@@ -158,8 +158,9 @@ def middle_of(grid: GridSpec, cell: int) -> Point:
 
 
 def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point:
-    """Returns the point where a step passes from its cell into the next: on the edge that they share, of which
-    `shared` is the middle, or at their corner, which it is then."""
+    """Returns the point where a step passes from its cell into the next. For a straight step it lies on the common
+    edge, and `shared` is the middle of that edge. For a diagonal step it is the common corner, and `shared` is that
+    corner."""
     if rows and cols:
         return shared
     if rows:

@@ -108,7 +108,7 @@ def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
 class _Guide:
     """Common part of missions and setpoints.
 
-    above     of MAVLink: the frame of `height_m`
+    above     MAVLink frame constant for `height_m`: above home or above terrain
     height_m  None: the vehicle stays on its ground
     """
 

@@ -167,11 +167,11 @@ def combinations(study: Study) -> Iterator[tuple[str, str, str, dict[str, Any]]]
 
 
 def plan(study: Study, base: Path, source: str) -> list[Case]:
-    """The cases of a study, with their trials. Raises ConfigError on a scenario that cannot be read, or not with
-    these settings.
+    """The cases of a study, with their trials. Raises ConfigError if a scenario cannot be read, or if the study's
+    settings do not fit it.
 
-    base    folder of the study; a scenario that lies there goes before a built-in one
-    source  what errors call the study
+    base    folder of the study file; a scenario in it is used instead of a built-in one of the same name
+    source  name of the study in error messages
     """
     return [_planned(study, base, source, *each) for each in combinations(study)]
 

@@ -38,8 +38,9 @@ _TRIES = 12
 class Rover:
     """One rover.
 
-    rests_s  how long it stands or turns yet, by the wall clock; it drives at 0
-    turns    whether it drives on then, so that it says its speed already
+    rests_s  seconds, not multiplied by the time scale, for which it still stands or turns; it drives when this is 0
+             or less
+    turns    True if it pauses only to turn and will drive on: it then already reports its driving speed
     """
 
     id: str

@@ -110,8 +110,8 @@ class TrueTerrain:
         return level_s if self.climb is None else level_s * self.climb.driven(cell, to)
 
     def way(self, start: int, chance: random.Random) -> list[int]:
-        """The cheapest way to a random place that can be reached inside the window around `start`, without `start`
-        itself; empty if there is none."""
+        """Returns the cells (without `start`) of the cheapest path to a random reachable cell in the window around
+        `start`, at least `WAY_HALF_CELLS // 3` cells away if there is one. Empty if no cell can be reached."""
         # Imported here: it takes 0.2 s, for which the start of all other processes would wait.
         from scipy.sparse.csgraph import dijkstra
 
@@ -359,8 +359,8 @@ class Walker:
 
 
 def slowness_of(target: TargetConfig, cost: CostConfig) -> float:
-    """On level open ground the target keeps its own speed, elsewhere it is as much slower or faster as the ground
-    is; it never outruns a vehicle's pace on the same cell. Infinite for one that stands still."""
+    """Returns the factor (at least 1) on a vehicle's time for a cell. A target slower than a vehicle has its own
+    speed on level open ground; a faster one is limited to the vehicle's speed. Infinite at speed 0."""
     if target.speed_m_per_s <= 0:
         return math.inf
     return max(1.0, cost.flat_speed_m_per_s / target.speed_m_per_s)

@@ -69,15 +69,16 @@ def class_readings(
     seen: Bools | None = None,
     progress: Progress = no_progress,
 ) -> ByRules:
-    """Returns the readings of a photo without labels.
+    """Classifies a photo by rules, without training labels. Returns the class of each cell, and for cells of class
+    UNKNOWN the classes that are possible (readings).
 
     Parameters
     ----------
     rgb : uint8 (rows, cols, 3), red, green, blue
     elevation_m : float32 (rows, cols), m, or None
-        Voids (NaN), and all without an elevation, count as level.
+        Cells without a height (NaN) count as level. None: all cells count as level.
     resolution_m : float
-        Side of a cell. Roads are looked for on cells of at most `COARSEST_M`.
+        Side of a cell, in metres. Roads are searched for only if it is at most `COARSEST_M` (30 m).
     seen : bool (rows, cols), optional
         Where the photo shows anything; elsewhere the class is UNKNOWN.
     progress : callable

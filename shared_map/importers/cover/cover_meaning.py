@@ -54,9 +54,11 @@ class Meaning:
 
 
 def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None:
-    """Returns the conversion of a file's values into grounds; None if there is no evidence.
+    """Returns how the values of a land-cover file are converted to terrain classes; None if the file gives no hint
+    of its code table.
 
-    Raises TerrainError if it holds no codes, or if several tables fit.
+    Raises TerrainError if the values of the file are not codes (whole numbers), if several code tables fit, or if
+    it is a coloured image and the configured table has no colours.
     """
     own = cover_codes.own_grounds(config.cover_classes)
     given = None if config.cover_codes is None else cover_codes.table_named(config.cover_codes)

@@ -307,7 +307,8 @@ def outlines_of(
     Raises
     ------
     TerrainError
-        In one sentence: the file cannot be read, holds no area on the terrain, one with a hole, or too many.
+        The file cannot be read, has no area on the terrain, has an unusable feature, an area with a hole or with
+        more than `most_corners` corners, or too many areas.
     """
     import shapely
 

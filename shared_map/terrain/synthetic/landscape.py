@@ -108,7 +108,7 @@ def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
     resolution_m : float
         Side of a cell.
     seed : int
-        Of where forest and soil are.
+        Seed of the random pattern of forest and soil.
 
     Returns
     -------

@@ -39,9 +39,11 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
 
     vehicles   ids in the order of `cells`; newer routes are pushed to these until they ask another planner
-    max_cells  most steps of each route; 0 is the whole route
-    force      a route ran out: the planner extends its window to these cells
-    vehicle_class  whose routes: those of another class of vehicles follow another tree
+    max_cells  largest number of steps of each returned route; 0: the whole route, or as much as fits into one
+               message
+    force      True if a vehicle has reached the end of its route without the target: the planner extends its search
+               window to these cells
+    vehicle_class  class of the vehicles; each class has its own tree, so its own routes
     """
 
     cells: Annotated[list[Cell], LARGE] = []

@@ -46,10 +46,12 @@ class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
     """All vehicles of a host that hold or request a cell of one plot, sent to one of its members. The newest
     replaces the older.
 
-    life   which life of the host speaks; a later one is greater
-    knows  the newest table that the host acts on: of what that granted, it holds no more than it lists here
-    dead   earlier lives of this host that are proved to have ended: they ran on the file that this one has locked
-    ended  this life drives no more, and never will again
+    life   number of the host's start (glossary: life) that sends this; a later start has a greater number
+    knows  number of the newest table that the host has used. It has given up every cell which that table, or an
+           older one, granted and which is not listed in `vehicles`
+    dead   numbers of earlier starts of this host that have certainly ended: they had locked the host's file, which
+           this start has locked now
+    ended  this start of the host has stopped driving, for good
     """
 
     plot: Plot

@@ -38,7 +38,8 @@ _TRIGGER = "std_srvs/srv/Trigger"
 
 
 class Incoming:
-    """All incoming topics, until `close`. `tick` is called by one thread, some twenty times a second.
+    """Handles all incoming topics and services, until `close`. `tick` is called by one thread, some twenty times a
+    second.
 
     node      of the ROS side
     swarm     a connection; it is not closed here
