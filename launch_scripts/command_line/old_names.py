@@ -29,7 +29,8 @@ OPTIONS = {
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
-    "delete": ("remove",), "rm": ("remove",), "watch": ("top",), "validate": ("check",),
+    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
+    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
 """Word that other programs have, or we had -> our words, the first of which that a group knows is meant."""
@@ -53,6 +54,7 @@ def current(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def meant(word: str, known: Collection[str]) -> str:
     """Returns the end of a sentence about an unknown command: the command which is meant, or all that are known."""
-    synonyms = (each for each in _SYNONYMS.get(word, ()) if each in known or each[0] in "-.")
-    synonym = next(synonyms, None)
+    file = (f"up {word}", f"info {word}") if "." in word else ()
+    found = (each for each in _SYNONYMS.get(word, file) if each.split()[0] in known or each[0] in "-.")
+    synonym = next(found, None)
     return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"
