@@ -58,7 +58,7 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
         assert ask(url, live=True).ok
         keeper.send_signal(signal.SIGINT)
         assert keeper.wait(60) == 0, hands.logs()
-    [log] = hands.folder.glob("keeper-*.log")
+    [log] = hands.folder.glob("role-keeper*.log")
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert {(line["role"], line["id"]) for line in lines} == {("keeper", "0")}
     assert any("keeper started" in line["message"] for line in lines)
