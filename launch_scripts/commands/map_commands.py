@@ -208,7 +208,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
             if held is None or supersedes(word, held):
                 found[word.author] = word
     if failure is not None and not found:
-        raise BusError(f"nobody {where} says what was learned: {failure}")
+        raise BusError(f"no process {where} states what was learned: {failure}")
     return [found[author] for author in sorted(found)]
 
 

@@ -90,7 +90,7 @@ def observed(
         observer.listen(clock, 0.1)
     if observer.latest is None:
         admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
-        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
+        raise BusError(f"no process answers {where}: is the swarm running{admitted}?")
     return observer
 
 

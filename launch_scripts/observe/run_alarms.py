@@ -99,7 +99,7 @@ class Alarm:
             if self.since_s is None:
                 return f"until {self._at(self.over_s)}"
             return f"at {self._at(self.since_s)}" + (f", for {lasted}" if self.over_s > self.since_s else "")
-        last = f", last heard of at {self._at(end_s)}" if self.is_old and end_s is not None else ""
+        last = f", last report at {self._at(end_s)}" if self.is_old and end_s is not None else ""
         return ("now" if lasted is None else f"for {lasted}") + last
 
     def _at(self, run_s: float) -> str:
@@ -218,5 +218,5 @@ def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tupl
             heard_ns = status.stamp_ns
         elif pose is not None:
             since_ns = pose.stamp_ns
-        text = f"nobody knows where {id} is; routes lead to where it was"
+        text = f"no tracker publishes {id}; routes lead to its last place"
         yield Told(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id), heard_ns

@@ -283,7 +283,7 @@ def frame_of_run(bus: Bus, where: object) -> MapFrame:
     """
     frame = frame_of_members(ask_run(bus))
     if frame is None:
-        raise BusError(f"nobody {where} says which terrain the swarm is on")
+        raise BusError(f"no process {where} names the terrain of the swarm")
     return frame
 
 

@@ -310,6 +310,6 @@ def _whole(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
     if dataset.height * dataset.width > MAX_CELLS:
         raise TerrainError(
             f"terrain {path} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too"
-            " large to mend here: gdal_calc or gdal_edit.py -a_nodata does it"
+            " large to correct here: gdal_calc or gdal_edit.py -a_nodata does it"
         )
     return _rows_of(dataset, 0, dataset.height)

@@ -244,7 +244,7 @@ class Session:
                     if replies:
                         self.call(lambda: waiting.set_result(found))
                     else:
-                        what = f"no answer: {failure}" if failure and failure != "timeout" else "nobody answers"
+                        what = f"no answer: {failure}" if failure and failure != "timeout" else "no process answers"
                         self.call(lambda: waiting.set_exception(BusError(what)))
                 case LinkChanged(up=up):
                     self.connected = up

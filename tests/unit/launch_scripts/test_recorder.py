@@ -280,7 +280,7 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     first, second = recorder.summary(10 * NS_PER_S).targets
     assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost for 9 s)", True, 9.0)
     assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
-    lost = "target lost: nobody knows where t0 is; routes lead to where it was, row 0, col 0, for 10 s"
+    lost = "target lost: no tracker publishes t0; routes lead to its last place, row 0, col 0, for 10 s"
     assert lost in plain_line(recorder.summary(10 * NS_PER_S), "small")
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
     hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end

@@ -203,7 +203,7 @@ def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None
     rover.at(5.0, -5.0)
     asked = rover.route_soon("t7", timeout_s=0.5)
     world.run(1.0)
-    with pytest.raises(BusError, match="no route to 't7': nobody answers"):
+    with pytest.raises(BusError, match="no route to 't7': no process answers"):
         asked.result(0)
     with pytest.raises(ConfigError, match="target 'a/b'"):
         rover.route("a/b")
@@ -233,7 +233,7 @@ def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_w
     world.run(1.0)
     world.kill("planner-t-1")
     world.run(20.0)
-    assert program.problems == ["vehicle rover gets no route to t: nobody answers"]
+    assert program.problems == ["vehicle rover gets no route to t: no process answers"]
     world.planner("t", 2)
     world.cells["t"] = GRID.cell(33, 33)
     world.run(8.0)

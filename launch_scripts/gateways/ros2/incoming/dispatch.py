@@ -230,7 +230,7 @@ class Incoming:
 
             def give() -> None:
                 told = orders.resume() if resumes else orders.pause()
-                silent = f", not heard of: {', '.join(told.silent)}" if told.silent else ""
+                silent = f", no reply from: {', '.join(told.silent)}" if told.silent else ""
                 respond(True, f"{len(told.obeyed)} processes obey{silent}")
 
             if not self._orders.give(name, give, lambda why: respond(False, why)):
