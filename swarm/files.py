@@ -66,7 +66,9 @@ def check_writable(folder: Path, size: int = _PROBE_BYTES, *, file: Path | None 
     probe = folder / f".space.{os.getpid()}"
     with writing(file or folder):
         try:
-            probe.write_bytes(bytes(size))
+            probe.unlink(missing_ok=True)
+            with probe.open("xb") as opened:  # follows no link
+                opened.write(bytes(size))
         finally:
             with contextlib.suppress(OSError):
                 probe.unlink()

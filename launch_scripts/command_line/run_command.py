@@ -15,9 +15,13 @@ from typer.exceptions import TyperException
 
 from launch_scripts.command_line.declaring import ENVIRONMENT
 from launch_scripts.command_line.old_names import current, meant
+from launch_scripts.plain_text import plain
 from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
+
+_NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
+"""What the system says of a path that cannot be one, or not for this user."""
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -48,7 +52,8 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         print("swarm: stopped; nothing is written", file=sys.stderr)
         return 1
     except SwarmError as error:
-        print(f"swarm: {error}{_given_by(str(error))}", file=sys.stderr)
+        said = "\n".join(map(plain, f"{error}{_given_by(str(error))}".split("\n")))
+        print(f"swarm: {said}", file=sys.stderr)
         return error.exit_code
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -60,6 +65,9 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         _leave_output()
         return 0
     except OSError as error:
+        if error.errno in _NO_PATHS and error.filename is not None:
+            print(f"swarm: {quoted(str(error.filename))}: {error.strerror}", file=sys.stderr)
+            return ConfigError.exit_code
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
             raise
         _leave_output()

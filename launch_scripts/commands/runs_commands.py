@@ -6,6 +6,7 @@ import heapq
 import json
 import math
 import os
+import re
 import signal
 import sys
 import time
@@ -36,6 +37,8 @@ RunArgument = Annotated[
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""
 _TURN_S = 0.2
+_MOST_LINES = 1_000_000
+"""Lines that are held for `--lines`: at most a few hundred MB."""
 _Line = tuple[float, str, str]
 """Time, process and text of a line of a log."""
 
@@ -66,7 +69,9 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
     for each in told:
         table.add_row(*(plain("" if value is None else str(value)) for value in each.values()))
     # A row is one line, which a narrow terminal breaks: a copied folder is whole.
-    Console(highlight=False, width=1000).print(table if told else "no run of yours runs here; see `swarm ps -a`")
+    Console(highlight=False, markup=False, width=1000).print(
+        table if told else "no run of yours runs here; see `swarm ps -a`"
+    )
 
 
 @command(app, RUN)
@@ -79,6 +84,8 @@ def down(run: RunArgument = None) -> int:
 
     run  Name of the run, or its folder. May be omitted if exactly one run is running here.
     """
+    import psutil
+
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folder import read_report
     from launch_scripts.observe.run_registry import registered
@@ -91,14 +98,20 @@ def down(run: RunArgument = None) -> int:
     if not found.launchers:
         raise ConfigError(f"run {found.name} does not run here; these do: {', '.join(running) or 'none'}")
     for pid in found.launchers:
-        with suppress(ProcessLookupError):  # it ended by itself
-            os.kill(pid, signal.SIGINT)
+        with suppress(psutil.NoSuchProcess):  # it ended by itself
+            process = psutil.Process(pid)
+            if not re.search("swarm|launch_scripts", " ".join(process.cmdline())):
+                raise ConfigError(
+                    f"run {found.name}: process {pid} is no launcher; its entry in the registry is wrong"
+                )
+            process.send_signal(signal.SIGINT)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
     with terminal.busy(f"run {found.name} ends"):
-        while (left := _chosen(str(found.folder)).launchers) and time.monotonic() < until_s:
+        while (left := _launchers(found.folder)) and time.monotonic() < until_s:
             time.sleep(_TURN_S)
     if left:
-        terminal.say(f"run {found.name} still ends after {_DOWN_S:g} s; `swarm down` once more kills it", "red")
+        pids = ", ".join(map(str, left))
+        terminal.say(f"run {found.name} still ends after {_DOWN_S:g} s; its launcher has the pid {pids}", "red")
         return 1
     with suppress(SwarmError):
         terminal.say(str(read_report(found.folder).get("verdict", "")))
@@ -111,7 +124,7 @@ def down(run: RunArgument = None) -> int:
 def logs(
     process: Annotated[str | None, typer.Argument(metavar="ROLE-ID")] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f")] = False,
-    lines: Annotated[int | None, typer.Option("--lines", "-n", min=0)] = None,
+    lines: Annotated[int | None, typer.Option("--lines", "-n", min=0, max=_MOST_LINES)] = None,
     run: RunOption = None,
 ) -> None:
     """Print the logs of a run, which may be over.
@@ -140,7 +153,7 @@ def logs(
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:
                 return
-            follow = bool(_chosen(str(found.folder)).launchers)  # once more after its end
+            follow = bool(_launchers(found.folder))  # once more after its end
             time.sleep(_TURN_S)
             told = _new_lines(found.folder, process, read)
 
@@ -210,7 +223,7 @@ def in_background(*, as_json: bool) -> int:
     except (OSError, RuntimeError, StoreError) as error:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
     words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
-    words = [word for word in words if word not in ("-d", "--detach")]
+    words = [word for word in words if not re.fullmatch("-d+|--detach", word)]
     launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, errors="replace", start_new_session=True)
     assert launcher.stdout is not None
     try:
@@ -241,14 +254,21 @@ def _chosen(name: str | None) -> KnownRun:
     return next((run for run in known if run.folder == folder), KnownRun(folder, (), 0, False))
 
 
+def _launchers(folder: Path) -> tuple[int, ...]:
+    """Pids of the launchers that still run, also if the folder is not there any more."""
+    from launch_scripts.observe.run_registry import registered
+
+    return next((run.launchers for run in registered() if run.folder == folder), ())
+
+
 def _fields(run: KnownRun) -> dict[str, Any]:
     """A row of `swarm ps`."""
     from launch_scripts.observe.run_folder import REPORT_FILE, run_facts
     from launch_scripts.ports import page_of
 
     facts, report = run_facts(run.folder), run.folder / REPORT_FILE
-    over = "ended" if report.exists() or facts.get("recorded") is False else "broke off"
-    began = facts.get("began")
+    over = "ended" if os.path.exists(report) or facts.get("recorded") is False else "broke off"
+    began: str | None = str(facts.get("began"))
     now_s = time.time() if run.launchers else max((f.stat().st_mtime for f in _log_files(run.folder)), default=0.0)
     try:
         lasted_s = round(max(now_s - datetime.fromisoformat(str(began)).timestamp(), 0.0))
@@ -256,7 +276,7 @@ def _fields(run: KnownRun) -> dict[str, Any]:
         began = lasted_s = None
     return {
         "run": run.name,
-        "scenario": facts.get("scenario"),
+        "scenario": None if "scenario" not in facts else str(facts["scenario"]),
         "state": ("running" if run.is_whole else "starting") if run.launchers else over,
         "began": began,
         "seconds": lasted_s,
@@ -271,7 +291,9 @@ def _fields(run: KnownRun) -> dict[str, Any]:
 
 def _log_files(folder: Path) -> list[Path]:
     """Logs of a run, the earlier of two of a process first."""
-    return sorted((*folder.glob("*.log"), *folder.glob("*.log.1")), reverse=True)
+    return sorted(
+        (file for end in ("log", "log.1") for file in folder.glob(f"*.{end}") if file.is_file()), reverse=True
+    )
 
 
 def _new_lines(folder: Path, process: str | None, read: dict[int, int]) -> Iterator[_Line]:

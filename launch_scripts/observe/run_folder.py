@@ -19,7 +19,7 @@ from launch_scripts.observe.run_registry import register, registered
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable, write_file
 
 SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
@@ -84,8 +84,8 @@ def ended(folder: Path) -> dict[str, Any]:
 def run_facts(folder: Path) -> dict[str, Any]:
     """Returns the content of `run.json`; empty if it cannot be read."""
     try:
-        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        facts = json.loads(read_text(folder / RUN_FILE, FileKind.RUN))
+    except (SwarmError, OSError, ValueError, RecursionError):
         return {}
     return facts if isinstance(facts, dict) else {}
 
@@ -116,7 +116,7 @@ def find_run(name: str, runs: Path) -> Path:
     """The folder of a run: a path, or its name in `runs`, where `LAST` may be a file. In the usual folder also the
     name of a registered run, of which `LAST` is the newest. Raises ConfigError."""
     for path in (Path(name), runs / name):
-        if path.is_dir():
+        if os.path.isdir(path):  # unlike `Path.is_dir` also of a name that is too long
             return path
         if path.name == LAST and path.is_file():
             named = path.parent / read_text(path, FileKind.RUN).strip()

@@ -92,22 +92,22 @@ def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str 
         file = registry() / f"{folder.name}.{os.getpid()}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         write_file(file, msgspec.json.encode(entry))
-    except (OSError, RuntimeError, StoreError) as error:
+    except (OSError, RuntimeError, ValueError, StoreError) as error:  # ValueError: a name that is no UTF-8
         return f"commands find this run in its folder only, as it cannot be registered: {error}"
     return None
 
 
 def registered() -> list[KnownRun]:
-    """The runs whose folders are there: those that run first, and of these the newest. Removes entries of folders
-    that are not there any more."""
+    """The runs that run, then those whose folders are there, each the newest first. Removes the entry of a launcher
+    that has ended, if its folder was removed or another entry names it."""
     found: dict[Path, list[_Entry]] = {}
     for file, entry in _entries():
-        folder = Path(entry.folder)
-        if not folder.is_dir() or (folder in found and not _runs(entry)):
-            with suppress(OSError):
+        folder, is_running = Path(entry.folder), _runs(entry)
+        with suppress(OSError, ValueError):  # a folder that cannot be looked at
+            if not is_running and (folder in found or not folder.is_dir()):
                 file.unlink()
-        elif folder.is_absolute():
-            found.setdefault(folder, []).append(entry)
+            elif folder.is_absolute():
+                found.setdefault(folder, []).append(entry)
     runs = [
         KnownRun(
             folder,
@@ -128,11 +128,12 @@ def pids_of(run_id: str) -> dict[str, int]:
 
 def _entries() -> Iterator[tuple[Path, _Entry]]:
     """Yields the entries that can be read, the newest first."""
-    try:
-        files = sorted(registry().glob("*.json"), key=lambda file: file.lstat().st_mtime_ns, reverse=True)
-    except (OSError, RuntimeError):
-        return
-    for file in files:
+    files: list[tuple[int, Path]] = []
+    with suppress(OSError, RuntimeError):
+        for file in registry().glob("*.json"):
+            with suppress(OSError):  # one that is written at this moment has another name by now
+                files += [(file.lstat().st_mtime_ns, file)] if not file.name.endswith(".part.json") else []
+    for _, file in sorted(files, reverse=True):
         with suppress(OSError, SwarmError, msgspec.MsgspecError, RecursionError):
             yield file, msgspec.json.decode(read_text(file, FileKind.RUN), type=_Entry)
 

@@ -75,9 +75,8 @@ class Server(socketserver.ThreadingTCPServer):
     behind   address of rerun's server, to which requests for the stream are passed
     lasts_s  a connection that does not take the stream is cut after so long
 
-    A visitor beyond the bound is cut where there is a stream. If there is none, requests are short: the new
-    connection is accepted, and the oldest one is closed for it, so that no client keeps others out by holding
-    connections open.
+    Requests are short: beyond the bound the oldest connection which has not taken the stream is closed for the new
+    one, so that no client keeps others out by holding connections open. If all have taken it, the new one is cut.
 
     Raises BusError if it cannot listen there. The OSError is its cause.
     """
@@ -137,8 +136,8 @@ class Server(socketserver.ThreadingTCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:
-            if len(self._open) >= MOST_CONNECTIONS and self.behind is None:
-                oldest = next(iter(self._open))
+            asking = (each for each, until_s in self._open.items() if until_s != math.inf)
+            if len(self._open) >= MOST_CONNECTIONS and (oldest := next(asking, None)) is not None:
                 del self._open[oldest]
                 _cut(oldest)
             if fits := len(self._open) < MOST_CONNECTIONS:

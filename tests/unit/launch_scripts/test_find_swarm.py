@@ -126,6 +126,9 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
     assert find_swarm(name="first").network.connect == (f"tcp/127.0.0.1:{listens[0]}",)
     assert set(find_swarm().others) | {find_swarm().run} == {"first", "second"}
     (tmp_path / "second").rename(tmp_path / "away")
+    assert [run.name for run in registered()] == ["second", "first"], "the launcher of the second one runs"
+    for file in (tmp_path / "state" / "runs").iterdir():
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"pid": 2**30}))
     assert [run.name for run in registered()] == ["first"]
     assert len(list((tmp_path / "state" / "runs").iterdir())) == 1
 
