@@ -21,7 +21,7 @@ from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
-"""What the system says of a path that cannot be one, or not for this user."""
+"""Errors about a path that cannot be one, or not for this user."""
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
