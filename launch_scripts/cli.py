@@ -67,16 +67,12 @@ class Root(TyperGroup):
         if self.all:
             super().format_help(ctx, formatter)
             return
-        names = [*self.commands]
+        text = inspect.cleandoc(Root.__doc__ or "")
+        others = ", ".join(name for name in self.commands if f"\n  {name} " not in text)
         print("Usage: swarm COMMAND ...\n")
-        for line in inspect.cleandoc(Root.__doc__ or "").splitlines():
-            if line.startswith("  "):
-                if line.split()[0] not in names:
-                    continue
-                names.remove(line.split()[0])
-            elif line.startswith("More"):
-                line = textwrap.fill(f"{line}  {', '.join(names)}", 79, subsequent_indent=" " * 24)
-            print(line)
+        for line in text.splitlines():
+            more = line.startswith("More")
+            print(textwrap.fill(f"{line}  {others}", 79, subsequent_indent=" " * 24) if more else line)
 
 
 app = typer.Typer(

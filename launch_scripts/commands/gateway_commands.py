@@ -12,7 +12,7 @@ import typer
 
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.role_commands import check_name
-from launch_scripts.commands.running_swarm import RUNS, Where
+from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
 from swarm.errors import BusError, ConfigError
 
@@ -66,6 +66,7 @@ def ros2(
     as_json   With --list: as JSON.
     """
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
+    from launch_scripts.observe.run_folder import RUNS
 
     told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
     chosen = load_settings(settings, {**told, "vehicles": vehicles})
@@ -74,7 +75,7 @@ def ros2(
         return
     ours = chosen.swarm
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
-    if where.tls_ca is None:
+    if where.tls_ca is None and where.tls_dir is None:
         where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
     _serve_ros2(chosen, where.network(), where.runs or RUNS)
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
     from swarm.config.scenario import NetworkConfig
 
-RUNS = Path("runs")
-"""Folder in which a command looks beside the registry: runs of earlier versions are not registered."""
 RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete.runs)]
 RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
 _CONNECT_S = 3.0
@@ -116,7 +114,7 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
     name  of the run, or its folder; only that is looked at then
     Raises BusError with the places that were tried, ConfigError if there is no run of that name.
     """
-    from launch_scripts.observe.run_folder import find_run
+    from launch_scripts.observe.run_folder import RUNS, find_run
     from swarm.bus.endpoints import listening
     from swarm.config import scenario
     from swarm.errors import BusError
@@ -165,7 +163,7 @@ def _network_of(folder: Path) -> NetworkConfig | None:
 def _newest_first(runs: Path | None) -> list[Path]:
     """Folders of runs: those whose launcher runs first, then those that have left no report, and of these the
     newest."""
-    from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE
+    from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE, RUNS
     from launch_scripts.observe.run_registry import registered
 
     known = registered()

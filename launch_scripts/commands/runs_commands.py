@@ -22,7 +22,7 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
-from launch_scripts.commands.running_swarm import RUNS, RunOption, say_newest
+from launch_scripts.commands.running_swarm import RunOption, say_newest
 from launch_scripts.commands.shared_options import AsJson
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def down(run: RunArgument = None) -> int:
             process.send_signal(signal.SIGINT)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
     with terminal.busy(f"run {found.name} ends"):
-        while (left := _launchers(found.folder)) and time.monotonic() < until_s:
+        while (left := _run_in(found.folder).launchers) and time.monotonic() < until_s:
             time.sleep(_TURN_S)
     if left:
         pids = ", ".join(map(str, left))
@@ -153,7 +153,7 @@ def logs(
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:
                 return
-            follow = bool(_launchers(found.folder))  # once more after its end
+            follow = bool(_run_in(found.folder).launchers)  # once more after its end
             time.sleep(_TURN_S)
             told = _new_lines(found.folder, process, read)
 
@@ -240,25 +240,23 @@ def in_background(*, as_json: bool) -> int:
 
 def _chosen(name: str | None) -> KnownRun:
     """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError."""
-    from launch_scripts.observe.run_folder import find_run
-    from launch_scripts.observe.run_registry import KnownRun, registered
+    from launch_scripts.observe.run_folder import RUNS, find_run
+    from launch_scripts.observe.run_registry import registered
     from swarm.errors import ConfigError
 
-    known = registered()
     if name is None:
-        if not known:
+        if not (known := registered()):
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
         say_newest(known[0].name, [each.name for each in known[1:] if each.launchers])
         return known[0]
-    folder = find_run(name, RUNS).resolve()
-    return next((run for run in known if run.folder == folder), KnownRun(folder, (), 0, False))
+    return _run_in(find_run(name, RUNS).resolve())
 
 
-def _launchers(folder: Path) -> tuple[int, ...]:
-    """Pids of the launchers that still run, also if the folder is not there any more."""
-    from launch_scripts.observe.run_registry import registered
+def _run_in(folder: Path) -> KnownRun:
+    """The run of a folder as it is now, also if it is not registered or the folder is not there any more."""
+    from launch_scripts.observe.run_registry import KnownRun, registered
 
-    return next((run.launchers for run in registered() if run.folder == folder), ())
+    return next((run for run in registered() if run.folder == folder), KnownRun(folder, (), 0, False))
 
 
 def _fields(run: KnownRun) -> dict[str, Any]:

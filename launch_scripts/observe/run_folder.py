@@ -23,8 +23,9 @@ from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable, write_file
 
 SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
-_USUAL = Path("runs")
-"""The folder of all runs, if no other is given. Runs which are elsewhere are in the registry."""
+RUNS = Path("runs")
+"""The folder of all runs, if no other is given. Commands look there beside the registry: runs of earlier versions
+are not registered."""
 LAST = "LAST"
 """In the folder of all runs: a link to the newest; where links are impossible a file that holds its name."""
 _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
@@ -122,7 +123,7 @@ def find_run(name: str, runs: Path) -> Path:
             named = path.parent / read_text(path, FileKind.RUN).strip()
             if named.is_dir():
                 return named
-    for run in registered() if runs == _USUAL else ():
+    for run in registered() if runs == RUNS else ():
         if name in (run.name, LAST):
             return run.folder
     raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}; `swarm ps -a` lists your runs")

@@ -101,6 +101,7 @@ def registered() -> list[KnownRun]:
     """The runs that run, then those whose folders are there, each the newest first. Removes the entry of a launcher
     that has ended, if its folder was removed or another entry names it."""
     found: dict[Path, list[_Entry]] = {}
+    pids: dict[Path, list[int]] = {}
     for file, entry in _entries():
         folder, is_running = Path(entry.folder), _runs(entry)
         with suppress(OSError, ValueError):  # a folder that cannot be looked at
@@ -108,10 +109,11 @@ def registered() -> list[KnownRun]:
                 file.unlink()
             elif folder.is_absolute():
                 found.setdefault(folder, []).append(entry)
+                pids.setdefault(folder, []).extend([entry.pid] * is_running)
     runs = [
         KnownRun(
             folder,
-            tuple(each.pid for each in entries if _runs(each)),
+            tuple(pids[folder]),
             max(each.web_port for each in entries),
             any(each.is_whole for each in entries),
         )
