@@ -163,11 +163,11 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """Heights in a text or an archive of arrays."""
-    from shared_map.importers.array_grids import read_asc, read_npz
+    from shared_map.importers.array_grids import read_npz
     from shared_map.importers.xyz_grids import read_text_grid
 
     suffix = path.suffix.lower()
-    plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
+    plain = read_npz(path) if suffix == ".npz" else read_text_grid(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config)
@@ -176,10 +176,10 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
         step = (config.resolution_m, config.resolution_m)
     degrees = plain.degrees or _geographic(config.crs)
-    if suffix != ".npz" and not degrees and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
-        raise TerrainError(
-            f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
-        )
+    if suffix != ".npz" and not degrees and config.crs is None:
+        from shared_map.importers.georeference import check_metres
+
+        check_metres(step[0], plain.west, f"terrain {path}")
     place = (heights, step, plain.west, plain.north, config.resolution_m, str(path))
     heights, grid, note = from_degrees(*place) if degrees else from_metres(*place, config.crs or "local")
     if photo is not None and photo.shape[:2] != heights.shape:
@@ -239,8 +239,9 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".dem": _raster,
     ".nc": _raster,
     ".dt2": _raster,
+    ".asc": _raster,
+    ".grd": _raster,
     ".zip": _raster,
-    ".asc": _heights,
     ".npz": _heights,
     ".csv": _heights,
     ".xyz": _heights,
