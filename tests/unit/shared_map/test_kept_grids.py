@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ HEIGHTS = (300 + 8 * np.sin(np.arange(12) / 3)[:, None] + np.cos(np.arange(15) /
 ROWS, COLS = HEIGHTS.shape
 
 
-def load(path: Path, **settings: object) -> Source:
+def load(path: Path, **settings: Any) -> Source:
     return load_source(TerrainConfig(source=str(path), **settings), seed=1)
 
 
