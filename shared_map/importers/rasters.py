@@ -280,6 +280,14 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
+    axes = [
+        axis
+        for part in crs.to_dict(projjson=True).get("components", [])
+        for axis in part["coordinate_system"]["axis"]
+    ]
+    if any(axis["direction"] == "down" for axis in axes):  # a vertical system such as EPSG:5715
+        factor, offset = -factor, -offset
+        notes.append("the file states depths; heights are their negatives")
     text = str(dataset.units[0] or "").lower()
     # [m], US_survey_foot and ft (US) without their brackets and signs.
     unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())
