@@ -272,6 +272,8 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
             f"{what} {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
             f" {_HGT_BYTES[0]}, one of 3601 has {_HGT_BYTES[1]}"
         )
+    if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
+        raise TerrainError(f"{what} {path}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
         _check_virtual(path, f"{what} {path}", {})
     if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter

@@ -23,6 +23,8 @@ JACKSBORO_RESOLUTION_M = 75.0
 """Its heights are 3 arc seconds apart, at 36.6 degrees north 74.5 m from west to east and 92.5 m from north to
 south: cells as fine as the closer of the two."""
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
+_SOME = 7
+"""Every n-th height is shown in an error."""
 SYNTHETIC_RESOLUTION_M = 30.0
 """The resolution of the elevation models that cover the world, Copernicus GLO-30 and SRTM."""
 
@@ -264,15 +266,22 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.level_ground import fill_voids, voids_of
+    from shared_map.importers.level_ground import HIGHEST_M, fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
         elevation_m = elevation_m.copy()
+    some_m = elevation_m[::_SOME, ::_SOME].copy()
     count = voids_of(elevation_m)
     if count == 0:
         return replace(source, elevation_m=elevation_m)
     share = count / elevation_m.size
+    if share == 1.0 and np.isfinite(some_m).any():
+        found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
+        raise TerrainError(
+            f"terrain {config.source} has heights of {found} m, expected at most {HIGHEST_M:g}: of centimetres set"
+            " terrain.height_scale = 0.01"
+        )
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
     if config.nodata == "fill":

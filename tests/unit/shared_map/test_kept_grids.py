@@ -166,6 +166,32 @@ def test_control_points_place_a_raster(tmp_path: Path) -> None:
     assert float(np.nanmean(source.elevation_m)) == pytest.approx(float(HEIGHTS.mean()), abs=0.5)
 
 
+@pytest.mark.parametrize(
+    ("ending", "scale", "profile", "words"),
+    [
+        ("tif", 100, {}, r"has heights of 2.* to 3.* m, expected at most 20000: of centimetres set"),
+        ("hgt", 1, {"driver": "GTiff"}, "says by its name where it lies, such as N46E008.hgt"),
+    ],
+)
+def test_a_refusal_states_what_was_found(
+    tmp_path: Path, ending: str, scale: float, profile: dict[str, Any], words: str
+) -> None:
+    path = tmp_path / f"dem.{ending}"
+    if ending == "hgt":
+        path.write_bytes(bytes(2 * 1201 * 1201))
+    else:
+        write_raster(path, 10.0, numbers=HEIGHTS * np.float32(scale), **profile)
+    with pytest.raises(TerrainError, match=words):
+        load(path)
+
+
+def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
+    write_raster(tmp_path / "a.tif", 10.0, crs="EPSG:32632+5715")
+    source = load(tmp_path / "a.tif")
+    np.testing.assert_array_equal(source.elevation_m, -HEIGHTS)
+    assert "the file states depths; heights are their negatives" in source.notes
+
+
 @pytest.mark.parametrize("kind", ["NC", "NC4"])
 def test_both_versions_of_netcdf_are_read(tmp_path: Path, kind: str) -> None:
     write_raster(tmp_path / "a.tif", 10.0)
