@@ -65,6 +65,10 @@ class StoreError(SwarmError):
     exit_code = 6
 
 
+class DamagedError(StoreError):
+    """A store that is not as it was written."""
+
+
 class ProtocolError(SwarmError):
     """A payload that is no message, or a message that breaks its rules. The bus counts and drops it; no service
     sees it."""
