@@ -65,8 +65,10 @@ class StoreError(SwarmError):
     exit_code = 6
 
 
-class DamagedError(StoreError):
-    """A store that is not as it was written."""
+class DamagedError(SwarmError):
+    """A store that is not as it was written. A full disk gets better (`StoreError`), a damaged record does not."""
+
+    exit_code = StoreError.exit_code
 
 
 class ProtocolError(SwarmError):

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import DamagedError, StoreError
+from swarm.errors import DamagedError, StoreError, SwarmError
 from swarm.files import writing
 
 DIGEST_BYTES = 8
@@ -90,23 +90,7 @@ class Lock:
             fcntl.flock(self._file, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
         except OSError as error:
             self.close()
-            raise StoreError(f"{path} is in use: {in_use}") from error
-
-    def check(self, found: Seal, *, digest_at: Callable[[int], bytes | None]) -> None:
-        """Raises DamagedError if the store is older than the witness, or another one."""
-        witness = read_seal(os.pread(self._file, SEAL_BYTES, 0), found.kind)
-        if witness is None:  # none was written yet, or it is damaged itself: nothing acts on it
-            return
-        told = f"to use it nevertheless, delete {self._path}.lock"
-        if witness.name != found.name:
-            raise DamagedError(f"{self._path} is another file than the one that was written last; {told}")
-        if witness.last > found.last:
-            raise DamagedError(
-                f"{self._path} is an older version: it ends with record {found.last}, but {witness.last} were "
-                f"written; {told}"
-            )
-        if (known := digest_at(witness.last)) is not None and known != witness.digest:
-            raise DamagedError(f"{self._path} is damaged: record {witness.last} is not the one written; {told}")
+            raise StoreError(f"{path} is in use {in_use}") from error
 
     def witness(self, seal: Seal) -> None:
         with writing(self._path):
@@ -116,6 +100,34 @@ class Lock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def witness_of(path: Path, kind: str) -> Seal | None:
+    """Returns the witness of a store; None if there is none, or one of another kind, or it is damaged itself."""
+    try:
+        with Path(f"{path}.lock").open("rb") as file:
+            return read_seal(file.read(SEAL_BYTES), kind)
+    except OSError:
+        return None
+
+
+def check_witness(path: Path, witness: Seal | None, found: Seal, digest_at: Callable[[int], bytes | None]) -> None:
+    """Raises DamagedError if a store is older than its witness, or another one.
+
+    found      the seal of its whole content
+    digest_at  the digest of the record of a number; None if the file does not hold it
+    """
+    if witness is None:
+        return
+    if witness.name != found.name:
+        why = "is another file than the one that was written last"
+    elif witness.last > found.last:
+        why = f"is an older version: expected {witness.last} records or commits, found {found.last}"
+    elif (digest_at(witness.last) or witness.digest) != witness.digest:
+        why = f"is damaged: expected record {witness.last} as it was written, found another"
+    else:
+        return
+    raise DamagedError(f"{path} {why}; to use it nevertheless, delete {path}.lock")
 
 
 class Journal:
@@ -162,7 +174,7 @@ class Journal:
         try:
             if path.exists():
                 self._read(older)
-        except StoreError:
+        except SwarmError:
             self.close()
             raise
 
@@ -228,6 +240,7 @@ class Journal:
 
     def _read(self, older: Callable[[bytes], list[bytes]]) -> None:
         """Reads the records of the file, and goes on behind them."""
+        witness = witness_of(self._path, self._seal.kind)
         data = read_bytes(self._path, self._kind)
         seal = read_seal(data, self._seal.kind)
         if seal is None:
@@ -237,7 +250,7 @@ class Journal:
                 raise DamagedError(
                     f"{self._path} is damaged at byte 0: expected a seal of {self._seal.kind!r}, found {error}"
                 ) from error
-            self._lock.check(self._seal, digest_at=lambda _: None)
+            check_witness(self._path, witness, self._seal, lambda _: None)
             return
         at, number, digest = SEAL_BYTES + DIGEST_BYTES, seal.first, data[SEAL_BYTES : SEAL_BYTES + DIGEST_BYTES]
         digests = {}
@@ -256,7 +269,7 @@ class Journal:
                 "written, found other bytes"
             )
         found = seal._replace(last=number, digest=digest)
-        self._lock.check(found, digest_at=digests.get)
+        check_witness(self._path, witness, found, digests.get)
         with writing(self._path):
             self._file = os.open(self._path, os.O_RDWR)
         self._seal, self._at, self._size, self._synced = found, at, len(data), found == seal

@@ -78,7 +78,7 @@ class FilePromiseStore(PromiseStore):
     def __init__(self, path: Path, *, waits: bool = False) -> None:
         super().__init__(secrets.randbits(60))
         self._encode = msgspec.msgpack.Encoder().encode
-        in_use = "the same agent runs here already; end it first"
+        in_use = "by the same agent, which runs here already: end it first"
         self._journal = Journal(
             path, FileKind.PROMISES, self._live, _older, size=_SIZE_BYTES, in_use=in_use, waits=waits
         )

@@ -70,7 +70,7 @@ class LifeFile(MemoryLives):
             lambda: [_encoded(self.lives)],
             _older,
             size=_SIZE_BYTES,
-            in_use="this vehicle has right of way here already",
+            in_use="by this vehicle, which has right of way here already",
         )
         for body in self._journal.found:
             self.lives = [number for (number,) in _LIFE.iter_unpack(body)]

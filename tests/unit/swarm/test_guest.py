@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest import Guest, Removal
 from swarm.right_of_way.guest_session import GuestService
@@ -225,7 +225,7 @@ def test_lives_are_on_file_before_they_speak_and_one_process_has_the_file(tmp_pa
     again.close()
     older = tmp_path / "older"
     older.write_text("4\nnine\n")
-    with pytest.raises(StoreError, match="is damaged at byte 0: expected a seal of 'lives 1'"):
+    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1'"):
         LifeFile(older)
     older.write_text("4\n9\n")
     for _ in range(2):
