@@ -390,10 +390,11 @@ class AgentService:
                         force=force,
                         vehicle_class=self._class,
                     )
-                    self._bus.ask(ROUTE, asking, self._post, tag=f"route-{request}", target=target)
+                    tag = f"route-{request}"
+                    self._bus.ask(ROUTE, asking, self._post, tag=tag, target=target, asker=self._setup.asker)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
-                    self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
+                    self._bus.ask(COST, costs, self._post, tag=f"cost-{request}", asker=self._setup.asker)
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:

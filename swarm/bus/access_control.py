@@ -14,7 +14,7 @@ from swarm.errors import ConfigError
 from swarm.liveness import job_of
 from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import check_id
-from swarm.wire.topics import ALIVE_KEY, TOPICS
+from swarm.wire.topics import ALIVE_KEY, TOPICS, asker_of
 
 ROUTER = "router"
 _EVERYTHING = (
@@ -40,6 +40,7 @@ class Bearer:
     def own(self, field: str) -> str:
         """Required value of a key's field where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
+        own["asker"] = asker_of(self.role, self.id)
         return own.get(field, self.id)
 
 

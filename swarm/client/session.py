@@ -23,7 +23,7 @@ from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import ROUTE, RUN, Topic
+from swarm.wire.topics import NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -177,8 +177,12 @@ class Session:
         self.bus.ask(topic, request, self.post, tag=tag, timeout_s=timeout_s, **fields)
         return waiting
 
-    def ask_route(self, target: str, cell: int, vehicle_class: str, timeout_s: float) -> Future[Route]:
+    def ask_route(
+        self, target: str, cell: int, vehicle_class: str, timeout_s: float, vehicle: str | None = None
+    ) -> Future[Route]:
         """The best route of a class of vehicles from a cell. Its failure is a BusError.
+
+        vehicle  id of the vehicle which asks; without one the question shares the turn of nameless askers
 
         Raises ConfigError if the target's id is none.
         """
@@ -197,7 +201,9 @@ class Session:
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
-        self.ask(ROUTE, request, timeout_s, target=target).add_done_callback(finish)
+        asker = {} if vehicle is None else {"asker": asker_of("rover", vehicle)}
+        topic = NAMELESS_ROUTE if vehicle is None else ROUTE
+        self.ask(topic, request, timeout_s, target=target, **asker).add_done_callback(finish)
         return found
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
