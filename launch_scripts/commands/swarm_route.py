@@ -26,7 +26,7 @@ from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus
-from swarm.wire.topics import COST, ROUTE, asker_of
+from swarm.wire.topics import COST, NAMELESS, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -103,6 +103,8 @@ def ask_planner(
     asker = asker_of(OPERATOR, "command")
     topic = COST if cost else ROUTE
     replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target, asker=asker)
+    if not replies and failure is None:  # no planner, or an earlier version
+        replies, failure = replies_to(bus, NAMELESS[topic.name], request, _TIMEOUT_S, target=target)
     took_ms = (time.monotonic() - began_s) * 1e3
     for reply in replies:
         if isinstance(reply, RouteReply | CostReply):

@@ -23,7 +23,7 @@ from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
+from swarm.wire.topics import NAMED_SINCE, NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -201,10 +201,16 @@ class Session:
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
-        asker = {} if vehicle is None else {"asker": asker_of("rover", vehicle)}
-        topic = NAMELESS_ROUTE if vehicle is None else ROUTE
-        self.ask(topic, request, timeout_s, target=target, **asker).add_done_callback(finish)
+        self.ask_planner(request, timeout_s, target, vehicle).add_done_callback(finish)
         return found
+
+    def ask_planner(
+        self, request: RouteRequest, timeout_s: float, target: str, vehicle: str | None
+    ) -> Future[list[Any]]:
+        """All answers of a planner, asked under the name of a vehicle."""
+        if vehicle is None or self.run.wire_version < NAMED_SINCE:
+            return self.ask(NAMELESS_ROUTE, request, timeout_s, target=target)
+        return self.ask(ROUTE, request, timeout_s, target=target, asker=asker_of("rover", vehicle))
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
         """Waits for the replies to a query. Raises BusError; ConfigError on the thread that would have to bring

@@ -18,7 +18,7 @@ from swarm.errors import ConfigError
 from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
-from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE, asker_of
+from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE
 
 if TYPE_CHECKING:
     from swarm.right_of_way.guest_session import GuestSession
@@ -199,7 +199,7 @@ class Vehicle(Reported):
         request = RouteRequest(
             cells=[self.cell], vehicles=[self.id], force=ran_out, vehicle_class=self.vehicle_class
         )
-        asked = self._session.ask(ROUTE, request, _TIMEOUT_S, target=target, asker=asker_of("rover", self.id))
+        asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
         self._asking = True
 
         def finish(done: Future[list[Any]]) -> None:

@@ -15,7 +15,7 @@ CAPACITY = 4096
 PER_ASKER = CAPACITY // 4
 """Unread questions per asker, or per topic where the key names no asker."""
 _BASE_PRICE = 64
-"""A question of no bytes costs as much as one of so many cells."""
+"""Price of a question without content, in bytes."""
 LATE_S = 0.5
 """Once the oldest question of an asker has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""

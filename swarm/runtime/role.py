@@ -13,7 +13,6 @@ from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo, Stats
-from swarm.wire.topics import asker_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +69,6 @@ class RoleSetup:
             wire_version=WIRE_VERSION,
             plot_cells=self.scenario.map.plot_regions * REGION_CELLS,
         )
-
-    @property
-    def asker(self) -> str:
-        """Name under which this process asks planners."""
-        return asker_of(self.role, self.id)
 
     @property
     def author(self) -> str:

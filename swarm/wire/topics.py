@@ -360,6 +360,10 @@ ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
 _TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64})/([0-9]{1,19})")
 
 
+NAMELESS = {ROUTE.name: NAMELESS_ROUTE, COST.name: NAMELESS_COST}
+"""Topic -> the one of the same questions without the name of an asker."""
+NAMED_SINCE = 9
+"""Wire version from which on planners answer questions with the name of an asker."""
 NO_ASKER = "-"
 """In the key of an answer, the asker of a question under many names."""
 

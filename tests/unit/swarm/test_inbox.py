@@ -333,7 +333,7 @@ def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
 
 
 def flooded(*askers: tuple[str, int], size: int = 450_000) -> tuple[Inbox, Time]:
-    """An inbox with so many expensive questions of each asker."""
+    """An inbox with expensive questions, a number of each asker."""
     inbox, clock = Inbox(), Time()
     for name, many in askers:
         for _ in range(many):
