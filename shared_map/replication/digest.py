@@ -138,13 +138,14 @@ def fingerprint(held: Held) -> str:
 
 
 _NAME_BYTES = 80
-"""Of an author in a message, at most, beside its rows."""
+"""Most bytes of an author in a message, beside its rows."""
 
 
 def parts_of(held: Held, most_bytes: int) -> Iterator[tuple[dict[str, bytes], Place | None, Place | None]]:
-    """The rows of a digest in parts of so many bytes, with the range of each as in `Digest`. One part if all fit.
+    """The rows of a digest in parts, with the range of each as in `Digest`. One part if all fit.
 
-    held  in order of author, its rows in order of tile
+    held        in order of author, its rows in order of tile
+    most_bytes  of the rows and names in one part
     """
     part: dict[str, bytes] = {}
     left, after, last = most_bytes, None, None
@@ -170,7 +171,7 @@ _MAX_TRIES = 10
 """After these the sender has sent its next whole digest, which starts again."""
 _MAX_SENDERS = 4096
 _MAX_PARTS = 128
-"""Of one sender: a keeper's digest of every tile of a map of 16,384 x 16,384 cells has 85."""
+"""Most that wait of one sender: a keeper's digest of every tile of a map of 16,384 x 16,384 cells has 85."""
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""
 _FORGET_NS = 60 * NS_PER_S

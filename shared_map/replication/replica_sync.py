@@ -6,7 +6,6 @@ replica tells by digests what it holds, and a replica that misses something asks
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -59,8 +58,6 @@ _TILES_AT_ONCE = MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
 _PART_BYTES = MOST_DIGEST_BYTES - 512
 """Rows and names of authors in one digest, without its other fields."""
-_PARTS_AT_ONCE = 4
-"""Parts of a digest that are published at one tick."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
 _MANY = "-"
@@ -392,26 +389,24 @@ class MapSync:
         if now_ns >= self._digest_due_ns and not self._parts:
             self._digest_due_ns = now_ns + self._digest_ns
             self._parts.extend(parts_of(self._committed(), _PART_BYTES))
-        for _ in range(min(len(self._parts), _PARTS_AT_ONCE)):
-            held, after, until = self._parts.popleft()
-            self._put_digest(held, whole=after is None and until is None, after=after, until=until)
         author = self.replica.author
-        if author is None or not self._changed or now_ns < self._changes_due_ns:
+        after: Place | None = None
+        until: Place | None = None
+        whole = False
+        if self._parts:  # one message at a tick, as a reader takes the newest of each key
+            held, after, until = self._parts.popleft()
+            whole = after is None and until is None
+        elif author is not None and self._changed and now_ns >= self._changes_due_ns:
+            changes = {author: self.replica.held.ledger.rows_of(author, self._changed)}
+            held = next(parts_of(changes, _PART_BYTES))[0]
+        else:
             return
-        changes = {author: self.replica.held.ledger.rows_of(author, self._changed)}
-        for held, _, _ in itertools.islice(parts_of(changes, _PART_BYTES), _PARTS_AT_ONCE):
-            self._put_digest(held, whole=False)
         self._changes_due_ns = now_ns + _CHANGES_EVERY_NS
         for tile, until_ns in list(self._changed.items()):
             if until_ns is None:
                 self._changed[tile] = now_ns + _CHANGES_FOR_NS
             elif now_ns >= until_ns:
                 del self._changed[tile]
-
-    def _put_digest(
-        self, held: dict[str, bytes], *, whole: bool, after: Place | None = None, until: Place | None = None
-    ) -> None:
-        assert self._name is not None
         self._digest_seq += 1
         digest = Digest(
             author=self._name,

@@ -11,8 +11,6 @@ from msgspec import Meta
 
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import (
-    IDS,
-    MOST_IDS,
     Column,
     GridSide,
     Id,
@@ -126,6 +124,7 @@ DIGEST_ROW_BYTES = width_of(_ROW)
 MOST_TILES = 1 << 18
 """Named in one message: every tile of a map of 16,384 x 16,384 cells."""
 DigestRows = Annotated[bytes, Meta(max_length=DIGEST_ROW_BYTES * MOST_TILES), Column(_ROW)]
+_AUTHORS = Meta(max_length=1 << 16)
 _Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
 _Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
 _Paces = Annotated[bytes, Column("<f4", per="kinds", least=PACE_LEAST, most=PACE_MOST, checked=False)]
@@ -231,7 +230,7 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
 
 
 MOST_DIGEST_BYTES = 1 << 16
-"""Of one digest, so that it is compared within a tick. It names 3,000 sets, more than most agents ever leave. A
+"""Bound of one digest, so that it is compared within a tick. It names 3,000 sets, more than most agents ever leave. A
 replica that holds more publishes parts (`Digest.after`)."""
 KEEPERS = "keeper"
 """The authors under which keepers publish digests begin with this and a dot, and no group is called so: an author's
@@ -253,7 +252,7 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
 
     author: Id
     role: Word
-    held: Annotated[dict[Id, DigestRows], Meta(max_length=MOST_IDS)]
+    held: Annotated[dict[Id, DigestRows], _AUTHORS]
     whole: bool = True
     seq: Natural = 0
     after: _Place | None = None
@@ -280,7 +279,7 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
     bulk  answers may be MarkSets, under a key with `-` for region and tile
     """
 
-    authors: Annotated[list[Id], IDS] = []
+    authors: Annotated[list[Id], _AUTHORS] = []
     tiles: Annotated[list[Tile], Meta(max_length=MOST_TILES)] = []
     bulk: bool = False
 

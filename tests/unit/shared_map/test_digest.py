@@ -76,7 +76,7 @@ tables = st.dictionaries(
 def test_the_parts_of_a_digest_name_each_set_once_and_between_them_cover_everything(
     ours: dict[str, set[int]], theirs: dict[str, set[int]], most_bytes: int
 ) -> None:
-    """What parts show to be missing on their side is what the whole digest shows."""
+    """Parts show the same to be missing on their side as the whole digest does."""
     ledger, kept = Ledger(), Ledger()
     for filled, table in ((ledger, ours), (kept, theirs)):
         for author, tiles in table.items():
