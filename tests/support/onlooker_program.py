@@ -70,7 +70,7 @@ class Notes:
                 self.followed.setdefault(followed.vehicle, []).append(now_s)
             case Heard(message=Beat(role="planner", leads=True) as beat):
                 self.leads[beat.id] = now_s
-            case Heard(message=Digest() as digest if is_keeper(digest.author):
+            case Heard(message=Digest() as digest) if is_keeper(digest.author):
                 kept = self.acknowledged.setdefault(digest.author.split(".")[1], {})
                 for author, rows in digest.held.items():
                     for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist():
