@@ -57,6 +57,7 @@ from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -217,7 +218,8 @@ class _Run:
                 self._swarm.stop(lambda: time.sleep(_TURN_S), force=self._stop_asked.force)
                 return self._stopped_early()
             log.info("the router listens")
-            with open_bus(self._scenario.network) as bus:
+            network = self._scenario.network
+            with open_bus(network, authenticator=authenticator_of(network, self._run_id)) as bus:
                 self._join(bus)
                 self._say_begin()
                 known: Recorder | OwnPart
