@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.check.machine_check import this_machine, why_no_room
 from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
@@ -366,8 +367,12 @@ class _Run:
     def _ordered_planners(self) -> OrderedPlanners:
         options = self._options
         whole = options.is_whole and not options.joins
+
+        def no_room(planners: int) -> str | None:
+            return why_no_room(self._scenario, self._terrain.grid.cells, planners, this_machine(self._run_dir))
+
         return OrderedPlanners(
-            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say
+            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say, no_room
         )
 
     def _is_up(self, watcher: Watcher) -> bool:
