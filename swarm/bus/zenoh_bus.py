@@ -50,6 +50,7 @@ from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
+from swarm.wire.meant import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
@@ -79,14 +80,12 @@ class ZenohAnswerer:
         """Returns the query, decoded; None if it is rejected, which ends the query."""
         intake, topic, query = self._bus.intake, self._topic, self._query
         assert query is not None
-        assert topic.request is not None
         key = str(query.key_expr)
         intake.received(self._asked)
         try:
             if self._fault is not None:
                 raise self._fault
-            intake.check(topic, key, query, self._asked)
-            request = intake.request(topic.request, query, self._asked, self._parameters)
+            request = intake.request(topic, query, self._asked, self._parameters)
         except ProtocolError as error:
             intake.drop(key, error)
             self.refuse(f"{topic.name}: {error}")
@@ -108,7 +107,8 @@ class ZenohAnswerer:
         key = topic.keyed(bus.namespace, **{**self._concrete, **fields})
         if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        payload = encode_json(message) if self._as_json else encode(message)
+        below = bus.intake.below(key)
+        payload = encode_json(message, below) if self._as_json else meant_for(below, encode(message))
         bus.intake.sent(payload)
         if self._as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
@@ -225,7 +225,8 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self.closed:
             return
-        key, payload = topic.keyed(self._namespace, **fields), encode(message)
+        below = topic.value(fields)[1]
+        key, payload = f"{self._namespace}/{below}", meant_for(below, encode(message))
         self.intake.sent(payload)
         self._session.put(
             key,
@@ -328,7 +329,8 @@ class ZenohBus:
     ) -> None:
         replies = 0
         failure: str | None = None
-        expression, asked = topic.expression(self._namespace, **fields), encode(request)
+        expression = topic.expression(self._namespace, **fields)
+        asked = meant_for(self.intake.below(expression), encode(request))
         began_s = time.monotonic()
 
         def arrive(reply: zenoh.Reply) -> None:
@@ -341,6 +343,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
+                check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
                 named = self.intake.fields(topic, key)

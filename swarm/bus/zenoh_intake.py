@@ -15,10 +15,27 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S, Heard, new_counts, newest_of
+from swarm.bus.bus import (
+    LONGEST_TIMEOUT_S,
+    TIMEOUT_PARAMETER,
+    USUAL_TIMEOUT_S,
+    Heard,
+    counter_of,
+    new_counts,
+    newest_of,
+)
 from swarm.errors import ProtocolError
 from swarm.wire.access import Authenticator, check_code
-from swarm.wire.codec import JSON_ENCODING, decode, decode_many, decode_parameters, may_be_json, packed_json
+from swarm.wire.codec import (
+    JSON_ENCODING,
+    KEY_FIELD,
+    decode,
+    decode_many,
+    decode_parameters,
+    may_be_json,
+    packed_json,
+)
+from swarm.wire.meant import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic
 
@@ -160,10 +177,8 @@ class Intake:
         key = str(sample.key_expr)
         try:
             named = self.fields(topic, key)
-            self.check(topic, key, sample, payload)
-            if says_json(sample, payload):
-                payload = packed_json(payload, topic.message, named)
-            message = decode(payload, topic.message)
+            packed = self._checked(topic, key, sample, payload)
+            message = decode(packed, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
             self.drop(key, error)
@@ -198,20 +213,37 @@ class Intake:
         for sample, payload in zip(samples, payloads, strict=True):
             key = str(sample.key_expr)
             try:
-                if says_json(sample, payload):
-                    payload = packed_json(payload, topic.message, self.fields(topic, key))
+                payload = self._checked(topic, key, sample, payload)
             except ProtocolError as error:
                 self.drop(key, error)
             else:
                 yield key, payload
 
-    def request(
-        self, wanted: type[Message], query: zenoh.Query, asked: bytes, parameters: dict[str, str]
-    ) -> Message:
+    def request(self, topic: Topic, query: zenoh.Query, asked: bytes, parameters: dict[str, str]) -> Message:
         """Decodes a query with the payload `asked`. Raises ProtocolError."""
+        key, wanted = str(query.key_expr), topic.request
+        assert wanted is not None
         if query.payload is None:
+            check_named(self.below(key), parameters.pop(KEY_FIELD, None))
+            self.check(topic, key, query, asked)
             return decode_parameters(parameters, wanted)
-        return decode(packed_json(asked, wanted) if says_json(query, asked) else asked, wanted)
+        packed = packed_json(asked, wanted) if says_json(query, asked) else asked
+        check_meant(self.below(key), packed)
+        self.check(topic, key, query, asked)
+        return decode(packed, wanted)
+
+    def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
+        """A payload as MessagePack, which is meant for its key and has the code that its topic needs. Raises
+        ProtocolError."""
+        in_json = says_json(sample, payload)
+        packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
+        check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
+        self.check(topic, key, sample, payload)
+        return packed
+
+    def below(self, key: str) -> str:
+        """A key below the namespace."""
+        return key.removeprefix(f"{self._namespace}/")
 
     def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
         """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
@@ -239,7 +271,7 @@ class Intake:
 
     def drop(self, key: str, error: ProtocolError) -> None:
         with self._counting:
-            self.counts["payloads_dropped"] += 1
+            self.counts[counter_of(error)] += 1
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > _LOGGED_KEYS:

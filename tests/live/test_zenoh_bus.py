@@ -451,9 +451,10 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     world.until(lambda: said and heard)
     put = (said[0].payload.to_bytes(), said[0].attachment.to_bytes())
     thief.put("swarm/stored/0/a1/a2", put[0], attachment=put[1])
+    thief.put("swarm/stored/0/a1/a2", put[0].replace(b"stored/0/a1/a0", b"stored/0/a1/a2"), attachment=put[1])
     thief.put("swarm/stored/0/a1/a0", put[0], attachment=put[1])
     world.until(lambda: len(heard) == 2)  # a repetition is nothing new
-    assert hears.counts["payloads_dropped"] == 1
+    assert hears.counts["payloads_misrouted"] == hears.counts["payloads_dropped"] == 1
     listening.undeclare()
 
     hears.serve(TABLE, answering((table(), {})), plot=0, member="a1", agent="a0")
