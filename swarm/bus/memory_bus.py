@@ -309,7 +309,7 @@ Trace = Callable[[int, str, str, str, bytes], None]
 
 MOST_SWAPPED = 300
 """Messages to one bus that come under a wrong key after a reconnect."""
-SWAPPED_NS = NS_PER_S
+SWAPPED_NS = NS_PER_S // 4
 """No message comes under a wrong key later than this after a reconnect."""
 
 
