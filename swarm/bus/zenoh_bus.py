@@ -18,6 +18,7 @@ from typing import Any
 
 import zenoh
 
+from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
@@ -279,13 +280,17 @@ class ZenohBus:
         return self.intake.together(topic, samples) if samples else []
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
+        subscribers = self._subscribers.pop(self._pattern(topic, fields), ())
         collecting = self._collecting.get(topic.name, ())
         self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
         self._undeclare_all(subscribers)
 
+    def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:
+        """The key expression of a subscription or queryable."""
+        return patterned(topic.expression(self._namespace, **fields))
+
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
@@ -296,17 +301,17 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            asked = ZenohAnswerer(self, topic, concrete, query).decoded()
-            if asked is not None:
+            answerer = ZenohAnswerer(self, topic, concrete, query)
+            if not self.intake.concerns(query):
+                answerer.end()
+            elif undecoded:
+                post(Undecoded(topic, answerer, answerer.decoded))
+            elif (asked := answerer.decoded()) is not None:
                 post(asked)
 
-        def leave(query: zenoh.Query) -> None:
-            answerer = ZenohAnswerer(self, topic, concrete, query)
-            post(Undecoded(topic, answerer, answerer.decoded))
-
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         arrivals = Arrivals(_QUERY_BUFFER)
-        into = zenoh.handlers.Callback(guarded(leave), indirect=False) if undecoded else _into(arrivals)
+        into = zenoh.handlers.Callback(guarded(arrive), indirect=False) if undecoded else _into(arrivals)
         queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
         if undecoded:
@@ -315,7 +320,7 @@ class ZenohBus:
             self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
-        self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
+        self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
 
     def ask(
         self,
@@ -379,6 +384,8 @@ class ZenohBus:
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
+            if not str(sample.key_expr).startswith(f"{self._namespace}/"):
+                return
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
@@ -391,7 +398,7 @@ class ZenohBus:
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
         arrivals = Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._namespace}/{key}", _into(arrivals), history=True
+            patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
         )
         self._read(subscriber, arrive, "alive", arrivals.take)
 

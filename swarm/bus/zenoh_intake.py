@@ -164,7 +164,7 @@ class Intake:
     """
 
     def __init__(self, namespace: str, authenticator: Authenticator | None) -> None:
-        self._namespace = namespace
+        self._namespace, self._start = namespace, f"{namespace}/"
         self._authenticator = authenticator
         self.counts = new_counts()
         self._counting = threading.Lock()
@@ -172,9 +172,8 @@ class Intake:
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
 
-    def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
+    def _heard(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
-        key = str(sample.key_expr)
         try:
             named = self.fields(topic, key)
             packed = self._checked(topic, key, sample, payload)
@@ -195,23 +194,30 @@ class Intake:
             if isinstance(message, ProtocolError):
                 self.drop(key, message)
             else:
-                heard.append((key[len(self._namespace) + 1 :], message))
+                heard.append((self.below(key), message))
         return heard
 
     def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
         """The events of the newest sample under each key, without those that are rejected."""
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        if samples:
-            self.received(*payloads)
-        keyed = ((str(each[0].key_expr), each) for each in zip(samples, payloads, strict=True))
+        keyed = ((each[0], each) for each in self._own(samples))
         return newest_of(topic, keyed, lambda waited: self._heard(topic, *waited))
+
+    def _own(self, samples: list[zenoh.Sample]) -> list[tuple[str, zenoh.Sample, bytes]]:
+        """Keys, samples and payloads of those in our namespace: `patterned` hears others, too."""
+        keyed = ((str(sample.key_expr), sample) for sample in samples)
+        own = [(key, sample, sample.payload.to_bytes()) for key, sample in keyed if key.startswith(self._start)]
+        if own:
+            self.received(*(payload for _, _, payload in own))
+        return own
+
+    def concerns(self, query: zenoh.Query) -> bool:
+        """Returns True if a query asks for a key in our namespace."""
+        key = str(query.key_expr)
+        return key.startswith(self._start) or zenoh.KeyExpr(f"{self._start}**").intersects(query.key_expr)
 
     def _packed(self, topic: Topic, samples: list[zenoh.Sample]) -> Iterator[tuple[str, bytes]]:
         """Keys and payloads as MessagePack, without those that are broken JSON."""
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        self.received(*payloads)
-        for sample, payload in zip(samples, payloads, strict=True):
-            key = str(sample.key_expr)
+        for key, sample, payload in self._own(samples):
             try:
                 payload = self._checked(topic, key, sample, payload)
             except ProtocolError as error:
@@ -243,7 +249,7 @@ class Intake:
 
     def below(self, key: str) -> str:
         """A key below the namespace."""
-        return key.removeprefix(f"{self._namespace}/")
+        return key.removeprefix(self._start)
 
     def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
         """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
