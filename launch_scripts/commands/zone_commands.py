@@ -21,7 +21,7 @@ from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, TerrainError
 from swarm.places import FORMS, corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
@@ -98,7 +98,10 @@ def add(
         return _give(of_places, where, as_json)
     if polygon is not None or polygon_m is not None:
         raise ConfigError("zone add: give either --file or a polygon")
-    check_file(file, FileKind.VECTORS)
+    try:
+        check_file(file, FileKind.VECTORS)
+    except TerrainError as error:
+        raise ConfigError(f"--file: {error}") from error
     checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
 
     def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
