@@ -272,7 +272,8 @@ class Journal:
         check_witness(self._path, witness, found, digests.get)
         with writing(self._path):
             self._file = os.open(self._path, os.O_RDWR)
-        self._seal, self._at, self._size, self._synced = found, at, len(data), found == seal
+        self._seal, self._at, self._size = found, at, len(data)
+        self._synced = False  # a record that is whole counts from now on, and a witness may be missing
         self.sync()
 
     def _switch(self) -> None:

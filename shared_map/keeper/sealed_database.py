@@ -281,8 +281,9 @@ class SealedDatabase:
             raise DamagedError(_damaged(self.path, "expected the rows of its seal, found more or fewer"))
         check_witness(self.path, witness, seal, lambda number: seal.digest if number == seal.last else None)
         self._seal = seal
-        if not self._read_only:
+        if self._lock is not None:
             self._watch(db)
+            self._lock.witness(seal)  # there may be none
         return db
 
     def _check_version(self, meta: dict[str, str], known: str) -> None:
