@@ -35,7 +35,7 @@ from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import Topic, check_size
 
 # One query on the simulated network: which queryables have not ended yet, and how their answers travel.
 
@@ -125,6 +125,7 @@ class MemoryAnswerer:
             if asking.over:
                 return
             try:
+                check_size(payload, asking.topic.answer_bytes)
                 check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
             except ProtocolError:
                 asking.bus.counts["payloads_dropped"] += 1
@@ -488,6 +489,7 @@ class MemoryBus:
             return
         to.received(payload)
         try:
+            check_size(payload, topic.ask_bytes)
             check_code(to.authenticator, code, topic, topic.below(event.fields), payload)
         except ProtocolError as error:
             to.counts["payloads_dropped"] += 1
@@ -607,6 +609,7 @@ class _Sample:
     def parse(self) -> None:
         payload, kind = self.payload, self.topic.message
         try:
+            check_size(payload, self.topic.put_bytes)
             if self.in_json and may_be_json(payload):
                 payload = packed_json(payload, kind, self.fields)
             self.parses = Heard(self.topic, self.fields, decode(payload, kind))

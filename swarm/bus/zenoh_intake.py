@@ -20,7 +20,7 @@ from swarm.errors import ProtocolError
 from swarm.wire.access import Authenticator, check_code
 from swarm.wire.codec import JSON_ENCODING, decode, decode_many, decode_parameters, may_be_json, packed_json
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import Topic, check_size
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""
@@ -198,6 +198,7 @@ class Intake:
         for sample, payload in zip(samples, payloads, strict=True):
             key = str(sample.key_expr)
             try:
+                self.check(topic, key, sample, payload)
                 if says_json(sample, payload):
                     payload = packed_json(payload, topic.message, self.fields(topic, key))
             except ProtocolError as error:
@@ -213,10 +214,18 @@ class Intake:
             return decode_parameters(parameters, wanted)
         return decode(packed_json(asked, wanted) if says_json(query, asked) else asked, wanted)
 
-    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
-        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
+    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes | None = None) -> None:
+        """Raises ProtocolError where a sample, query or reply is too long, or on a trusted topic has no right code.
+
+        asked  the payload of the question, where this is an answer
+        """
+        if asked is not None:
+            most_bytes = topic.answer_bytes
+        else:
+            most_bytes = topic.ask_bytes if isinstance(carrier, zenoh.Query) else topic.put_bytes
+        check_size(payload, most_bytes)
         if topic.trusted:
-            check_code(self._authenticator, attached(carrier), topic, key, payload, asked)
+            check_code(self._authenticator, attached(carrier), topic, key, payload, asked or b"")
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""
