@@ -176,6 +176,7 @@ class Node:
         if self.bus is not bus or self._shell is None:
             return
         if self.ticking and self._waiting is None:
+            bus.gather()
             self._shell.tick(self.now_ns())
             for look in self._simulation.after_tick:
                 look(self)
@@ -208,7 +209,8 @@ class Node:
     def _take(self, event: Event) -> None:
         if self._waiting is not None:
             self._waiting.append(event)
-        elif self._shell is not None:
+        elif self._shell is not None and self.bus is not None:
+            self.bus.gather()
             self._shell.handle(event, self.now_ns())
 
     def stop(self) -> None:

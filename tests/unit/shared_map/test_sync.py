@@ -49,6 +49,7 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
     swarm.run(0.15)
     assert not all_equal([author, reader])
     (rows,) = author.replica.own_digest().values()
+    swarm.buses["p"].gather()
     assert reader.sync.holds("a1.1", rows, swarm.now_ns)  # what an order needs is not fetched: it waits here
     assert all_equal([author, reader])
 
