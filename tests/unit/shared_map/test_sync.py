@@ -173,12 +173,14 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
         digest = Digest(author="k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
         keeper_says.publish(DIGEST, digest, author="k.1")
         swarm.run(0.01)
+        swarm.buses["p"].gather()
         listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[2]}
     uncounted = Digest(author="k.1", role="keeper", held={"a1.1": kept[3]})
     keeper_says.publish(DIGEST, uncounted, author="k.1")
     swarm.run(0.01)
+    swarm.buses["p"].gather()
     listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[3]}
