@@ -80,7 +80,7 @@ class Twin:
 
 
 class Stop(NamedTuple):
-    """Where a process is stopped within a call of its service, for how long (ns).
+    """A stop of a process within a call of its service, for `lasts_ns`.
 
     A call of a service is four steps: its inbox is read, the clock is read, it works, and its messages go out one
     by one. Work reads nothing else, so a stop within it is one before a message.
@@ -159,7 +159,7 @@ class FaultyLinks:
         return Stop(lasts_ns, sends, chance.random() < 0.5)
 
     def hold(self, node: str, sends: int, until_ns: int) -> None:
-        """Lets a node send this many messages now, and no others until a time."""
+        """Holds messages of a node until a time, all but the next `sends`."""
         self._held[node] = sends, until_ns
 
     def _is_quiet(self, now_ns: int) -> bool:
@@ -167,7 +167,7 @@ class FaultyLinks:
         return quiet_s is not None and (now_ns - self._began_ns) / NS_PER_S >= quiet_s
 
     def _held_ns(self, source: str, now_ns: int) -> int:
-        """How long a message of a node waits for the end of its stop."""
+        """Returns the time for which a message of a node waits for the end of its stop."""
         sends, until_ns = self._held.get(source, (0, 0))
         if sends and until_ns > now_ns:
             self._held[source] = sends - 1, until_ns

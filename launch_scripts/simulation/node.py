@@ -239,7 +239,8 @@ class Node:
             self._call(self.bus, partial(self._shell.handle, event))
 
     def stop(self) -> None:
-        if self._shell is not None:
+        if self._shell is not None and self.bus is not None:
+            self.bus.gather()
             self._shell.counters.gauge(ENDED, 1.0)
             self._shell.stop(self.now_ns())
 

@@ -288,6 +288,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
 
     # The end: what the recording shows last is what the report says.
     simulation.finish()
+    watched.bus.gather()
     watched.monitor.stop(watched.now_ns)
     report, end = simulation.report(_SHOWN_S), simulation.recorder.summary(watched.now_ns)
     assert shown_in(watched.logged.summary) == shown_in(table_of(end))
