@@ -56,6 +56,8 @@ def private_copy(array: NDArray[Any]) -> NDArray[Any]:
     """A copy that may be written to. Of an array from `open_array`, or its first elements, only the pages (4 KiB
     each) that are written to are copied, at the first write; the file stays as it is."""
     mapped = array.base
+    while type(mapped) is np.ndarray:
+        mapped = mapped.base
     if (
         not isinstance(mapped, _Mapped)
         or mapped.dtype != array.dtype
