@@ -70,13 +70,13 @@ class PreparedCosts:
             found = _read(path, np.float32, self._size)
             if found is None:
                 cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
-                save_array(path, cost_grid.time_cost)
-                found = open_array(path)
+                _save(path, cost_grid.time_cost)
+                found = open_array(path)[: self._size]
         self.cell_cost: Floats = found
 
     def load(self) -> Bytes | None:
         found = _read(self._strides, np.uint8, None)
-        return None if found is None else private_copy(found)[:-_DIGEST_BYTES]
+        return None if found is None else private_copy(found)
 
     def claim(self) -> bool:
         """Released by the system if this process ends."""
@@ -92,7 +92,7 @@ class PreparedCosts:
 
     def leave(self, packed: Bytes) -> None:
         try:
-            save_array(self._strides, np.concatenate((packed, _digest_of(packed))))
+            _save(self._strides, packed)
             if (kept := self._kept()) is not None:
                 keep_beside(kept, self._strides)
         except (OSError, StoreError) as error:
@@ -121,18 +121,28 @@ def _digest(text: str) -> str:
     return hashlib.blake2b(f"{code} {text}".encode(), digest_size=8).hexdigest()
 
 
-def _digest_of(packed: Bytes) -> Bytes:
-    return np.frombuffer(hashlib.blake2b(packed.data, digest_size=_DIGEST_BYTES).digest(), np.uint8)
+def _digest_of(array: NDArray[Any]) -> NDArray[Any]:
+    """The digest of an array, as elements of its type."""
+    return np.frombuffer(hashlib.blake2b(array.data, digest_size=_DIGEST_BYTES).digest(), array.dtype)
+
+
+def _save(path: Path, array: NDArray[Any]) -> None:
+    """Writes an array with its digest, where `_read` reads it."""
+    save_array(path, np.concatenate((array, _digest_of(array))))
 
 
 def _read(path: Path, dtype: type[np.generic], size: int | None) -> NDArray[Any] | None:
-    """None where the file is not there; a damaged one is as none, and is said. The size is not given: the file ends
-    with its digest, as kernels check no index that they read from it."""
+    """None where the file is not there; a damaged one is as none, and is said: kernels check no index that they
+    read from it."""
     try:
-        found = open_array(path)
-        if found.shape != (size or found.size,) or found.dtype != dtype:
-            raise ValueError(f"it is {found.shape} {found.dtype}")
-        if size is None and (found[-_DIGEST_BYTES:] != _digest_of(found[:-_DIGEST_BYTES])).any():
+        whole = open_array(path)
+        if whole.ndim != 1 or whole.dtype != dtype:
+            raise ValueError(f"it is {whole.shape} {whole.dtype}")
+        digest_size = _DIGEST_BYTES // whole.itemsize
+        found, digest = whole[:-digest_size], whole[-digest_size:]
+        if size not in (None, found.size):
+            raise ValueError(f"it has {found.size} values")
+        if digest.tobytes() != _digest_of(found).tobytes():
             raise ValueError("its digest is another")
     except FileNotFoundError:
         return None

@@ -53,12 +53,20 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def private_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy that may be written to. Only the pages (4 KiB each) of an array from `open_array` that are written to
-    are copied, at the first write; the file stays as it is."""
+    """A copy that may be written to. Of an array from `open_array`, or its first elements, only the pages (4 KiB
+    each) that are written to are copied, at the first write; the file stays as it is."""
     mapped = array.base
-    if not isinstance(mapped, _Mapped) or mapped.shape != array.shape or mapped.dtype != array.dtype:
+    while type(mapped) is np.ndarray:
+        mapped = mapped.base
+    if (
+        not isinstance(mapped, _Mapped)
+        or mapped.dtype != array.dtype
+        or mapped.ndim != array.ndim
+        or mapped.ctypes.data != array.ctypes.data
+        or not array.flags.c_contiguous
+    ):
         return np.array(array)
-    return np.asarray(_map(mapped.file, mapped.dtype, mapped.shape, mapped.offset, "c"))
+    return np.asarray(_map(mapped.file, mapped.dtype, array.shape, mapped.offset, "c"))
 
 
 @functools.cache

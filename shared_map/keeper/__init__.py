@@ -2,7 +2,8 @@
 those that are gone. One runs in a swarm, or several, which hold the same.
 
 - A mark is acknowledged once it is on a keeper's disk: the keeper's digest names what it has committed, and nothing
-  else (`mark_store`). A store survives kill -9 at any instant.
+  else (`mark_store`). A store survives kill -9 at any instant, and a row that the disk has changed is noticed
+  (`sealed_database`).
 - Mark sets of dead authors shrink to the marks that can still win (`compaction`), and are restored if such an
   author turns out to live.
 - Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in a

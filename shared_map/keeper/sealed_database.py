@@ -65,15 +65,12 @@ class Table(NamedTuple):
         newer  columns by which a row that is not older replaces the one of its key; if empty, any does
         """
         columns = [*self.columns, "digest"]
-        marks = ", ".join("?" * len(columns))
-        if not newer:
-            return f"REPLACE INTO {self.name} ({', '.join(columns)}) VALUES ({marks})"
+        marks, key = ", ".join("?" * len(columns)), ", ".join(columns[: self.key])
         changes = ", ".join(f"{name} = excluded.{name}" for name in columns[self.key :])
         after, before = (", ".join(f"{where}.{name}" for name in newer) for where in ("excluded", self.name))
-        return (
-            f"INSERT INTO {self.name} ({', '.join(columns)}) VALUES ({marks}) "
-            f"ON CONFLICT ({', '.join(columns[: self.key])}) DO UPDATE SET {changes} WHERE ({after}) >= ({before})"
-        )
+        condition = f"WHERE ({after}) >= ({before})" if newer else ""
+        insert = f"INSERT INTO {self.name} ({', '.join(columns)}) VALUES ({marks})"
+        return f"{insert} ON CONFLICT ({key}) DO UPDATE SET {changes} {condition}"
 
     def sealed(self, row: Sequence[object]) -> tuple[object, ...]:
         return (*row, self.digest(row))
@@ -241,7 +238,7 @@ class SealedDatabase:
         return self._tables[number].digest(row)
 
     def _watch(self, db: sqlite3.Connection) -> None:
-        db.execute("PRAGMA recursive_triggers = ON")  # REPLACE deletes
+        db.execute("PRAGMA recursive_triggers = ON")  # otherwise REPLACE deletes without one
         db.create_function("moved", 2, self._moved)
         for table in self._tables:
             for trigger in table.triggers():

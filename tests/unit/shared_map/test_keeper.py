@@ -152,19 +152,6 @@ def test_a_file_that_is_no_store_is_refused_with_the_reason_and_set_aside_when_a
     assert (tmp_path / "map.sqlite.damaged-1").read_bytes().startswith(b"these are not")
 
 
-def test_a_store_with_torn_pages_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "map.sqlite"
-    with KeeperStore(path) as store:
-        for seq in range(40):
-            store.save([set_of(f"a{seq}.{tile}", tile, seq, {1: (LETHAL, 0, 1)}) for tile in range(20)])
-    whole = bytearray(path.read_bytes())
-    assert len(whole) > 5 * 4096
-    whole[2 * 4096 : 4 * 4096] = b"\xff" * (2 * 4096)
-    path.write_bytes(whole)
-    with pytest.raises(DamagedError, match="is damaged"):
-        KeeperStore(path)
-
-
 @pytest.mark.parametrize(
     ("change", "why"),
     [
