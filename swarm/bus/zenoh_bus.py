@@ -32,6 +32,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
     Undecoded,
+    asker_in,
     check_subscription,
 )
 from swarm.bus.endpoints import listening, wait_for_router, why_not_listening, why_unreachable
@@ -53,7 +54,7 @@ from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.meant import check_meant, meant_for
 from swarm.wire.messages import Message
-from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of
 
 
 class ZenohAnswerer:
@@ -95,6 +96,11 @@ class ZenohAnswerer:
         # A tool may ask with `**`, which no key template parses: all that we serve is meant.
         asked = topic.parse(self._bus.namespace, key) or {**dict.fromkeys(topic.fields, "*"), **self._concrete}
         return Asked(topic, asked, request, self)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        return len(self._asked)
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
@@ -305,7 +311,8 @@ class ZenohBus:
             if not self.intake.concerns(query):
                 answerer.end()
             elif undecoded:
-                post(Undecoded(topic, answerer, answerer.decoded))
+                asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+                post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
             elif (asked := answerer.decoded()) is not None:
                 post(asked)
 
@@ -348,6 +355,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
+                check_size(payload, topic.answer_bytes)
                 check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
