@@ -40,7 +40,7 @@ from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, OBEYED, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, NOTE, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
