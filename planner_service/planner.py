@@ -140,10 +140,14 @@ class Planner:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
-        """Takes over, or leave it to another. A planner that takes over does not know which routes followers have:
-        it pushes one to each."""
+        """Takes over, or leave it to another."""
         self.leads = leads
-        if leads:
+        self.push_all()
+
+    def push_all(self) -> None:
+        """Pushes a route to each follower. A planner that takes over, or whose link was lost, does not know which
+        routes they have."""
+        if self.leads:
             self.followers.forget_routes()
 
     def set_pace(self, cpu_budget: float, push_s: float) -> None:

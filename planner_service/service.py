@@ -27,7 +27,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from shared_map.vehicle_class_maps import ClassMaps
 from shared_map.vehicle_presence import Presence
-from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Bus, Event, Heard, LinkChanged, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.config.vehicle_classes import GROUND, class_numbers
@@ -210,6 +210,9 @@ class PlannerService:
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, LinkChanged) and event.up:
+            for _, planner in self._planners:
+                planner.push_all()
         match event:
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))

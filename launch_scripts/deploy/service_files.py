@@ -24,7 +24,7 @@ import msgspec
 from launch_scripts.deploy.host_scenario import GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.machine_plan import ROUTER, Plan, PlannedHost, PlannedProcess, router_name
 from launch_scripts.process_table import TABLE
-from swarm.bus.access_control import access_control
+from swarm.bus.access_control import access_control, low_pass_filter
 from swarm.bus.zenoh_config import tls_settings
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.config.write import scenario_text
@@ -183,6 +183,7 @@ def zenohd_config(network: NetworkConfig, *, plugins: str | None = None, volume:
         storage={"key_expr": MARKS.expression(network.namespace), "volume": volume},
         tls=tls_settings(network.tls) if network.tls is not None else None,
         access_control=access_control(network.namespace, network.admit, network.revoked) if secured else None,
+        low_pass_filter=low_pass_filter(network.namespace),
     )
     config: dict[str, Any] = json.loads(text)
     return config

@@ -1,4 +1,4 @@
-"""Zenoh's access control for a router, from the table of topics.
+"""Zenoh's access control for a router, and its limits of payloads, from the table of topics.
 
 Zenoh allows a message if a rule's key expression includes the whole key expression of the message. It identifies a
 peer by the whole common name of its certificate. Each name therefore has its own rules.
@@ -13,7 +13,7 @@ from typing import Any
 from swarm.config.setting_types import RESERVED_GROUPS
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.wire.access import MEMBERS, ROLES, Grant
+from swarm.wire.access import CODE_BYTES, MEMBERS, ROLES, Grant
 from swarm.wire.fields import check_id
 from swarm.wire.messages.map_data import KEEPERS
 from swarm.wire.topics import ALIVE_KEY, TOPICS, asker_of
@@ -118,6 +118,28 @@ def access_control(namespace: str, names: Iterable[str], revoked: Collection[str
         "subjects": subjects,
         "policies": policies,
     }
+
+
+def low_pass_filter(namespace: str) -> list[dict[str, Any]]:
+    """Returns the value of a router's `low_pass_filter`: it drops a payload which no receiver would read, as it is
+    longer than the table of topics allows. With certificates a key has one author, so a limit by key is one by
+    author."""
+    return [
+        {
+            "id": f"{topic.name} {message}",
+            "flows": ["ingress"],
+            "messages": [message],
+            "key_exprs": [topic.expression(namespace)],
+            "size_limit": most_bytes + CODE_BYTES,
+        }
+        for topic in TOPICS
+        for message, used, most_bytes in (
+            ("put", topic.published, topic.put_bytes),
+            ("query", topic.request is not None, topic.ask_bytes),
+            ("reply", topic.request is not None, topic.answer_bytes),
+        )
+        if used
+    ]
 
 
 def _rules(namespace: str, who: Bearer) -> list[dict[str, Any]]:

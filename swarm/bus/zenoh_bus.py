@@ -56,7 +56,7 @@ from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.meant import check_meant, meant_for
 from swarm.wire.messages import Message
-from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of
 
 
 class ZenohAnswerer:
@@ -384,6 +384,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
+                check_size(payload, topic.answer_bytes)
                 check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)

@@ -7,7 +7,7 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.access_control import access_control
+from swarm.bus.access_control import access_control, low_pass_filter
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
 
@@ -36,6 +36,7 @@ def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
         settings["listen/exit_on_failure"] = True
         settings["connect/endpoints"] = list(network.peers)
         settings["connect/exit_on_failure"] = False
+        settings["low_pass_filter"] = low_pass_filter(network.namespace)
         if network.tls is not None:
             settings["access_control"] = access_control(network.namespace, network.admit, network.revoked)
     else:

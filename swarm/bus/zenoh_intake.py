@@ -241,8 +241,8 @@ class Intake:
         return decode(packed, wanted)
 
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
-        """A payload as MessagePack, which is meant for its key and has the code that its topic needs. Raises
-        ProtocolError."""
+        """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
+        needs. Raises ProtocolError."""
         check_size(payload, topic.put_bytes)
         in_json = says_json(sample, payload)
         packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload

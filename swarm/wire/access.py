@@ -81,7 +81,7 @@ def _grants(text: str) -> tuple[Grant, ...]:
     return tuple(grants)
 
 
-_CODE_BYTES = 16
+CODE_BYTES = 16
 """128 bits, which cannot be guessed; half of them would do for a run of hours."""
 
 
@@ -101,7 +101,7 @@ class Authenticator:
         asked  the payload of the question, where this is an answer to one
         """
         lengths = f"{len(key)},{len(asked)},".encode()
-        return blake2b(lengths + key.encode() + asked + payload, key=self._key, digest_size=_CODE_BYTES).digest()
+        return blake2b(lengths + key.encode() + asked + payload, key=self._key, digest_size=CODE_BYTES).digest()
 
 
 def code_of(

@@ -116,9 +116,7 @@ def test_a_question_that_comes_to_another_queryable_is_refused_and_not_acted_on(
     a, b, routes, costs = world.bus("a"), world.bus("b"), Box(), Box()
     b.serve(ROUTE, routes, target="t0")
     b.serve(COST, costs, target="t0")
-    fields = {"target": "t0"}
-    (route, cost) = (topic.below(topic.every(fields)) for topic in (ROUTE, COST))
-    confused(world, b, route, cost)
+    confused(world, b, "target/t0/route/", "target/t0/cost/")
     for topic, request in ((ROUTE, RouteRequest(row=1, col=1)), (COST, CostRequest(row=1, col=1))):
         (ended,) = asked(world, a, topic, request, target="t0")
         assert isinstance(ended, AskEnded)

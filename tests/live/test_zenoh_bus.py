@@ -34,14 +34,14 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
-from swarm.wire.access import Authenticator
+from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, OBEYED, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, NOTE, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
@@ -349,6 +349,23 @@ def test_readers_of_what_comes_seldom_sleep_until_it_comes(world):
     a.ask(RUN, Nothing(), Box(), tag="q")
     world.settle()
     assert len(asked_of) == len(tokens) == 1
+
+
+def test_a_router_passes_no_payload_which_is_longer_than_its_topic_allows(world):
+    a, b, heard, asked_of = world.bus("a").session, world.bus("b").session, [], []
+    listening = b.declare_subscriber("*/note/**", heard.append)
+    serving = b.declare_queryable("*/run/**", lambda query: asked_of.append(query.payload.to_bytes()))
+    world.settle()
+    put, ask = NOTE.put_bytes + CODE_BYTES, RUN.ask_bytes + CODE_BYTES
+    for more in (1, 0):
+        a.put("swarm/note/agent/a0", bytes(put + more))
+        a.put("other/note/agent/a0", bytes(put + more))  # of another run
+        list(a.get("swarm/run/agent/b", payload=bytes(ask + more), timeout=0.3))
+    world.until(lambda: len(heard) == 3 and asked_of)
+    assert [len(each.payload) for each in heard] == [put + 1, put, put]
+    assert [len(each) for each in asked_of] == [ask]
+    listening.undeclare()
+    serving.undeclare()
 
 
 class Deaf:

@@ -13,7 +13,7 @@ from launch_scripts.deploy.service_files import zenohd_config
 from launch_scripts.process_table import certificate_name, certificate_names
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL
-from swarm.bus.access_control import access_control, bearer, common_name
+from swarm.bus.access_control import access_control, bearer, common_name, low_pass_filter
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, StandbyConfig, TargetConfig, TlsConfig
 from swarm.errors import ConfigError
@@ -126,4 +126,6 @@ def test_with_certificates_zenohd_and_our_router_have_the_same_rules_and_without
     control = zenohd_config(secured)["access_control"]
     assert control == access_control("swarm", names)
     assert control["default_permission"] == "deny"
-    assert "access_control" not in zenohd_config(msgspec.structs.replace(secured, tls=None))
+    plain = zenohd_config(msgspec.structs.replace(secured, tls=None))
+    assert "access_control" not in plain
+    assert plain["low_pass_filter"] == low_pass_filter(secured.namespace)

@@ -136,6 +136,23 @@ def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None
     assert sum(stats.histograms["mark_to_tree_ms"].values()) == 1
 
 
+def test_after_a_reconnect_every_follower_is_pushed_its_route_as_one_before_may_have_been_lost() -> None:
+    swarm = Swarm()
+    swarm.cells["t"] = GRID.cell(20, 5)
+    swarm.run(0.5)
+    start = GRID.cell(20, 40)
+    route = swarm.ear.routes(start, vehicles=["a"]).routes[0]
+    for up in (False, True):
+        swarm.report(("a", start))
+        swarm.run(1.0)
+        assert not swarm.ear.of(PushedRoute)
+        swarm.network.link_changed("planner-t-1", up)
+    swarm.report(("a", start))
+    swarm.run(1.0)
+    (pushed,) = swarm.ear.of(PushedRoute)
+    assert (pushed.vehicle, pushed.route.directions) == ("a", route.directions)
+
+
 def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_marks() -> None:
     swarm = Swarm()
     swarm.keeper("keeper", KeeperStore(":memory:"))
