@@ -192,9 +192,19 @@ class HeldSets:
 
         author  only this author's, as the key of the query says
         """
-        wanted = set(request.authors)
-        tiles: Sequence[int] = sorted(set(request.tiles)) if request.tiles else self.tiles
-        if author is not None:
-            found = (self.get(tile, author) for tile in tiles if not wanted or author in wanted)
-            return [each for each in found if each is not None]
-        return [each for tile in tiles for each in self.of_tile(tile) if not wanted or each.author in wanted]
+        wanted = frozenset(request.authors)
+        return [each for tile in self.asked_tiles(request) for each in self.asked_of(tile, wanted, author)]
+
+    def asked_tiles(self, request: MarksRequest) -> Sequence[int]:
+        """The tiles asked for, in order: all with sets if none is named."""
+        return sorted(set(request.tiles)) if request.tiles else self.tiles
+
+    def asked_of(self, tile: int, wanted: frozenset[str], author: str | None = None) -> list[MarkSet]:
+        """The sets of a tile that are asked for, in order of author.
+
+        wanted  authors that are named; empty for all
+        """
+        if author is None:
+            return [each for each in self.of_tile(tile) if not wanted or each.author in wanted]
+        held = self.get(tile, author)
+        return [] if held is None or (wanted and author not in wanted) else [held]

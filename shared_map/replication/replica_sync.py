@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 from msgspec.structs import replace
 
@@ -56,6 +57,12 @@ _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _TILES_AT_ONCE = MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
+_ANSWERS_PER_TICK, _SETS_AT_ONCE = 8192, 1024
+"""Sets sent in answers in one tick, some 10 ms, and to one asker before another has its turn."""
+_LEAST_COST, _SINGLE_COST = 32, 16
+"""Cost of a question, and of a set that is sent by itself, in sets."""
+_MOST_ANSWERS = 1024
+"""Questions for sets that wait: of all agents that start at once."""
 _PART_BYTES = MOST_DIGEST_BYTES - 512
 """Rows and names of authors in one digest, without its other fields."""
 _QUANTUM = 16_384
@@ -67,6 +74,22 @@ _MAX_NAMES = 4096
 _WARN_AGAIN_NS = 60 * NS_PER_S
 """An author is named once a minute (docs/design/map-merge-law.md): one that floods must not fill the log as
 well."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A question for sets that is being answered.
+
+    wanted  authors that it names; empty for all
+    author  the one whose sets it may get; None for all
+    tiles   those to come
+    """
+
+    asked: Asked
+    bulk: bool
+    wanted: frozenset[str]
+    author: str | None
+    tiles: Iterator[int]
 
 
 class MapSync:
@@ -125,6 +148,8 @@ class MapSync:
         self._changes_due_ns = 0
         self._digest_seq = 0
         # Parts of the whole digest that are not published yet, as `parts_of` gives them.
+        self._answers: deque[_Answer] = deque()
+        self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
@@ -208,6 +233,8 @@ class MapSync:
             assert isinstance(digest.message, Digest)
             self._on_digest(digest.message.author, now_ns)
             self._receive_digest(digest.message, now_ns)
+        self._answers_left = _ANSWERS_PER_TICK
+        self._answer_some()
         self._take_in(now_ns)
         self._merge_waiting(now_ns)
         self._choose_digests(now_ns)
@@ -329,15 +356,37 @@ class MapSync:
         author = None if "*" in named else named
         if not self._serves_all:
             author = self.replica.author
-        sets = self.replica.held.answer(request, author)
-        if request.bulk:
-            for many in packed(sets):
-                asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
-        else:
-            for each in sets:
+        if len(self._answers) >= _MOST_ANSWERS:
+            asked.refuse(f"{MARKS.name}: too many questions wait")
+            asked.end()
+            return
+        tiles = iter(self.replica.held.asked_tiles(request))
+        self._answers.append(_Answer(asked, request.bulk, frozenset(request.authors), author, tiles))
+        self._answer_some()
+
+    def _answer_some(self) -> None:
+        """Answers those who ask for sets, by turns, until the work of this tick is done."""
+        while self._answers and self._answers_left > 0:
+            answer = self._answers.popleft()
+            sets: list[MarkSet] = []
+            looked_at = 0
+            more = False
+            for tile in () if answer.asked.expired else answer.tiles:
+                sets += self.replica.held.asked_of(tile, answer.wanted, answer.author)
+                looked_at += 1
+                more = len(sets) + looked_at // 8 >= _SETS_AT_ONCE
+                if more:
+                    break
+            self._answers_left -= _LEAST_COST + looked_at // 8 + len(sets) * (1 if answer.bulk else _SINGLE_COST)
+            for many in packed(sets) if answer.bulk else ():
+                answer.asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
+            for each in () if answer.bulk else sets:
                 region = region_of(self.replica.grid, each.tile)
-                asked.answer(each, region=region, tile=each.tile, author=each.author)
-        asked.end()
+                answer.asked.answer(each, region=region, tile=each.tile, author=each.author)
+            if more:
+                self._answers.append(answer)
+            else:
+                answer.asked.end()
 
     # --- late join ------------------------------------------------------------------------------------------
 
