@@ -85,8 +85,6 @@ class ZenohAnswerer:
         try:
             if self._fault is not None:
                 raise self._fault
-            if query.payload is None and topic.trusted and intake.authenticator is not None:
-                raise ProtocolError("its fields are no payload, which alone a code can cover")
             intake.check(topic, key, query, self._asked)
             request = intake.request(topic.request, query, self._asked, self._parameters)
         except ProtocolError as error:

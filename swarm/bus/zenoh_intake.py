@@ -199,6 +199,7 @@ class Intake:
         for sample, payload in zip(samples, payloads, strict=True):
             key = str(sample.key_expr)
             try:
+                self.check(topic, key, sample, payload)
                 if says_json(sample, payload):
                     payload = packed_json(payload, topic.message, self.fields(topic, key))
             except ProtocolError as error:
@@ -215,8 +216,11 @@ class Intake:
         return decode(packed_json(asked, wanted) if says_json(query, asked) else asked, wanted)
 
     def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
-        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
-        if topic.trusted:
+        """Raises ProtocolError where a trusted key's sample, query or reply has no right code, or no payload, which
+        alone a code covers."""
+        if topic.needs_code(key) and self.authenticator is not None:
+            if not payload:
+                raise ProtocolError("its fields are not in a payload, which alone a code can cover")
             check_code(self.authenticator, attached(carrier), topic, key, payload, asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:

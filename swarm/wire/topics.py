@@ -11,7 +11,7 @@ from enum import Enum
 
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
+from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages import Message, Nothing, map_data, orders, planning, processes, traffic, vehicles
 
@@ -37,6 +37,7 @@ class Topic:
     bulk       for a queryable: a message that carries many values, if the request asks for it
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
+    trusted_in  part of those keys on which the same holds, where it does not hold on all
     newest     each value carries the whole state of its key, so a reader may skip to the newest
     echoed     whether a process that puts and subscribes hears what it has put itself
     buffer     samples that wait for a slow reader; the oldest are dropped first
@@ -53,6 +54,7 @@ class Topic:
     bulk: type[Message] | None = None
     published: bool = True
     trusted: bool = False
+    trusted_in: str | None = None
     newest: bool = True
     echoed: bool = True
     priority: Priority = Priority.DATA
@@ -73,6 +75,10 @@ class Topic:
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
         repeated = tuple(name for name in self.fields if name in self.message.__struct_fields__)
         object.__setattr__(self, "_repeated", repeated)
+
+    def needs_code(self, key: str) -> bool:
+        """Returns True if a message under a key counts only with a code."""
+        return self.trusted or (self.trusted_in is not None and self.trusted_in in key)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """Returns each field of the topic as one part of a Zenoh key; fields that are not given become `*`.
@@ -168,7 +174,7 @@ MARKS = Topic(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
         hear=f"{_REPLICAS} rover:author",
     ),
-    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192,
+    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192, trusted_in=f"/{OPERATOR}.",
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", map_data.Digest, "which sets a replica holds", "1 Hz, and on change",
