@@ -65,6 +65,8 @@ def _how(topic: Topic) -> str:
         ways.append(f"get with {_link(topic.request)}{several}")
     if topic.trusted:
         ways.append("with a code")
+    if topic.trusted_in is not None:
+        ways.append(f"with a code where the key has `{topic.trusted_in}`")
     return "; ".join(ways)
 
 

@@ -114,16 +114,27 @@ def neighbourhood(host: str) -> str:
     return str(address)
 
 
-class _End(asyncio.Protocol):
-    """One end of a connection that is passed on: what it receives goes to the other end."""
+class _End(asyncio.BufferedProtocol):
+    """One end of a connection that is passed on: what it receives goes to the other end.
+
+    All share one buffer, as one thread reads it: asyncio's own protocol takes 256 KiB of memory for each message.
+    """
 
     transport: asyncio.Transport
     other: _End | None = None
+    _buffer = memoryview(bytearray(1 << 16))
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.received(bytes(self._buffer[:nbytes]))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
 
-    def data_received(self, data: bytes) -> None:
+    def received(self, data: bytes) -> None:
+        """Passes data on."""
         if self.other is not None:
             self.other.transport.write(data)
 
@@ -158,7 +169,7 @@ class _Visitor(_End):
         self._door.accepted(self)
         asyncio.get_running_loop().call_later(HELLO_WITHIN_S, self._cut_if_slow)
 
-    def data_received(self, data: bytes) -> None:
+    def received(self, data: bytes) -> None:
         self._spoke = True
         if self.other is not None:
             self.other.transport.write(data)
@@ -237,7 +248,7 @@ class _Inner(_End):
     def __init__(self, visitor: _Visitor) -> None:
         self._visitor = visitor
 
-    def data_received(self, data: bytes) -> None:
+    def received(self, data: bytes) -> None:
         self._visitor.transport.write(data)
         self._visitor.replied()
 

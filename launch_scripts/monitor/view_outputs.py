@@ -37,7 +37,7 @@ from swarm.files import check_writable, writing
 
 log = logging.getLogger(__name__)
 
-_MEMORY = "64MiB"
+_MEMORY = "32MiB"
 """Limit of the stream's store for later viewers; the oldest goes first. The process grows by twice as much."""
 _PACK_S = 1.0
 """Interval at which rerun packs logged data of an entity into one chunk, unless the service flushes it for viewers.

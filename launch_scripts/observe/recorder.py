@@ -108,7 +108,9 @@ class RunFigures:
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 8_000_000
-"""Estimated size of all routes that are kept: beside its steps a route takes 64 bytes."""
+"""Size of all routes that are kept."""
+_OF_ROUTE_BYTES = 400
+"""Bytes of the objects that a route consists of, beside its steps; a test counts them."""
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
 
@@ -134,7 +136,7 @@ class Recorder(RunFigures):
         """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Positions and times of captures; `Observed` counts them."""
-        self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + 64)
+        self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + _OF_ROUTE_BYTES)
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)

@@ -89,8 +89,6 @@ class ZenohAnswerer:
         try:
             if self._fault is not None:
                 raise self._fault
-            if query.payload is None and topic.trusted and intake.authenticator is not None:
-                raise ProtocolError("its fields are no payload, which alone a code can cover")
             request = intake.request(topic, query, self._asked, self._parameters)
         except ProtocolError as error:
             intake.drop(key, error)

@@ -255,14 +255,16 @@ class Intake:
         return key.removeprefix(self._start)
 
     def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes | None = None) -> None:
-        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code, or a reply is too
-        long.
+        """Raises ProtocolError where a trusted key's sample, query or reply has no right code, or no payload, which
+        alone a code covers; also where a reply is too long.
 
         asked  the payload of the question, where this is an answer
         """
         if asked is not None:
             check_size(payload, topic.answer_bytes)
-        if topic.trusted:
+        if topic.needs_code(key) and self.authenticator is not None:
+            if not payload:
+                raise ProtocolError("its fields are not in a payload, which alone a code can cover")
             check_code(self.authenticator, attached(carrier), topic, key, payload, asked or b"")
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:

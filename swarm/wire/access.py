@@ -107,8 +107,10 @@ class Authenticator:
 def code_of(
     authenticator: Authenticator | None, topic: Topic, key: str, payload: bytes, asked: bytes = b""
 ) -> bytes | None:
-    """Returns the attachment of a payload: its code, on a trusted topic; None if no secret is shared."""
-    return authenticator.code(key, payload, asked) if authenticator is not None and topic.trusted else None
+    """Returns the attachment of a payload: its code, on a trusted key; None if no secret is shared."""
+    if authenticator is None or not topic.needs_code(key):
+        return None
+    return authenticator.code(key, payload, asked)
 
 
 def check_code(

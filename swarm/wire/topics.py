@@ -11,7 +11,7 @@ from enum import Enum
 
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
+from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages import Message, Nothing, map_data, orders, planning, processes, traffic, vehicles
 
@@ -44,6 +44,7 @@ class Topic:
     costly     for a queryable: askers take turns, by the field `asker` of the key; agents come before all others
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
+    trusted_in  part of those keys on which the same holds, where it does not hold on all
     newest     each value carries the whole state of its key, so a reader may skip to the newest
     echoed     whether a process that puts and subscribes hears what it has put itself
     buffer     samples that wait for a slow reader; the oldest are dropped first
@@ -63,6 +64,7 @@ class Topic:
     costly: bool = False
     published: bool = True
     trusted: bool = False
+    trusted_in: str | None = None
     newest: bool = True
     echoed: bool = True
     priority: Priority = Priority.DATA
@@ -86,6 +88,10 @@ class Topic:
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
         repeated = tuple(name for name in self.fields if name in self.message.__struct_fields__)
         object.__setattr__(self, "_repeated", repeated)
+
+    def needs_code(self, key: str) -> bool:
+        """Returns True if a message under a key counts only with a code."""
+        return self.trusted or (self.trusted_in is not None and self.trusted_in in key)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """Returns each field of the topic as one part of a Zenoh key; fields that are not given become `*`.
@@ -188,7 +194,7 @@ MARKS = Topic(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
         hear=f"{_REPLICAS} rover:author",
     ),
-    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192,
+    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192, trusted_in=f"/{OPERATOR}.",
     answer_bytes=2 * _LONG,
 )  # fmt: skip
 DIGEST = Topic(

@@ -5,12 +5,13 @@ A world's `bus` takes an `authenticator`.
 
 from __future__ import annotations
 
-from support.bus_world import Box, answering, asked, pose
+from support.bus_world import Box, answering, asked, marks, pose
 
 from swarm.bus.bus import Asked, AskEnded, Heard, Replied
 from swarm.wire.access import Authenticator
+from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Claim, Stored, Table
-from swarm.wire.topics import POSE, STORED, TABLE
+from swarm.wire.topics import MARKS, POSE, STORED, TABLE
 
 OURS = Authenticator(b"secret", "run")
 OTHERS = (None, Authenticator(b"another secret", "run"), Authenticator(b"secret", "another run"))
@@ -40,6 +41,28 @@ def test_on_a_trusted_topic_only_who_knows_the_secret_of_the_run_is_heard(world)
     assert hears.counts["payloads_dropped"] == 3
     # A process without the secret may read; it does not hear itself on this topic.
     world.until(lambda: len(anybody) == 3)
+
+
+def test_a_zone_is_heard_only_from_who_knows_the_secret_and_other_marks_from_everybody(world):
+    """Zones are marks of an author of their own, which win over all others and stop vehicles."""
+    ours, hears, stranger = world.bus("o", authenticator=OURS), world.bus("h", authenticator=OURS), world.bus("s")
+    box, ticks = Box(), Box()
+    hears.subscribe(MARKS, box, together=True)
+    hears.collect(MARKS)
+    for author in ("operator.z", "all.r1.1"):
+        stranger.serve(MARKS, answering((marks(author, 0), {"region": 0, "tile": 0})), author=author)
+    world.settle()
+    for bus, author in ((stranger, "operator.z"), (stranger, "all.r1.1"), (ours, "operator.y")):
+        bus.publish(MARKS, marks(author, 0), region=0, tile=0, author=author)
+
+    def authors():
+        ticks.extend(hears.collected_together(MARKS))
+        return {message.author for _, message in ticks}
+
+    both = {"all.r1.1", "operator.y"}
+    world.until(lambda: {message.author for each in box for _, message in each.samples} == authors() == both)
+    replies = asked(world, hears, MARKS, MarksRequest()).of(Replied)
+    assert [each.message.author for each in replies] == ["all.r1.1"]
 
 
 def test_other_topics_need_no_secret(world):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import tracemalloc
 
 import msgspec
 import numpy as np
@@ -14,7 +15,7 @@ from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.history import Tracks
+from launch_scripts.observe.history import BegunRoute, Tracks
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
@@ -24,12 +25,13 @@ from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
+from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
-from swarm.wire.messages.vehicles import Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -360,6 +362,20 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
     day = record(12_000, 20_000, 2)
     assert day < 1.5 * hour
     assert len(recorder.captures) == recorder.captures.maxlen
+
+
+def test_routes_take_no_more_memory_than_is_counted_for_them(recorder: Recorder) -> None:
+    said = (
+        Followed(vehicle="a0-0", target="t", start=n, directions=bytes(n), cost_s=n, lower_bound_s=n)
+        for n in range(90)
+    )
+    sent = [encode(each) for each in said]
+    tracemalloc.start()
+    for at_ns, payload in enumerate(sent * 9, 10**18):
+        recorder.routes.add(BegunRoute(at_ns, decode(payload, Followed)))
+    took, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert took < 1.2 * recorder.routes._total
 
 
 def told(kind: str, about: str, since_s: float, over_s: float | None = None) -> Alarm:
