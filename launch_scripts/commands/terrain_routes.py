@@ -162,8 +162,10 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
     scenario, terrain, first, last = between(source, start, end, preset)
     grid, finder = terrain.grid, finder_for(scenario, terrain, last)
     found = finder.route(*grid.row_col(first))
+    _check_open(scenario, terrain, first, "--from", last)
+    _check_open(scenario, terrain, last, "--to", first)
     if found.status is not RouteStatus.OK:
-        raise TerrainError(_why_not(found.status, terrain, first, last))
+        raise TerrainError(f"no route ({found.status}): lethal ground lies between the two places all around")
     cells = found.cells[:, 0] * grid.cols + found.cells[:, 1]
     # The remaining cost gives the cost driven, by any rule of the planner.
     left_s = finder.cost_to_go_s().reshape(-1)[cells].astype(np.float64)
@@ -229,13 +231,22 @@ def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder
     return RouteFinder(terrain.pace_s_per_m, target_cell, resolution_m=resolution_m, climb=climb, **rules)
 
 
-def _why_not(status: RouteStatus, terrain: Terrain, first: int, last: int) -> str:
+def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, other: int) -> None:
+    """Raises TerrainError, which names the nearest place with a way to the other one, if a place is lethal."""
     lethal = terrain.lethal.reshape(-1)
-    for option, cell in (("--from", first), ("--to", last)):
-        if lethal[cell]:
-            kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
-            return f"no route: {option} is on lethal ground, {written(MapFrame(terrain.grid), cell)}, class {kind}"
-    return f"no route ({status}): lethal ground lies between the two places all around"
+    if not lethal[cell]:
+        return
+    grid, frame = terrain.grid, MapFrame(terrain.grid)
+    kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
+    seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
+    (row, col), (rows, cols) = grid.row_col(cell), np.nonzero(np.isfinite(seconds))
+    told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
+    if len(rows):
+        near = int(np.argmin((rows - row) ** 2 + (cols - col) ** 2))
+        told += (
+            f"; the nearest place that can be reached is {written(frame, int(rows[near] * grid.cols + cols[near]))}"
+        )
+    raise TerrainError(told)
 
 
 # --- from everywhere --------------------------------------------------------------------------------------------
@@ -296,7 +307,8 @@ def corridor(source: str, start: str, end: str, slack: float, preset: str | None
     finder = finder_for(scenario, terrain, last)
     best = finder.route(*terrain.grid.row_col(first))
     if best.status is not RouteStatus.OK:
-        raise TerrainError("no corridor: --to is lethal, or lethal ground lies between the two places all around")
+        _check_open(scenario, terrain, last, "--to", first)
+        raise TerrainError("no corridor: lethal ground lies between the two places all around")
     through = finder.cost_to_go_s() + there_s(
         back_s, terrain.pace_s_per_m, terrain.grid.resolution_m, scenario.planner
     )
@@ -342,10 +354,7 @@ def there_s(back_s: Floats, pace: Floats, resolution_m: float, rules: PlannerCon
 
 def _to(scenario: Scenario, terrain: Terrain, cell: int, option: str) -> Floats:
     """float32 (rows, cols), s: from everywhere to a cell."""
-    if terrain.lethal.reshape(-1)[cell]:
-        raise TerrainError(
-            f"{option} is on lethal ground, {written(MapFrame(terrain.grid), cell)}: no way leads there"
-        )
+    _check_open(scenario, terrain, cell, option, cell)
     return finder_for(scenario, terrain, cell).cost_to_go_s()
 
 

@@ -87,6 +87,11 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
         find_route(str(hill), "cell:10,35", "cell:10,75")
+    for start, end, option in (("cell:10,35", "cell:10,75", "--from"), ("cell:10,75", "cell:10,35", "--to")):
+        with pytest.raises(SwarmError, match=f"{option} is on lethal ground") as told:
+            find_route(str(hill), start, end)
+        nearest = str(told.value).split("reached is ")[1].split()[0]
+        assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
         (["--row", "1"], "give --target and --from"),
