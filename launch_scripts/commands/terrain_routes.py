@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, areas_of, write_layers, write_raster
+from launch_scripts.report.exporter import (
+    COSTS,
+    Feature,
+    FieldKind,
+    Layer,
+    areas_of,
+    turns_of,
+    write_layers,
+    write_raster,
+)
+from launch_scripts.report.mission_files import MISSIONS, write_mission
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
@@ -109,7 +119,9 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
     # A line has two points at least, even for a vehicle that is already there.
-    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values)
+    time_ns = None if route.at_s is None or len(xy_m) < 2 else (route.at_s * 1e9).round().astype(np.int64)
+    timed = time_ns if ending == ".gpx" else None  # from 1970 on: when it will be driven is not known
+    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values, timed)
     line = Layer("route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], COSTS)
     if ending not in (".csv", ".gpkg"):
         return [line]
@@ -136,6 +148,12 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
     without a place on Earth or a terrain where the format needs one."""
     ending = path.suffix.lower()
+    if ending in MISSIONS:
+        if route.grid.crs == "local":
+            raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
+        x_m, y_m = middles_of(route.grid, turns_of(route.cells, route.grid))
+        write_mission(path, [(lat, lon) for lat, lon in MapFrame(route.grid).to_degrees(x_m, y_m).T.tolist()])
+        return
     if ending != ".png":
         write_layers(path, layers_of(route, ending), MapFrame(route.grid))
         return
@@ -253,6 +271,8 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
 
 _MOST_BANDS = 200
 """Most areas of a file: more cannot be distinguished on a map."""
+_BAND_S = 600.0
+_SLACK_BANDS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,10 +378,11 @@ def _to(scenario: Scenario, terrain: Terrain, cell: int, option: str) -> Floats:
     return finder_for(scenario, terrain, cell).cost_to_go_s()
 
 
-def write_reach(found: Reach, path: Path, every_s: float) -> None:
+def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -> None:
     """Writes seconds as a GeoTIFF (-1 where there is no way), or areas of equal time in a format of the exporter.
 
-    every_s  how far apart in time the borders of areas are
+    every_s  how far apart in time the borders of areas are; None: ten minutes, and a fifth of a corridor's slack
+    slack    of a corridor
 
     Raises ConfigError on another ending or too many areas, StoreError if the file cannot be written.
     """
@@ -370,6 +391,8 @@ def write_reach(found: Reach, path: Path, every_s: float) -> None:
         told, tags = ["seconds of driving, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
         write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
+    if every_s is None:
+        every_s = _BAND_S if found.fastest_s is None else max(found.fastest_s * slack / _SLACK_BANDS, 1e-3)
     many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
     if many > _MOST_BANDS:
         raise ConfigError(f"--every-s {every_s:g} makes {many:.0f} areas, at most {_MOST_BANDS}: ask for fewer")

@@ -97,7 +97,7 @@ def test_a_target_on_lethal_ground_has_no_routes_until_it_is_back() -> None:
 
 
 def lethal_alarms(swarm: Swarm) -> list[int | None]:
-    """When each alarm about the target's ground was over; None of one that lasts."""
+    """The end of the newest alarm about the target's ground; None while it lasts."""
     alarms = swarm.planners["t"]._member.alarms.current()
     return [each.over_ns for each in alarms if each.kind == "target-lethal"][:1]
 
