@@ -22,7 +22,7 @@ from swarm.grid import GridSpec
 Box = tuple[float, float, float, float]
 Floats64 = NDArray[np.float64]
 MOST_FEATURES, MOST_CORNERS = 500_000, 20_000_000
-"""Limits of what is on the terrain."""
+"""Limits of one layer on the terrain."""
 _MOST_CROSSINGS = 50_000
 _STEP_M = 1000.0
 """Longer edges are cut: a straight edge in one system is bent in another, by some centimetres over this length."""
