@@ -457,8 +457,9 @@ class Planner:
         }
 
     def _reply_fields(self, now_ns: int) -> dict[str, Any]:
+        lethal, nearest = self.tree.lethal_target or (None, None)
         own = {"target_cell": self.tree.target_cell, "vehicle_class": self.vehicle_class}
-        return self._fields(now_ns) | own
+        return self._fields(now_ns) | own | {"lethal_target": lethal, "nearest_cell": nearest}
 
     def _cells(self, request: RouteRequest | CostRequest) -> list[int]:
         """The cells asked for; a person's row and col come last, as -1 where they are outside."""

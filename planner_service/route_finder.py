@@ -17,14 +17,14 @@ from shared_map.terrain.step_climb import Climb
 from swarm.config.explain import choice
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.route_columns import Route, RouteStatus, directions_of
+from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundRoute:
     """A route from a cell to the target, or why there is none.
 
-    status         RouteStatus: "ok", or "unreachable", "outside", "lethal-start", "no-target"
+    status         "ok", or "unreachable", "outside", "lethal_start", "lethal_target"
     cells          int64 (steps + 1, 2), row and col of every cell from the start to the target; the start alone
                    where there is no route
     cost_s         s, what driving it takes; inf where there is no route
@@ -32,7 +32,7 @@ class FoundRoute:
     length_m       m
     """
 
-    status: RouteStatus
+    status: RouteStatus | TargetStatus
     cells: NDArray[np.int64]
     cost_s: float
     lower_bound_s: float
@@ -142,7 +142,9 @@ class RouteFinder:
         cells = np.array([(row, col)], np.int64)
         if found.status is RouteStatus.OK:
             cells = np.stack(np.divmod(np.array(walk(self.grid, cell, found.directions)), self.grid.cols), axis=1)
-        return FoundRoute(found.status, cells, found.cost_s, found.lower_bound_s, found.length_m)
+        lethal = found.status is RouteStatus.NO_TARGET and self._tree.lethal_target is not None
+        status = TargetStatus.LETHAL if lethal else found.status
+        return FoundRoute(status, cells, found.cost_s, found.lower_bound_s, found.length_m)
 
     def _cell(self, row: int, col: int) -> int:
         """The index of a cell. Raises OutsideGridError outside."""

@@ -271,8 +271,20 @@ class PlannerService:
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
+        self._tell_lethal(now_ns)
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
+
+    def _tell_lethal(self, now_ns: int) -> None:
+        lethal = self._planner.tree.lethal_target
+        if lethal is None or not self._candidacy.leads:
+            self._member.alarms.end("target-lethal", self._target, now_ns)
+            return
+        grid = self._cost_map.grid
+        shown = [f"cell:{row},{col}" for row, col in (grid.row_col(each) for each in lethal if each is not None)]
+        nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
+        text = f"no vehicle can reach {self._target} on lethal ground at {shown[0]}; {nearest}"
+        self._member.alarms.begin("target-lethal", self._target, text, now_ns, lethal.cell, self._target)
 
     def _take_collected(self, now_ns: int) -> None:
         for heard in self._bus.collected(POSE):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,18 @@ class Update:
             return replace(self, repair_ns=repaired.repair_ns)
         window, cells = self.window.union(repaired.window), self.cells + repaired.cells
         return Update("window", window, cells, self.wants_full, repaired.repair_ns)
+
+
+_NEAR_CELLS = 256
+"""Rows and columns about a target within which the nearest open cell is looked for: some milliseconds."""
+
+
+class LethalTarget(NamedTuple):
+    """A target's lethal cell, to which no tree leads, and the nearest cell that can be reached; None if none is
+    near."""
+
+    cell: int
+    nearest: int | None
 
 
 class State(Enum):
@@ -125,6 +137,7 @@ class TargetTree:
         stopwatch: Callable[[], int] = lambda: 0,
     ) -> None:
         self.target_cell: int | None = None
+        self.lethal_target: LethalTarget | None = None
         self.map_version = -1
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
         self._grid = grid
@@ -313,9 +326,26 @@ class TargetTree:
         """Returns True if the target is on a cell to which a tree can lead. If not, the tree is stale as soon as
         the map changes."""
         self.target_cell = target_cell if can_be_root(self._costs, target_cell) else None
-        if not self.ready and (changes is None or changes.cells.size):
+        changed = changes is None or bool(changes.cells.size)
+        if self.ready or not 0 <= target_cell < self._grid.cells:
+            self.lethal_target = None
+        elif changed or self.lethal_target is None or self.lethal_target.cell != target_cell:
+            self.lethal_target = LethalTarget(target_cell, self._nearest(target_cell))
+        if not self.ready and changed:
             self._state = State.STALE
         return self.ready
+
+    def _nearest(self, target_cell: int) -> int | None:
+        """The open cell nearest to a lethal one, of those from which the last tree led; None if none is near."""
+        window = self._grid.around(target_cell, _NEAR_CELLS)
+        rows, cols = np.mgrid[window.row0 : window.row1, window.col0 : window.col1].reshape(2, -1)
+        padded = (rows + 1) * self._costs.stride + cols + 1
+        open_ = np.isfinite(self._costs.cell_cost[padded])
+        led = open_ & np.isfinite(self._tree.cost_at(padded)) if self._tree.root >= 0 else open_
+        row, col = self._grid.row_col(target_cell)
+        away = np.where(led if led.any() else open_, (rows - row) ** 2 + (cols - col) ** 2, np.inf)
+        best = int(away.argmin())
+        return self._grid.cell(int(rows[best]), int(cols[best])) if np.isfinite(away[best]) else None
 
     def _follow(self, target_cell: int, changes: Changes | None) -> Update:
         """Brings the tree up to date with the map, then with its target: decide, and do it."""

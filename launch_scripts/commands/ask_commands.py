@@ -67,13 +67,14 @@ def route(
     start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
     end            With --terrain: the destination, in the same forms as --from.
     vehicle_class  Class of the vehicle.
-    out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
+    out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
     """
     from launch_scripts.commands import terrain_routes
     from launch_scripts.report.exporter import FORMATS, check_target
+    from launch_scripts.report.mission_files import MISSIONS
     from swarm.places import read_place
 
-    check_target(out, "--out", *FORMATS, ".png")
+    check_target(out, "--out", *FORMATS, *MISSIONS, ".png")
     if terrain is not None:
         if start is None or end is None or target is not None or row is not None or col is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")

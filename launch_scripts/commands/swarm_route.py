@@ -25,7 +25,7 @@ from swarm.wire.access import OPERATOR
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
-from swarm.wire.route_columns import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
 from swarm.wire.topics import COST, NAMELESS, ROUTE, asker_of
 
 if TYPE_CHECKING:
@@ -167,7 +167,9 @@ def show(answer: Answer) -> None:
 def _show_cost(answer: Answer, reply: CostReply) -> None:
     cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
     start = written(answer.frame, answer.start)
-    if reply.target_cell is None:
+    if reply.lethal_target is not None:
+        typer.echo(_lethal(answer, reply))
+    elif reply.target_cell is None:
         typer.echo("no_target: the planner does not know where its target is")
     elif math.isfinite(cost_s):
         typer.echo(f"from {start} to {_target(answer)} in {cost_s:.1f} s")
@@ -176,8 +178,18 @@ def _show_cost(answer: Answer, reply: CostReply) -> None:
         typer.echo(f"unreachable: {start} has no way to {reply.target}, or is lethal")
 
 
+def _lethal(answer: Answer, reply: RouteReply | CostReply) -> str:
+    places = [cell for cell in (reply.lethal_target, reply.nearest_cell) if cell is not None]
+    shown = [written(answer.frame, cell) if cell < answer.frame.grid.cells else "outside" for cell in places]
+    nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
+    return f"{TargetStatus.LETHAL}: {reply.target} is on lethal ground, {shown[0]}; {nearest}"
+
+
 def _show_route(answer: Answer, reply: RouteReply) -> None:
     (found,) = reply.routes
+    if reply.lethal_target is not None:
+        typer.echo(_lethal(answer, reply))
+        return
     if not _leads(found):
         meaning = {
             RouteStatus.UNREACHABLE: "there is no way from there",

@@ -278,7 +278,7 @@ def reach(
     start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
     slack: Annotated[float, typer.Option(min=0.0, max=100.0)] = 0.05,
     out: Path | None = None,
-    every_s: Annotated[float, typer.Option(min=0.001, max=1e9)] = 600.0,
+    every_s: Annotated[float | None, typer.Option(min=0.001, max=1e9)] = None,
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
@@ -297,7 +297,7 @@ def reach(
     start    Start of a corridor: only cells on near-optimal paths from there.
     slack    With --from: a path may take this share longer than the best.
     out      Write .tif: seconds, -1 without a path; .geojson, .gpkg, .kml or .csv: areas.
-    every_s  Distance between areas, in seconds.
+    every_s  Distance between areas, in seconds: 600; of a corridor a fifth of the time that slack allows.
     """
     from launch_scripts.commands import terrain_routes
 
@@ -307,7 +307,7 @@ def reach(
     else:
         found = terrain_routes.corridor(terrain, start, to, slack, preset)
     if out is not None:
-        terrain_routes.write_reach(found, out, every_s)
+        terrain_routes.write_reach(found, out, every_s, slack)
     median_s, longest_s = found.quantiles_s()
     if as_json:
         facts = {"share": round(found.share, 4), "median_s": round(median_s, 2), "longest_s": round(longest_s, 2)}

@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, areas_of, write_layers, write_raster
+from launch_scripts.report.exporter import (
+    COSTS,
+    Feature,
+    FieldKind,
+    Layer,
+    areas_of,
+    turns_of,
+    write_layers,
+    write_raster,
+)
+from launch_scripts.report.mission_files import MISSIONS, write_mission
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
@@ -109,7 +119,9 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
     # A line has two points at least, even for a vehicle that is already there.
-    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values)
+    time_ns = None if route.at_s is None or len(xy_m) < 2 else (route.at_s * 1e9).round().astype(np.int64)
+    timed = time_ns if ending == ".gpx" else None  # from 1970 on: when it will be driven is not known
+    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values, timed)
     line = Layer("route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], COSTS)
     if ending not in (".csv", ".gpkg"):
         return [line]
@@ -136,6 +148,12 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
     without a place on Earth or a terrain where the format needs one."""
     ending = path.suffix.lower()
+    if ending in MISSIONS:
+        if route.grid.crs == "local":
+            raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
+        x_m, y_m = middles_of(route.grid, turns_of(route.cells, route.grid))
+        write_mission(path, [(lat, lon) for lat, lon in MapFrame(route.grid).to_degrees(x_m, y_m).T.tolist()])
+        return
     if ending != ".png":
         write_layers(path, layers_of(route, ending), MapFrame(route.grid))
         return
@@ -162,8 +180,10 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
     scenario, terrain, first, last = between(source, start, end, preset)
     grid, finder = terrain.grid, finder_for(scenario, terrain, last)
     found = finder.route(*grid.row_col(first))
+    _check_open(scenario, terrain, first, "--from", last)
+    _check_open(scenario, terrain, last, "--to", first)
     if found.status is not RouteStatus.OK:
-        raise TerrainError(_why_not(found.status, terrain, first, last))
+        raise TerrainError(f"no route ({found.status}): lethal ground lies between the two places all around")
     cells = found.cells[:, 0] * grid.cols + found.cells[:, 1]
     # The remaining cost gives the cost driven, by any rule of the planner.
     left_s = finder.cost_to_go_s().reshape(-1)[cells].astype(np.float64)
@@ -229,19 +249,30 @@ def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder
     return RouteFinder(terrain.pace_s_per_m, target_cell, resolution_m=resolution_m, climb=climb, **rules)
 
 
-def _why_not(status: RouteStatus, terrain: Terrain, first: int, last: int) -> str:
+def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, other: int) -> None:
+    """Raises TerrainError, which names the nearest place with a way to the other one, if a place is lethal."""
     lethal = terrain.lethal.reshape(-1)
-    for option, cell in (("--from", first), ("--to", last)):
-        if lethal[cell]:
-            kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
-            return f"no route: {option} is on lethal ground, {written(MapFrame(terrain.grid), cell)}, class {kind}"
-    return f"no route ({status}): lethal ground lies between the two places all around"
+    if not lethal[cell]:
+        return
+    grid, frame = terrain.grid, MapFrame(terrain.grid)
+    kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
+    seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
+    (row, col), (rows, cols) = grid.row_col(cell), np.nonzero(np.isfinite(seconds))
+    told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
+    if len(rows):
+        near = int(np.argmin((rows - row) ** 2 + (cols - col) ** 2))
+        told += (
+            f"; the nearest place that can be reached is {written(frame, int(rows[near] * grid.cols + cols[near]))}"
+        )
+    raise TerrainError(told)
 
 
 # --- from everywhere --------------------------------------------------------------------------------------------
 
 _MOST_BANDS = 200
 """Most areas of a file: more cannot be distinguished on a map."""
+_BAND_S = 600.0
+_SLACK_BANDS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +327,8 @@ def corridor(source: str, start: str, end: str, slack: float, preset: str | None
     finder = finder_for(scenario, terrain, last)
     best = finder.route(*terrain.grid.row_col(first))
     if best.status is not RouteStatus.OK:
-        raise TerrainError("no corridor: --to is lethal, or lethal ground lies between the two places all around")
+        _check_open(scenario, terrain, last, "--to", first)
+        raise TerrainError("no corridor: lethal ground lies between the two places all around")
     through = finder.cost_to_go_s() + there_s(
         back_s, terrain.pace_s_per_m, terrain.grid.resolution_m, scenario.planner
     )
@@ -342,17 +374,15 @@ def there_s(back_s: Floats, pace: Floats, resolution_m: float, rules: PlannerCon
 
 def _to(scenario: Scenario, terrain: Terrain, cell: int, option: str) -> Floats:
     """float32 (rows, cols), s: from everywhere to a cell."""
-    if terrain.lethal.reshape(-1)[cell]:
-        raise TerrainError(
-            f"{option} is on lethal ground, {written(MapFrame(terrain.grid), cell)}: no way leads there"
-        )
+    _check_open(scenario, terrain, cell, option, cell)
     return finder_for(scenario, terrain, cell).cost_to_go_s()
 
 
-def write_reach(found: Reach, path: Path, every_s: float) -> None:
+def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -> None:
     """Writes seconds as a GeoTIFF (-1 where there is no way), or areas of equal time in a format of the exporter.
 
-    every_s  how far apart in time the borders of areas are
+    every_s  how far apart in time the borders of areas are; None: ten minutes, and a fifth of a corridor's slack
+    slack    of a corridor
 
     Raises ConfigError on another ending or too many areas, StoreError if the file cannot be written.
     """
@@ -361,6 +391,8 @@ def write_reach(found: Reach, path: Path, every_s: float) -> None:
         told, tags = ["seconds of driving, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
         write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
+    if every_s is None:
+        every_s = _BAND_S if found.fastest_s is None else max(found.fastest_s * slack / _SLACK_BANDS, 1e-3)
     many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
     if many > _MOST_BANDS:
         raise ConfigError(f"--every-s {every_s:g} makes {many:.0f} areas, at most {_MOST_BANDS}: ask for fewer")

@@ -178,7 +178,7 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
     high = any(part.shape[1] == 3 for feature in layer.features for part in feature.parts)
     crs = "EPSG:4326" if form.driver in ("LIBKML", "GPX") else None
     if form.driver == "GPKG" and frame.grid.crs != "local":
-        crs = frame.system.to_wkt()
+        crs = named_system(frame)
     try:
         with warnings.catch_warnings():
             # RFC 7946 has no system to name, nor has a site; GPX ends at 180 degrees, and begins at -180.
@@ -195,6 +195,8 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
                 crs=crs,
                 append=append,
                 layer_options=options,
+                # QGIS and ArcGIS of before 2020 open no newer one.
+                dataset_options={"VERSION": "1.2"} if form.driver == "GPKG" and not append else {},
                 gdal_tz_offsets={  # 100 is UTC
                     name: np.full(len(layer.features), 100) for name, kind in fields.items() if kind == "time"
                 },
@@ -352,6 +354,11 @@ def turns_of(cells: NDArray[np.int64], grid: GridSpec) -> NDArray[np.int64]:
     return cells[turns]
 
 
+def named_system(frame: MapFrame) -> str:
+    """The coordinate system of a map as WKT; one without a name gets one, by which a GIS lists it."""
+    return str(frame.system.to_wkt()).replace('"unknown"', '"map of this terrain"')
+
+
 # --- rasters ------------------------------------------------------------------------------------------------------
 
 
@@ -388,7 +395,7 @@ def write_raster(
 
     side = {"tiled": True, "blockxsize": 256, "blockysize": 256} if min(grid.rows, grid.cols) >= 256 else {}
     size = {"height": grid.rows, "width": grid.cols, "count": len(bands), "dtype": bands[0].dtype}
-    crs = None if grid.crs == "local" else grid.crs
+    crs = None if grid.crs == "local" else named_system(MapFrame(grid))
     where = {"crs": crs, "transform": transform_of(grid)}
     try:
         with (

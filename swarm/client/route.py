@@ -12,7 +12,7 @@ from swarm.client.terrain_frame import Frame, Point
 from swarm.grid import walk
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.route_columns import Route as WireRoute
-from swarm.wire.route_columns import RouteStatus
+from swarm.wire.route_columns import RouteStatus, TargetStatus
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Route:
     While the target is unseen the status is "searching", and the route leads to a cell where it may be.
 
     target         id of the target
-    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target;
+    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target, lethal_target;
                    searching
     cells          from the vehicle's cell to the target's, or as far as the planner tells
     turns          of a pulled route the indices of the cells in which it turns, its first and last included: it
@@ -33,6 +33,7 @@ class Route:
     pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
     tracker_lost   no tracker publishes the target now: this is its last known position
     target_cell    cell of the target that the planner went by: a target that has just moved may be elsewhere by now
+    nearest_cell   of a lethal target the nearest cell that can be reached
     """
 
     frame: Frame
@@ -46,6 +47,7 @@ class Route:
     tracker_lost: bool = False
     turns: tuple[int, ...] = ()
     target_cell: int | None = None
+    nearest_cell: int | None = None
 
     @classmethod
     def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
@@ -57,10 +59,14 @@ class Route:
         turns = route.turns if led else ()
         if any(cells[start] == cells[end] for start, end in pairwise(turns)):
             raise ValueError("a segment of the route ends where it begins")
-        age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
+        status, age_s, lost, nearest = str(route.status), None, False, None
+        if isinstance(reply, RouteReply):
+            age_s, lost, nearest = reply.pose_age_s, reply.tracker_lost, reply.nearest_cell
+            if reply.lethal_target is not None and route.status is RouteStatus.NO_TARGET:
+                status = str(TargetStatus.LETHAL)
         return cls(
-            frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
-            age_s, lost, turns, reply.target_cell,
+            frame, reply.target, status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
+            age_s, lost, turns, reply.target_cell, nearest,
         )  # fmt: skip
 
     @property

@@ -45,10 +45,17 @@ class RouteStatus(enum.StrEnum):
     OUTSIDE = "outside"
     LETHAL_START = "lethal_start"
     NO_TARGET = "no_target"
-    """The planner does not know yet where the target is, or it stands on a lethal cell or outside."""
+    """The planner does not know yet where the target is, or it is on a lethal cell or outside."""
     SEARCHING = "searching"
     """The target is unseen: the route leads to a cell where it may be, without a proven bound. At its end ask
     again. Without steps and with an infinite cost no place has been found yet: ask later."""
+
+
+class TargetStatus(enum.StrEnum):
+    """Cause of NO_TARGET, which a reply tells by a field of its own: builds before know no further status."""
+
+    LETHAL = "lethal_target"
+    """The target is on a lethal cell."""
 
 
 STATUSES = tuple(RouteStatus)

@@ -144,7 +144,7 @@ def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
 
 
 def checked_xml(data: bytes, what: str) -> None:
-    """Checks every coordinate of a KML, a GPX or an OSM XML, and that no shape refers to what is not in the file.
+    """Checks every coordinate of a KML, a GPX or an OSM XML, and that no shape needs another file.
 
     Raises TerrainError with one sentence.
     """

@@ -23,9 +23,6 @@ from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import SwarmError, TerrainError
 
-MOST_FEATURES = 500_000
-"""Number of those that touch the terrain."""
-MOST_VERTICES = 20_000_000
 _CHUNK = 100_000
 """Features which are read at once."""
 _IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
@@ -60,18 +57,29 @@ class Layer:
 class Features:
     """Some features of a layer, in its own coordinates. Each has a shape, all of whose coordinates are finite.
 
-    ids     what people call each, such as way/4711, or its number in the file
-    shapes  shapely points, lines and polygons without heights, curves made of lines
-    of      int64, the feature which each shape is a part of
-    tags    attributes of each as texts, without those that are not set
-    closed  ids of those with a ring whose last corner was not its first
+    numbers  int64 (n,), in the file
+    columns  name -> attributes of each
+    shapes   shapely points, lines and polygons without heights, curves made of lines
+    of       int64, the feature which each shape is a part of
+    closed   those with a ring whose last corner was not its first
     """
 
-    ids: list[str]
+    numbers: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]
     shapes: NDArray[Any]
     of: NDArray[np.int64]
-    tags: list[dict[str, str]]
-    closed: list[str]
+    closed: NDArray[np.int64]
+
+    def tags(self, feature: int) -> dict[str, str]:
+        """Attributes as texts, without those that are not set."""
+        values = {name: column[feature] for name, column in self.columns.items()}
+        told = {name: "" if value is None else str(value) for name, value in values.items()}
+        return {name: text for name, text in told.items() if text not in ("", "nan", "NaT")}
+
+    def id(self, feature: int) -> str:
+        """The name of a feature to people, such as way/4711, or its number in the file."""
+        tags = self.tags(feature)
+        return next((tags[name] for name in _IDS if name in tags), str(self.numbers[feature]))[:60]
 
 
 def is_vector(path: Path) -> bool:
@@ -141,23 +149,19 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
                 skip_features=first,
                 max_features=_CHUNK,
             )
-            geometries = shapely.from_wkb(stored, on_invalid="fix")
-            unclosed = shapely.is_missing(shapely.from_wkb(stored, on_invalid="ignore"))
-        tags: list[dict[str, str]] = [{} for _ in numbers]
-        for name, values in zip(meta["fields"], fields, strict=True):
-            for row, value in zip(tags, values.tolist(), strict=True):
-                if value is not None and str(value) not in ("", "nan", "NaT"):
-                    row[str(name)] = str(value)
-        id_column = next((name for name in _IDS if name in wanted), "")
-        ids = [row.get(id_column, str(number))[:60] for row, number in zip(tags, numbers, strict=True)]
+            geometries = shapely.from_wkb(stored, on_invalid="ignore")
+            unclosed = np.flatnonzero(shapely.is_missing(geometries))
+            geometries[unclosed] = shapely.from_wkb(stored[unclosed], on_invalid="fix")
+        columns_read = dict(zip(map(str, meta["fields"]), fields, strict=True))
         shapes, of = _parts(geometries)
         bad: dict[int, str] = {int(n): "it has no shape" for n in np.flatnonzero(shapely.is_missing(geometries))}
         bad |= {int(n): "it, or a part of it, has no corners" for n in of[shapely.is_empty(shapes)]}
         corners, at = shapely.get_coordinates(shapes, return_index=True)
         bad |= {int(n): "its coordinates are no numbers" for n in of[at[~np.isfinite(corners).all(axis=1)]]}
+        features = Features(numbers, columns_read, shapes, of, unclosed)
         for n, why in sorted(bad.items()):
-            raise TerrainError(f"{layer.what}: feature {ids[n]} cannot be used: {why}; repair or remove it")
-        yield Features(ids, shapes, of, tags, [ids[n] for n in np.flatnonzero(unclosed)])
+            raise unusable(layer.what, features.id(n), why)
+        yield features
         if len(numbers) < _CHUNK:
             if first + len(numbers) != layer.count:
                 raise TerrainError(
@@ -165,6 +169,10 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
                     " read; ogr2ogr makes a copy of these"
                 )
             return
+
+
+def unusable(what: str, id: str, why: str) -> TerrainError:
+    return TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
 
 
 def _parts(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:

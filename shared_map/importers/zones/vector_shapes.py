@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
-from shared_map.importers.zones.vector_files import Features, Layer
+from shared_map.importers.zones.vector_files import Features, Layer, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 Box = tuple[float, float, float, float]
 Floats64 = NDArray[np.float64]
+MOST_FEATURES, MOST_CORNERS = 500_000, 20_000_000
+"""Limits of one layer on the terrain."""
 _MOST_CROSSINGS = 50_000
 _STEP_M = 1000.0
 """Longer edges are cut: a straight edge in one system is bent in another, by some centimetres over this length."""
@@ -70,7 +72,7 @@ class Placing:
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
         self._reach: Box | None = None
-        self._touched = False
+        self._touched, self._features, self._corners = False, 0, 0
 
     @property
     def crs(self) -> str:
@@ -125,7 +127,7 @@ class Placing:
             wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
             for n in np.flatnonzero(wrong)[:1]:
                 raise TerrainError(
-                    f"{what}: feature {features.ids[features.of[n]]} reaches from {_shown(tuple(bounds[n]))}, which"
+                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(tuple(bounds[n]))}, which"
                     f" are no degrees, as {self.crs} has them; set crs"
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
@@ -149,14 +151,21 @@ class Placing:
             self._check_bounds(features, bounds)
             near = self._on(bounds)
             self._touched |= bool(near.any())
+            self._features += len(np.unique(features.of[near]))
+            self._corners += int(shapely.get_num_coordinates(features.shapes[near]).sum())
+            if self._features > MOST_FEATURES or self._corners > MOST_CORNERS:
+                raise TerrainError(
+                    f"{self.layer.what} has more than {MOST_FEATURES} features or {MOST_CORNERS} corners on the"
+                    " terrain; crop, dissolve or simplify it"
+                )
             of = features.of[near]
             shapes, of, mended = _mended(features, near, self.layer.what)
             placed = [self._placed(shapes, of, shift, features) for shift in self._shifts]
-        outside = len(features.ids) - len(np.unique(of))
+        outside = len(features.numbers) - len(np.unique(of))
         return Shapes(
             np.concatenate([each for each, _ in placed]),
             np.concatenate([each for _, each in placed]),
-            sorted({*mended, *features.closed}),
+            sorted({*mended, *map(features.id, features.closed.tolist())}),
             outside,
         )
 
@@ -175,7 +184,7 @@ class Placing:
         with self._reprojecting():
             shapes = shapely.transform(shapes, lambda points: self._to_cells(points, -shift))
         for n in of[~np.isfinite(shapely.bounds(shapes)).all(axis=1)]:
-            raise _unusable(self.layer.what, features, n, "it has no place in the terrain's system")
+            raise unusable(self.layer.what, features.id(n), "it has no place in the terrain's system")
         return shapes, of
 
     @contextmanager
@@ -248,8 +257,7 @@ def _turned(bounds: Floats64) -> Floats64:
 
 
 def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
-    id = features.ids[features.of[shape]]
-    return TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
+    return unusable(what, features.id(features.of[shape]), why)
 
 
 def _shown(box: Box) -> str:
@@ -301,7 +309,7 @@ def _mended(
         if shapely.is_empty(shapes[n]):
             raise _unusable(what, features, n, "it encloses no ground")
     simple, within = _simple(shapes[near])
-    return simple, features.of[near][within], {features.ids[features.of[n]] for n in wrong}
+    return simple, features.of[near][within], {features.id(features.of[n]) for n in wrong}
 
 
 def _crossings(polygon: Any) -> float:

@@ -20,7 +20,7 @@ from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones import way_classes
 from shared_map.importers.zones.burn import Drawn, burn
 from shared_map.importers.zones.shape_texts import INCLUSION
-from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layers, read_features
+from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layers, read_features, unusable
 from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from swarm.config.ground import ZoneConfig
@@ -129,7 +129,7 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
         facts.crs = placing.crs
         for features in read_features(layer, worth.columns):
             placed = placing.place(features)
-            facts.features += len(features.ids)
+            facts.features += len(features.numbers)
             facts.outside += placed.outside
             facts.mended += placed.mended
             names = set()
@@ -168,9 +168,9 @@ def _margin_m(zone: ZoneConfig, layer: Layer) -> float:
     stated = [column for column in layer.columns if states_extent(column)]
     widths = [way.width_m or 0.0 for way in zone.classes.values()] + [zone.width_m or 0.0, _WIDEST_M]
     for features in read_features(layer, stated) if stated else ():
-        for tags in features.tags:
+        for n in range(len(features.numbers)):
             with contextlib.suppress(ValueError):
-                widths.append(way_classes.width_of(tags) or 0.0)
+                widths.append(way_classes.width_of(features.tags(n)) or 0.0)
     return max(widths) / 2
 
 
@@ -223,9 +223,9 @@ class _Worth:
         else is closed)."""
         ways: dict[int, tuple[Way | None, bool, bool]] = {}
         for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
-            id = features.ids[n]
+            id = features.id(n)
             if n not in ways:
-                tags = way_classes.unpacked(features.tags[n])
+                tags = way_classes.unpacked(features.tags(n))
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
@@ -268,12 +268,9 @@ class _Worth:
             own_m = way_classes.width_of(tags)
         except ValueError as error:
             if closes or kind == "water":
-                raise self._unusable(id, str(error)) from None
+                raise unusable(self._layer.what, id, str(error)) from None
             own_m = None
         return Way(own_m or zone.width_m or way.width_m, None if closes else way.factor)
-
-    def _unusable(self, id: str, why: str) -> TerrainError:
-        return TerrainError(f"{self._layer.what}: feature {id} cannot be used: {why}; repair or remove it")
 
     def _class_of(self, tags: dict[str, str]) -> str | None:
         attribute = self._zone.attribute

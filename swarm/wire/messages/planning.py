@@ -70,6 +70,8 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     pose_age_s   time since the pose arrived that the route leads to; None before the first
     tracker_lost  no tracker publishes the target now: this is its last known position
     vehicle_class  whose routes these are
+    lethal_target  the lethal cell where the target is, to which no route leads: the status is NO_TARGET
+    nearest_cell   the cell nearest to it which can be reached; None if none is near
     """
 
     target: Id
@@ -83,6 +85,8 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     pose_age_s: AgeSeconds | None = None
     tracker_lost: bool = False
     vehicle_class: Id = GROUND
+    lethal_target: Cell | None = None
+    nearest_cell: Cell | None = None
 
     def check(self) -> None:
         self.routes.check_bounds()
@@ -125,6 +129,8 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     pose_age_s: AgeSeconds | None = None
     tracker_lost: bool = False
     vehicle_class: Id = GROUND
+    lethal_target: Cell | None = None
+    nearest_cell: Cell | None = None
 
 
 MOST_BELIEVED = 512

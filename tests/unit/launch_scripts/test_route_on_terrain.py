@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import sqlite3
+from datetime import datetime
 from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
@@ -29,6 +32,8 @@ from launch_scripts.commands.terrain_routes import (
 )
 from launch_scripts.launcher.options import find_scenario
 from shared_map.terrain.terrain import build_terrain
+from shared_map.terrain.zones import paint_zones
+from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 
@@ -82,11 +87,48 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
     assert (len(rows), rows[0]["row"], rows[0]["col"]) == (many, "10", "5")
 
 
+def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Path, tmp_path: Path) -> None:
+    found = find_route(str(hill), "cell:10,5", "cell:50,75")
+    for ending in ("plan", "waypoints", "gpx", "gpkg"):
+        write_route(found, tmp_path / f"way.{ending}")
+    items = json.loads((tmp_path / "way.plan").read_text())["mission"]["items"]
+    rows = [line.split("\t") for line in (tmp_path / "way.waypoints").read_text().splitlines()[1:]]
+    assert [each["params"][4:6] for each in items] == [[float(row[8]), float(row[9])] for row in rows[1:]]
+    assert [int(row[0]) for row in rows] == list(range(len(items) + 1))
+    # The line of the mission covers each cell of the route.
+    pace = np.ones(found.grid.shape, np.float32)
+    zone = ZoneConfig(kind="forbidden", file=str(tmp_path / "way.waypoints"))
+    paint_zones(pace, [zone], found.grid, CostConfig())
+    assert np.isinf(pace.reshape(-1)[found.cells]).all()
+    times = re.findall(r"<time>(.*?)</time>", (tmp_path / "way.gpx").read_text())
+    assert len(times) == len(found.cells)
+    assert found.at_s is not None
+    last = datetime.fromisoformat(times[-1].replace("Z", "+00:00")).timestamp()
+    assert last == pytest.approx(found.at_s[-1], abs=0.001)
+    with sqlite3.connect(tmp_path / "way.gpkg") as database:
+        assert database.execute("PRAGMA user_version").fetchall() == [(10200,)]
+        names = database.execute("SELECT srs_name FROM gpkg_spatial_ref_sys").fetchall()
+    assert ("unknown",) not in names
+
+
+def test_the_bands_of_a_corridor_fit_its_slack(hill: Path, tmp_path: Path) -> None:
+    words = f"reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
+    CliRunner().invoke(terrain_app, words.split(), catch_exceptions=False)
+    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+    assert {each["properties"]["from_s"] for each in features} >= {0}
+    assert 3 <= len({each["properties"]["from_s"] for each in features}) <= 6
+
+
 def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
     with pytest.raises(
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
         find_route(str(hill), "cell:10,35", "cell:10,75")
+    for start, end, option in (("cell:10,35", "cell:10,75", "--from"), ("cell:10,75", "cell:10,35", "--to")):
+        with pytest.raises(SwarmError, match=f"{option} is on lethal ground") as told:
+            find_route(str(hill), start, end)
+        nearest = str(told.value).split("reached is ")[1].split()[0]
+        assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
         (["--row", "1"], "give --target and --from"),

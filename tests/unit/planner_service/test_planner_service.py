@@ -77,7 +77,8 @@ def test_one_wildcard_question_brings_the_costs_of_all_planners() -> None:
 
 def test_a_target_on_lethal_ground_has_no_routes_until_it_is_back() -> None:
     pace = flat()
-    pace[5, 5] = np.inf
+    pace[3:8, 3:8] = np.inf
+    pace[5, 6] = 1.0  # open, but no way leads there
     swarm = Swarm(pace)
     for _ in range(2):
         swarm.cells["t"] = GRID.cell(10, 10)
@@ -87,6 +88,19 @@ def test_a_target_on_lethal_ground_has_no_routes_until_it_is_back() -> None:
         swarm.run(0.3)
         reply = swarm.ear.routes(0)
         assert (reply.target_cell, reply.routes[0].status) == (None, RouteStatus.NO_TARGET)
+        assert (reply.lethal_target, reply.nearest_cell) == (GRID.cell(5, 5), GRID.cell(2, 5))
+        (costs,) = swarm.ear.ask(COST, CostRequest(cells=[0]))
+        assert (costs.lethal_target, costs.nearest_cell) == (GRID.cell(5, 5), GRID.cell(2, 5))
+        assert lethal_alarms(swarm) == [None]
+        swarm.cells["t"] = GRID.cell(10, 10)
+        swarm.run(1.3)
+        assert None not in lethal_alarms(swarm)
+
+
+def lethal_alarms(swarm: Swarm) -> list[int | None]:
+    """The end of the newest alarm about the target's ground; None while it lasts."""
+    alarms = swarm.planners["t"]._member.alarms.current()
+    return [each.over_ns for each in alarms if each.kind == "target-lethal"][:1]
 
 
 def test_a_pose_outside_of_the_terrain_is_not_used_and_the_target_is_lost_until_the_next_inside() -> None:

@@ -15,7 +15,7 @@ import planner_service
 from planner_service import RouteFinder
 from swarm.config.setting_types import Strategy
 from swarm.errors import OutsideGridError
-from swarm.wire.route_columns import RouteStatus
+from swarm.wire.route_columns import RouteStatus, TargetStatus
 
 
 def test_the_example_does_what_it_says() -> None:
@@ -66,7 +66,7 @@ def test_every_cell_has_an_answer_and_none_ends_the_interpreter() -> None:
     assert finder.route(2, 2).status is RouteStatus.LETHAL_START
     assert finder.route(5, 6).status is RouteStatus.OK
     finder.move((2, 2))
-    assert finder.route(5, 6).status is RouteStatus.NO_TARGET
+    assert finder.route(5, 6).status is TargetStatus.LETHAL
     assert np.isinf(finder.cost_to_go_s()).all()
     finder.move((5, 5))
     assert finder.route(5, 6).cost_s == 1.0

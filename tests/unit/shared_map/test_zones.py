@@ -13,12 +13,14 @@ from support.map_strategies import set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.cost_map import CostMap
+from shared_map.importers.zones.outlines import all_but
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
+from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
 from swarm.wire.topics import ZONES
@@ -137,6 +139,22 @@ def test_a_removal_counts_as_obeyed_when_its_tombstone_has_come() -> None:
     assert isinstance(removed, Zones)
     world.run(8.0)
     assert world.planner.replica.lacking("operator.z", removed.sets) == []
+
+
+def test_a_hole_of_a_zone_stays_open() -> None:
+    world = ZoneWorld()
+    world.add(holes=[[(3.0, 4.0), (3.0, 6.0), (5.0, 6.0), (5.0, 4.0)]])
+    assert world.lethal() == SQUARE_CELLS - {row * COLS + col for row in (3, 4) for col in (4, 5)}
+    kept = outlines_of_kept([(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)])
+    assert len(kept) == 1
+    world.add(polygon=kept[0][0], holes=kept[0][1:])
+    assert world.lethal() == set(range(ROWS * COLS)) - SQUARE_CELLS
+    outside = world.order(action="add", name="z", polygon=SQUARE, holes=[[(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]])
+    assert "its edges cross or touch each other" in str(outside)
+
+
+def outlines_of_kept(corners: list[tuple[float, float]]) -> list[list[list[tuple[float, float]]]]:
+    return all_but(corners, GridSpec(ROWS, COLS, 1.0), 256)
 
 
 def test_a_zone_without_a_name_gets_one_that_was_never_used() -> None:
