@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
-import math
 import multiprocessing
 import os
 import signal
@@ -19,6 +18,7 @@ from typing import Any
 
 from launch_scripts.launcher.child_process import ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
+from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
 from launch_scripts.web.health_verdict import Process
@@ -41,17 +41,6 @@ REFUSALS_ALLOWED = 5
 REFUSALS_WITHIN_S = 60.0
 FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
-
-
-STILL_S = 60.0
-"""A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes fail:
-restarts do not help an overloaded machine."""
-LOOK_EVERY_S = 1.0
-"""A sixtieth of `STILL_S`, so what hangs is found in time; the launcher's loop turns ten to twenty times as
-often."""
-_MOST_PER_LOOK_S = 2.0
-"""Two looks. More between two of them was no time in which the launcher turned: it was stopped, and so were its
-processes."""
 
 
 @dataclass(slots=True)
@@ -104,8 +93,7 @@ class Running:
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
     """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
-    ticked: tuple[int, float] = (0, 0.0)
-    """The newest stamp on its board while its loop runs, and the launcher's time when that was new."""
+    stillness: Stillness = field(default_factory=Stillness)
     hung_s: float | None = None
     """Since when this life has been asked to say where it hangs, and to end; None if it has not."""
 
@@ -179,10 +167,8 @@ class LocalSwarm:
         self._setup_of = setup_of
         self._log_dir = log_dir
         self._log_format = log_format
-        self._turned_s = 0.0
-        """For how long the launcher itself has turned. One that was stopped with all of its processes, as by
-        Ctrl-Z, finds their boards old when it goes on, and none of them hangs."""
-        self._looked_s = -math.inf
+        self._looked_s = 0.0
+        self._idle = IdleTime()
         self._context = multiprocessing.get_context("forkserver")
 
     @property
@@ -261,25 +247,27 @@ class LocalSwarm:
         return endings
 
     def _end_hung(self) -> None:
-        """Ends processes whose loop stands still: at first by SIGABRT, at which they write into their log where all
-        of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
+        """Ends processes which hang (`hang_watch`): at first by SIGABRT, at which they write into their log where
+        all of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
         SIGKILL."""
         now_s = time.monotonic()
         passed_s = now_s - self._looked_s
         if passed_s < LOOK_EVERY_S:
             return
         self._looked_s = now_s
-        self._turned_s += min(passed_s, _MOST_PER_LOOK_S)
+        idle: bool | None = None
         for running in self.running:
             vitals = running.seen().vitals
             stamp_ns = vitals.stamp_ns if vitals is not None and vitals.phase is Phase.RUNS else 0
-            if not stamp_ns or stamp_ns != running.ticked[0]:
-                running.ticked = stamp_ns, self._turned_s
-            elif self._turned_s - running.ticked[1] < STILL_S:
+            if not running.stillness.needs_look(stamp_ns):
                 continue
-            elif running.hung_s is None:
+            idle = self._idle.any_until(now_s) if idle is None else idle
+            sight = None if running.process is None else sight_of(running.process.pid or 0)
+            if sight is None or not running.stillness.hangs(sight, passed_s, idle):
+                continue
+            if running.hung_s is None:
                 running.hung_s = now_s
-                log.error("%s hangs: its loop has not turned for %.0f s", running.spec.name, STILL_S)
+                log.error("%s hangs: its loop has not turned for %.0f s of its time", running.spec.name, STILL_S)
                 running.send(signal.SIGABRT)
             elif now_s - running.hung_s > STOP_GRACE_S:
                 running.send(signal.SIGKILL)

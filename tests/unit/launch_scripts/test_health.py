@@ -16,15 +16,17 @@ import time
 from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.processes import eventually
 
-from launch_scripts.launcher import local_swarm
+from launch_scripts.launcher import hang_watch, local_swarm
 from launch_scripts.launcher.forkserver import WarmUp
-from launch_scripts.launcher.local_swarm import LOOK_EVERY_S, STILL_S, Ending, LocalSwarm, Running
+from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, Sight, Stillness
+from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_probe import ask, fast
@@ -313,62 +315,84 @@ def test_a_probe_loads_no_command_line() -> None:
     assert not heavy & set(loaded)
 
 
-class Watched:
-    """A launcher with one process, of which there is a board and nothing else, on a clock of the test."""
+class Machine:
+    """A process with a main thread, as a launcher sees it at each look, and what holds its judgement."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.now_s = 1000.0
-        self.sent: list[signal.Signals] = []
-        patch.setattr(local_swarm.time, "monotonic", lambda: self.now_s)
-        patch.setattr(Running, "send", lambda running, number: self.sent.append(number))
-        swarm = LocalSwarm([ProcessSpec("agent", "a0", "m:f")], lambda spec: None, Path())  # type: ignore[arg-type, return-value]
-        [self.running] = swarm.running
-        self.running.process, self.running.health = object(), bytearray(BOARD_BYTES)  # type: ignore[assignment]
-        self.board, self.look = Board(self.running.health), swarm._end_hung
+    def __init__(self) -> None:
+        self.stillness, self.stamp_ns, self.used_s = Stillness(), 1, 0.0
+        self.had_s = self.slept_s = 0.0
+        """Since its last tick: what it had of a processor, and what it slept while it could have had one."""
 
-    def passes(self, seconds: float, stamp_ns: int, phase: Phase = Phase.RUNS) -> list[signal.Signals]:
-        """The signal that the process gets at a check some seconds later, if its last tick was at `stamp_ns`."""
-        self.now_s, self.sent = self.now_s + seconds, []
-        self.board.write(Vitals(stamp_ns, 0, phase, ()))
-        self.look()
-        return self.sent
+    def look(self, passed_s: float, used: float, runnable: bool, idle: bool, ticks: bool) -> bool:
+        """Returns whether it is said to hang. `used`: the share of the time for which it had a processor."""
+        used_s = used * passed_s
+        self.used_s, self.stamp_ns = self.used_s + used_s, self.stamp_ns + ticks
+        self.had_s, self.slept_s = (
+            (0.0, 0.0) if ticks else (self.had_s + used_s, self.slept_s + (not runnable) * (passed_s - used_s))
+        )
+        return self.stillness.needs_look(self.stamp_ns) and self.stillness.hangs(
+            Sight(self.used_s, runnable), passed_s, idle
+        )
 
 
-@given(st.lists(st.tuples(st.floats(0.01, 100.0), st.booleans()), max_size=60))
-def test_who_is_killed_stood_still_for_a_minute_in_which_the_launcher_turned(
-    looks: list[tuple[float, bool]],
+_looks = st.tuples(st.floats(1.0, 90.0), st.floats(0.0, 1.0), st.booleans(), st.booleans(), st.booleans())
+
+
+@given(st.lists(_looks, max_size=60))
+def test_who_is_said_to_hang_had_a_minute_of_a_processor_or_slept_it_away(
+    looks: list[tuple[float, float, bool, bool, bool]],
 ) -> None:
-    """`looks`: seconds since the look before, and whether the process has ticked since then."""
-    with pytest.MonkeyPatch.context() as patch:
-        watched, stamp_ns, still_s = Watched(patch), 1, 0.0
-        watched.passes(0.0, stamp_ns)
-        looked_s = watched.now_s
-        for passed_s, ticked in looks:
-            stamp_ns += ticked
-            sent = watched.passes(passed_s, stamp_ns)
-            since_s = watched.now_s - looked_s
-            turned_s = 0.0 if since_s < LOOK_EVERY_S else min(since_s, 2.0)
-            still_s = 0.0 if ticked else still_s + turned_s
-            if turned_s:
-                looked_s = watched.now_s
-            if sent:
-                assert still_s >= STILL_S - 0.001
+    machine = Machine()
+    for look in looks:
+        if machine.look(*look):
+            assert machine.had_s + machine.slept_s >= STILL_S - 0.001
 
 
-@pytest.mark.parametrize("phase", [Phase.STARTS, Phase.ENDS])
-def test_nobody_is_killed_who_starts_or_ends(phase: Phase, monkeypatch: pytest.MonkeyPatch) -> None:
-    watched = Watched(monkeypatch)
-    assert not any(watched.passes(1.0, 1, phase) for _ in range(300))
-
-
-def test_who_stands_still_for_a_minute_says_where_and_is_killed_if_it_cannot(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("used", "runnable", "idle", "hangs_after"),
+    [
+        (1.0, True, True, 61),  # a loop without an end
+        (0.01, True, False, None),  # it compiles on a machine that is far too busy
+        (0.0, True, False, None),
+        (0.0, False, True, 61),  # a deadlock, or SIGSTOP
+        (0.01, False, True, 61),  # it sleeps, and looks now and then for what never comes
+        (0.0, False, False, 601),  # a deadlock among processes that leave no processor idle
+    ],
+)
+def test_when_a_process_that_does_not_tick_is_said_to_hang(
+    used: float, runnable: bool, idle: bool, hangs_after: int | None
 ) -> None:
-    watched = Watched(monkeypatch)
-    sent = [watched.passes(1.0, 1) for _ in range(68)]
-    assert [n for n, numbers in enumerate(sent) if numbers] == [60, 66, 67]
-    assert sent[60:67:6] == [[signal.SIGABRT], [signal.SIGKILL]]
-    assert watched.passes(1.0, 2) == []
+    machine = Machine()
+    machine.look(1.0, used, runnable, idle, True)
+    found = (n for n in range(1, 700) if machine.look(1.0, used, runnable, idle, False))
+    after = next(found, None)
+    assert after == hangs_after or (after is not None and hangs_after is not None and abs(after - hangs_after) <= 1)
+
+
+def test_who_was_stopped_with_its_launcher_does_not_hang_when_both_go_on() -> None:
+    machine = Machine()
+    machine.look(1.0, 0.0, False, True, True)
+    assert not any(machine.look(3600.0, 0.0, False, True, False) for _ in range(30))
+
+
+@pytest.mark.parametrize("phase", [Phase.STARTS, Phase.ENDS, Phase.RUNS])
+def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts_or_ends(
+    phase: Phase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, sent = 1000.0, []
+    monkeypatch.setattr(local_swarm.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(Running, "send", lambda running, number: sent.append((now_s - 1000.0, number)))
+    monkeypatch.setattr(local_swarm, "sight_of", lambda pid: Sight(0.0, False))
+    monkeypatch.setattr(local_swarm.IdleTime, "any_until", lambda idle, now_s: True)
+    swarm = LocalSwarm([ProcessSpec("agent", "a0", "m:f")], lambda spec: None, Path())  # type: ignore[arg-type, return-value]
+    [running] = swarm.running
+    running.process, running.health = mock.Mock(pid=1), bytearray(BOARD_BYTES)
+    Board(running.health).write(Vitals(1, 0, phase, ()))
+    for _ in range(70):
+        swarm._end_hung()
+        now_s += LOOK_EVERY_S
+    ended = [(61.0, signal.SIGABRT), *((s, signal.SIGKILL) for s in (67.0, 68.0, 69.0))]
+    assert sent == (ended if phase is Phase.RUNS else [])
 
 
 def started(tmp_path: Path, function: str) -> LocalSwarm:
@@ -394,7 +418,7 @@ def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str
 ) -> None:
     """One whose tick does not end, and one that was stopped, so that it cannot say anything."""
-    monkeypatch.setattr(local_swarm, "STILL_S", 2.0)
+    monkeypatch.setattr(hang_watch, "STILL_S", 2.0)
     swarm = started(tmp_path, function)
     endings: list[Ending] = []
     try:
