@@ -87,7 +87,7 @@ class Steering:
         """Returns True if a step to a neighbour is a diagonal that the cells beside it, or the planner, forbid."""
         cols = self._grid.cols
         rows, col = head // cols - tail // cols, head % cols - tail % cols
-        if not rows or not col or self._diagonal and self._corner_cutting:
+        if not rows or not col or (self._diagonal and self._corner_cutting):
             return False
         return not self._diagonal or self.closed(tail + col) or self.closed(tail + rows * cols)
 
