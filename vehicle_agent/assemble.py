@@ -16,6 +16,7 @@ from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Bus, Post
+from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.config.plugin_names import assignment_key
 from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, flies, of_class
@@ -99,7 +100,10 @@ class AgentParts:
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
         side = scenario.map.plot_regions * REGION_CELLS
         plots = Plots(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
-        core = RightOfWay(setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids)
+        tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
+        core = RightOfWay(
+            setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns
+        )
         self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn)
 
         # The vehicles.

@@ -17,7 +17,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.member import AskPromises, Refused, Save
+from vehicle_agent.traffic.member import SLOW_NS, AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 
@@ -52,12 +52,13 @@ class OwnTime:
 
 log = logging.getLogger(__name__)
 
-_FIRST_ANSWERS_S = 0.3
-"""A new life waits so long for the others' answers before it begins."""
+_FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
+"""A new life waits so long for the others' answers before it begins. What comes later counts as well."""
+_LATE_ANSWERS_S = 10.0
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 """Interval of recovery queries to agents: a second, then twice as long each time, up to this."""
-_PROMISE_TIMEOUT_S = 5.0
+_PROMISE_TIMEOUT_S = 10.0
 """A late member replies late, and its promise counts until we claim again: by epoch, so it does no harm."""
 _MOST_REFUSALS_TOLD = 100
 """Liars may say as many different things as they like."""
@@ -72,7 +73,7 @@ class RightOfWaySync:
     """Carries an agent's right of way.
 
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
-            "promises", for the file of promises
+            "slow_link", for agents that answer late; "promises", for the file of promises
     """
 
     def __init__(
@@ -94,7 +95,8 @@ class RightOfWaySync:
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
         self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
         """Time for the core. When to ask, and when to tell people, goes by the time of the wall."""
-        self._asking = False
+        self._asked_ns: int | None = None
+        """Time of the last recovery query of this life."""
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._unasked = False
@@ -102,7 +104,7 @@ class RightOfWaySync:
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Plot without a warden -> when that is said again."""
-        self._reserve_due_ns = 0
+        self._reserve_due_ns = self._slow_due_ns = 0
         self._told_silent_ns: int | None = None
         """Time when it was last said that our seats are silent; None while they are not."""
 
@@ -116,7 +118,7 @@ class RightOfWaySync:
         self._bus.subscribe(TABLE, self._post, member=self._id)
         self._bus.subscribe(STORED, self._post, member=self._id)
         self._bus.collect(GRANTED, host=self._id)
-        self._ask_known()
+        self._ask_known(now_ns)
 
     def on_cells_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
@@ -135,7 +137,9 @@ class RightOfWaySync:
                 event.end()
             case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
                 core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, own_ns)
-            case Replied(message=Known() as known):
+            case Replied(message=Known() as known, took_s=took_s):
+                if known.agent in core.plots.agents:
+                    core.trips.measure(known.agent, int(took_s * NS_PER_S))
                 self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
                 core.host.hear_token(peer, up=True)
@@ -143,7 +147,7 @@ class RightOfWaySync:
             case Disappeared(peer=Peer(role="agent") as peer):
                 core.host.hear_token(peer, up=False)
             case AskEnded(topic=topic) if topic is KNOWN:
-                self._known_ended(now_ns)
+                self._begin()
             case AskEnded(topic=topic) if topic is TABLE:
                 pass
             case _:
@@ -159,19 +163,37 @@ class RightOfWaySync:
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)
-        if not self._asking and not self.core.settled and (self._unasked or now_ns >= self._ask_due_ns):
-            self._ask_known()
+        asked_ns = self._asked_ns
+        waited = asked_ns is None or not 0 <= now_ns - asked_ns < _FIRST_ANSWERS_NS
+        if waited and not self.core.settled and (self._unasked or now_ns >= self._ask_due_ns):
+            self._ask_known(now_ns)
         self._look_after_store(now_ns)
+        if waited and asked_ns is not None:
+            self._begin()
         for heard in self._bus.collected(STANDING):
             assert isinstance(heard.message, Standing)
             self.core.hear_standing(heard.message, own_ns)
         self._perform(self.core.tick(wishes, own_ns))
+        self._tell_slow(now_ns)
         unled = self.core.host.unled(own_ns)
         self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
         for plot, text in unled.items():
             if now_ns >= self._unled_due_ns[plot]:
                 self._unled_due_ns[plot] = now_ns + _WAITING_AGAIN_NS
                 self._warn("waiting", text)
+
+    def _tell_slow(self, now_ns: int) -> None:
+        """States which agents answer so late that vehicles wait longer for cells."""
+        slow = self.core.trips.slow()
+        if slow and now_ns >= self._slow_due_ns:
+            self._slow_due_ns = now_ns + _SILENT_AGAIN_NS
+            agent = max(slow, key=slow.__getitem__)
+            self._warn(
+                "slow_link",
+                f"{len(slow)} of the agents answer slowly, {agent} after {slow[agent] / NS_PER_S:.1f} s (expected: "
+                f"below {SLOW_NS / NS_PER_S:g} s): vehicles wait longer for cells, and a failed agent is replaced "
+                "later",
+            )
 
     def _look_after_store(self, now_ns: int) -> None:
         """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
@@ -188,21 +210,22 @@ class RightOfWaySync:
                 self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
         self.core.silent = not self._store.ready
 
-    def _ask_known(self) -> None:
+    def _ask_known(self, now_ns: int) -> None:
+        """Asks all agents what they know of us, and schedules the next query: each after twice the delay, up to a
+        limit."""
         plots = self.core.plots
         request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=plots.layer, plot_cells=plots.side)
-        self._asking, self._unasked = True, False
-        self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
-
-    def _known_ended(self, now_ns: int) -> None:
-        """Called when a round of queries has ended. Starts voting if this life has none yet and the promise file
-        can be written. Schedules the next round, each time after twice the delay, up to a limit."""
-        self._asking = False
-        self.core.silent = not self._store.ready
-        if not self.core.holdings.life and not self.core.silent:
-            self._perform(self.core.begin(self._chance))
+        self._asked_ns, self._unasked = now_ns, False
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
+        self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_LATE_ANSWERS_S)
+
+    def _begin(self) -> None:
+        """Begins a life if there is none, once those who could be asked had time to answer and the promise file can
+        be written."""
+        self.core.silent = not self._store.ready
+        if self._asked_ns is not None and not self.core.holdings.life and not self.core.silent:
+            self._perform(self.core.begin(self._chance))
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
         """A claim is answered to the member whose epoch it is, under its own name."""
@@ -243,7 +266,7 @@ class RightOfWaySync:
         for action in actions:
             match action:
                 case AskKnown():
-                    self._ask_known()
+                    self._asked_ns, self._unasked = None, True  # at the next tick
                 case Tell(members, standing):
                     for member in members:
                         self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self._id)

@@ -7,6 +7,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Stand, Standing, Table
+from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 GRID = GridSpec(8, 8, 1.0)
@@ -53,3 +54,11 @@ def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
 def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
     spawns = {name: {f"{name}-00": n} for n, name in enumerate(AGENTS)}
     return RightOfWay(agent, PLOTS, spawns, OwnRecord(disk=7), saved or {})
+
+
+def near_members() -> RoundTrips:
+    """Round trips of a millisecond to all members."""
+    trips = RoundTrips()
+    for member in MEMBERS:
+        trips.measure(member, S // 1000)
+    return trips

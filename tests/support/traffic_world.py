@@ -100,6 +100,7 @@ class Process:
         return self.rights.settled
 
     def hear_known(self, known: Known) -> None:
+        self.rights.trips.measure(known.agent, TICK_NS // 10)
         self.perform(self.rights.hear_known(known))
 
     def find_body(self, vehicle: str, cells: list[int]) -> int:

@@ -16,12 +16,21 @@ from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table
 from vehicle_agent.traffic.warden import Warden
 
 LEASE_NS = 3 * BEAT_NS
-"""A warden that is silent for so long may be replaced. Until then its members refuse every claim
-(docs/design/right-of-way.md)."""
+"""A warden that is silent for so long may be replaced, later where answers take long. Until then its members refuse
+every claim (docs/design/right-of-way.md)."""
 _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
 """Time without a host's message after which no warden is needed."""
+_TICK_NS = NS_PER_S // 10
+_UNKNOWN_NS = NS_PER_S
+"""Assumed before the first answer: a claim that comes too late costs once, one that comes too early each time."""
+_LONGEST_NS = 4 * NS_PER_S
+"""A process that was stopped answers late: then this counts, until later answers have outweighed it."""
+SLOW_NS = 3 * NS_PER_S // 10
+"""Above this round trip a link is reported as slow: an election then takes longer than on a fast link."""
+_ASKED_KEPT = 16
+"""Tables and claims of which it is kept when they were sent."""
 _TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
 
@@ -53,6 +62,31 @@ class Refused:
 MemberAction = Save | AskPromises | Refused | Table | Stored | Granted
 
 
+class RoundTrips:
+    """Bounds on the time until another agent's answer comes: the smoothed round trip and four times its deviation
+    (Jacobson, 1988)."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[int, int]] = {}
+        """Agent -> (smoothed round trip, deviation), ns."""
+
+    def measure(self, agent: str, trip_ns: int) -> None:
+        """An agent has answered after this time."""
+        trip_ns = min(max(trip_ns, 0), _LONGEST_NS)
+        mean, deviation = self._known.get(agent, (trip_ns, trip_ns // 4))
+        error = trip_ns - mean
+        self._known[agent] = mean + error // 8, deviation + (abs(error) - deviation) // 4
+
+    def bound_ns(self, agents: Collection[str]) -> int:
+        """Returns the time within which all of these agents answer, as far as is known."""
+        bounds = (self._known.get(agent, (_UNKNOWN_NS, 0)) for agent in agents)
+        return max((min(mean + 4 * deviation, _LONGEST_NS) for mean, deviation in bounds), default=0)
+
+    def slow(self) -> dict[str, int]:
+        """Returns the agents which answer slowly -> the round trip, ns."""
+        return {agent: mean for agent, (mean, _) in self._known.items() if mean > SLOW_NS}
+
+
 class Member:
     """One agent's seat among the members of one plot.
 
@@ -61,6 +95,8 @@ class Member:
     warden    the warden itself, while this member is in charge
 
     fleets    agent -> its vehicles, all of the run
+    trips     round trips to other agents, shared by all seats of this one
+    tick_ns   between two ticks
     """
 
     def __init__(
@@ -71,8 +107,14 @@ class Member:
         stored: Table,
         fleets: Mapping[str, Collection[str]],
         now_ns: int,
+        trips: RoundTrips | None = None,
+        tick_ns: int = _TICK_NS,
     ) -> None:
         self.plot = stored.plot
+        self._trips = RoundTrips() if trips is None else trips
+        self._tick_ns = tick_ns
+        self._asked: dict[Stamp, int] = {}
+        """Stamp of a table that was sent once -> when; of a claim the sequence is 0."""
         self.promised = promised
         self.stored = stored
         self.warden: Warden | None = None
@@ -98,14 +140,41 @@ class Member:
         self._has: dict[str, Stamp] = {}
         """Other member -> the table that it said last to have stored."""
 
+    # --- timeouts -------------------------------------------------------------------------------------------
+
+    @property
+    def _lease_ns(self) -> int:
+        """A warden speaks once a beat; the table of a new one comes a round trip after our promise. A table that is
+        lost is told again after another."""
+        return max(LEASE_NS, BEAT_NS + 2 * (self._trips.bound_ns(self._others) + self._tick_ns))
+
+    def _turn_ns(self) -> int:
+        """Time by which this member claims later than the first: that one's claim arrives before."""
+        return self._rank * max(_RANK_NS, self._trips.bound_ns(self._others) + self._tick_ns)
+
+    def _ask(self, stamp: Stamp, now_ns: int) -> None:
+        """Notes when a claim or a table is sent first. One that is repeated measures nothing: its answer does not
+        tell which of the two it answers (Karn and Partridge, 1987)."""
+        if stamp in self._asked:
+            self._asked[stamp] = -1
+            return
+        self._asked[stamp] = now_ns
+        if len(self._asked) > _ASKED_KEPT:
+            del self._asked[next(iter(self._asked))]
+
+    def _answered(self, member: str, stamp: Stamp, now_ns: int) -> None:
+        asked_ns = self._asked.get(stamp, -1)
+        if asked_ns >= 0:
+            self._trips.measure(member, now_ns - asked_ns)
+
     # --- what hosts say -------------------------------------------------------------------------------------
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
             # A new plot cannot have another warden; and hosts receive no more from the previous one.
-            led = self.promised and now_ns >= self._led_until_ns + LEASE_NS
-            wait_ns = _START_NS if led else 0
-            self._due_ns = max(self._due_ns, now_ns + wait_ns + self._rank * _RANK_NS)
+            led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
+            start_ns = max(_START_NS, self._trips.bound_ns(self._others) + self._tick_ns)
+            self._due_ns = max(self._due_ns, now_ns + (start_ns if led else 0) + self._turn_ns())
             self._acked_ns = now_ns
         self._wanted_ns = now_ns
         if self.warden is not None:
@@ -166,7 +235,10 @@ class Member:
         return [Save(self.promised, self.stored), self.stored]
 
     def hear_promise(self, member: str, epoch: int, table: Table, now_ns: int) -> None:
-        if epoch == self._claimed and epoch == self.promised and member in self._others:
+        if member not in self._others:
+            return
+        self._answered(member, (epoch, 0), now_ns)
+        if epoch == self._claimed and epoch == self.promised:
             self._promises[member] = table
             self._take_charge(now_ns)
 
@@ -182,6 +254,8 @@ class Member:
             return []
         if stored.epoch == self.warden.epoch:
             self._acked_ns = now_ns
+            if stored.seq and stored.agent == self._plots.warden(self.plot, stored.epoch + 1):  # replies at once
+                self._answered(stored.agent, (stored.epoch, stored.seq), now_ns)
             return self._on_file(self.warden, stored.seq, now_ns)
         if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
@@ -223,7 +297,8 @@ class Member:
         self._promise((max(self.promised, self._claim_above) // members + 1) * members + self._rank)
         self._claimed = self.promised
         self._promises = {self._me: self.stored}
-        self._due_ns = now_ns + LEASE_NS + self._rank * _RANK_NS
+        self._due_ns = now_ns + self._lease_ns + self._turn_ns()
+        self._ask((self._claimed, 0), now_ns)
         actions: list[MemberAction] = [Save(self.promised, self.stored)]
         if self._others:
             actions.append(AskPromises(self.plot, self._claimed, self._others))
@@ -231,7 +306,7 @@ class Member:
         return actions
 
     def _lead(self, warden: Warden, now_ns: int) -> list[MemberAction]:
-        if self._others and now_ns - self._acked_ns > LEASE_NS:
+        if self._others and now_ns - self._acked_ns > self._lease_ns:
             self.warden = None  # no messages arrive in one direction: leave it to the others
             self._led(now_ns, self._me)
             return []
@@ -239,6 +314,7 @@ class Member:
         warden.refused.clear()
         table = warden.tick(now_ns)
         if table is not None:
+            self._ask(table.stamp, now_ns)
             if table is not self.stored:
                 self.stored = table
                 self._told = [*self._told[-_TABLES_KEPT:], table]
@@ -268,5 +344,5 @@ class Member:
 
     def _led(self, now_ns: int, leader: str) -> None:
         self._leader = leader
-        self._led_until_ns = now_ns + LEASE_NS
-        self._due_ns = self._led_until_ns + self._rank * _RANK_NS
+        self._led_until_ns = now_ns + self._lease_ns
+        self._due_ns = self._led_until_ns + self._turn_ns()

@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping
 import msgspec
 from msgspec.structs import replace
 
+from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
@@ -18,7 +19,7 @@ from swarm.right_of_way.holdings import Place, Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
-from vehicle_agent.traffic.member import Member, MemberAction, Refused
+from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
 
 class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,9 +50,11 @@ class RightOfWay:
     saved   and of plots: (promised epoch, stored table)
     place   tells on which of the cells that it was granted a vehicle of a new life stands
     vehicles  of an agent that is not in `spawns`, a guest: it has no seat, and its vehicles enter one by one
+    tick_ns   between two ticks
 
     host      our part as a host of vehicles
     holdings  which cells our vehicles hold: none before `begin`
+    trips     round trips to the other agents
     silent    whether our file cannot be written now: then we are no member of any plot, and note no other agent's
               file. Our vehicles' held and granted cells do not depend on it
 
@@ -67,8 +70,11 @@ class RightOfWay:
         saved: Mapping[int, tuple[int, Table]],
         place: Place = first_of,
         vehicles: Collection[str] = (),
+        tick_ns: int = NS_PER_S // 10,
     ) -> None:
         self.agent = agent
+        self.trips = RoundTrips()
+        self._tick_ns = tick_ns
         self.plots = plots
         if not (saved or own.noted or own.noted_by):  # no vehicle depends on it: it takes any size
             own = replace(own, plot_cells=plots.side)
@@ -228,7 +234,9 @@ class RightOfWay:
         if self.agent not in members or not noted.issuperset(members) or not self._has_quorum:
             return None
         promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
-        made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._spawns, now_ns)
+        made = self._members[plot] = Member(
+            self.plots, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
+        )
         return made
 
     def _at_start(self, plot: int) -> Table:

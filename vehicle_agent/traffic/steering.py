@@ -27,6 +27,8 @@ it."""
 _DIAGONAL = math.sqrt(2.0) - 1.0
 _OCCUPIED = 0.9
 """Cost of pushing another vehicle, in cells: less than a step, so that a vehicle without another path pushes."""
+_LEAST_GAIN = 0.01
+"""Advantage of the route's next cell over staying, at least, in cells."""
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
@@ -79,11 +81,15 @@ class Steering:
             return head in self._out_of(tail)
         if self.closed(head) or not (self._climb is None or self._climb.allows(tail, head)):
             return False
+        return not self._cuts_corner(tail, head)
+
+    def _cuts_corner(self, tail: int, head: int) -> bool:
+        """Returns True if a step to a neighbour is a diagonal that the cells beside it, or the planner, forbid."""
         cols = self._grid.cols
         rows, col = head // cols - tail // cols, head % cols - tail % cols
-        if self._corner_cutting or not rows or not col:
-            return True
-        return not (self.closed(tail + col) or self.closed(tail + rows * cols))
+        if not rows or not col or (self._diagonal and self._corner_cutting):
+            return False
+        return not self._diagonal or self.closed(tail + col) or self.closed(tail + rows * cols)
 
     def passable_steps(self, cells: Sequence[int]) -> int:
         """Returns the number of leading steps of `cells` that the map allows. Bodies count for none: they may be
@@ -159,6 +165,10 @@ class Steering:
                 cost, key=lambda cell: (self._bodies.danger(cell), cell in one_way, cost[cell], hash((lot, cell)))
             )
             return Wish(ahead, wants, len(wants), _OLDEST_MS)
+        if ahead and ahead[0] in cost and ahead[0] not in one_way:
+            # Who stands on its route asks for the next cell, even while another holds it: it would hear a round
+            # trip after others that the cell is free.
+            cost[ahead[0]] = min(cost[ahead[0]], stays - _LEAST_GAIN)
         wants = sorted(cost, key=lambda cell: (cell in one_way, cost[cell], hash((lot, cell))))
         better = sum(cost[cell] < stays and cell not in one_way for cell in wants)
         return Wish(ahead, wants, len(wants) if pushed_ms else better, age_ms)
@@ -244,6 +254,7 @@ class Steering:
             south, east = abs(row - there_row), abs(col - there_col)
             apart = south + _DIAGONAL * east if south > east else east + _DIAGONAL * south
             beside = apart < 2.0 and (self._climb is None or self._climb.allows(cell, there))
+            beside = beside and not self._cuts_corner(cell, there)
             cost = rest + apart if beside else rest + _OFF_ROUTE + 2.0 * apart
             if cost < best:
                 best = cost

@@ -7,6 +7,7 @@ from support.plot_tables import (
     MEMBERS,
     PLOTS,
     S,
+    near_members,
     standing,
     table_of,
 )
@@ -17,7 +18,7 @@ from vehicle_agent.traffic.member import Member, Refused, Save
 
 
 def member_of(promised: int = 0) -> Member:
-    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), {}, 0)
+    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), {}, 0, near_members())
 
 
 def test_after_a_promise_nothing_older_is_stored() -> None:
@@ -33,7 +34,9 @@ def test_after_a_promise_nothing_older_is_stored() -> None:
 
 
 def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_beat() -> None:
-    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0) for n in (2, 0))  # of epoch 1
+    first, second = (
+        Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
+    )  # of epoch 1
     said = first.hear_table(table_of(1, 1), S)
     assert [type(action) for action in said] == [Save, Stored]
     assert [type(action) for action in second.hear_table(table_of(1, 1), S)] == [Save]
@@ -49,7 +52,7 @@ def test_the_second_member_says_what_the_first_has_not_said_and_something_in_eac
 
 def warden_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
     """A member that has just become warden, and the table that it sent, which no member has stored yet."""
-    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0)
+    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
     member.hear_standing(standing("a0", [9], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
@@ -82,7 +85,9 @@ def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_i
 
 
 def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
-    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0) for n in (2, 0))  # of epoch 1
+    first, second = (
+        Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
+    )  # of epoch 1
     same = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=4)
     lags = [Stored(plot=0, agent=MEMBERS[2], epoch=0, seq=0)]
     assert first.hear_stored(same, S) == lags  # it needs the whole table
@@ -133,7 +138,7 @@ def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
 
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
-    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0)
+    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
     member.hear_standing(standing("a0", [9], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)

@@ -105,14 +105,14 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
     assert vehicle.cell == above
 
 
-@given(st.integers(0, 1 << 32), st.sampled_from([0.5, 1.5, 3.0]))
+@given(st.integers(0, 1 << 32), st.sampled_from([0.0, 0.5, 1.5, 3.0]))
 @settings(max_examples=few(60), deadline=None)
 def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, relief_m: float) -> None:
     """Up a steep slope a route winds beside cells of its own that are too steep, or too expensive, to go to at
-    once."""
+    once; on level ground it winds around corners."""
     rng = np.random.default_rng(seed)
-    climb = climb_on(rng.normal(0, relief_m, (8, 8)))
-    pace = np.where(rng.random((8, 8)) < 0.1, np.inf, LEVEL).astype(np.float32)
+    climb = climb_on(rng.normal(0, relief_m, (8, 8))) if relief_m else None
+    pace = np.where(rng.random((8, 8)) < (0.1 if relief_m else 0.4), np.inf, LEVEL).astype(np.float32)
     target, start = rng.choice(np.flatnonzero(np.isfinite(pace)), 2).tolist()
     tree, steering, vehicle = (
         TargetTree(GRID, PlannerConfig(), climb),
@@ -129,7 +129,8 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
     for here, after in pairwise(cells):
         wish = steering.wish(vehicle, [here], 0, 1, (), lambda *_: False, seed)
         assert wish.better > 0
-        assert wish.wants[0] == after == wish.ahead[0]
+        assert wish.ahead[0] == after
+        assert wish.wants[0] == after or climb is None  # there another cell may be as good
         # A vehicle in the way is pushed on, or passed; to stay is no answer.
         assert after in steering.wish(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: wish.better]
         vehicle.route.moved(after)

@@ -1,0 +1,55 @@
+"""Vehicles drive although every message is late: slower, but they are granted cells at any delay to a second."""
+
+from __future__ import annotations
+
+import pytest
+from support.simulated import cells
+
+from launch_scripts.simulation.faults import FaultPlan
+from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import world
+
+
+def drive(delay_ms: float, until_s: float, jitter_ms: float = 0.0) -> tuple[Simulation, LawBook, int]:
+    """Returns the simulation, its laws and the steps of all vehicles from the eighth second on."""
+    scenario, terrain = world("small", 3)
+    simulation = Simulation(scenario, faults=FaultPlan(delay_ms=delay_ms, jitter_ms=jitter_ms), terrain=terrain)
+    laws, entered = LawBook(simulation), 0
+    simulation.run_until(8.0)
+    before = cells(simulation)
+    while simulation.now_s < until_s:
+        simulation.run_until(simulation.now_s + 0.1)
+        after = cells(simulation)
+        entered += sum(before.get(id) != cell for id, cell in after.items())
+        before = after
+    return simulation, laws, entered
+
+
+@pytest.mark.parametrize("delay_ms", [200.0, 600.0, pytest.param(400.0, marks=pytest.mark.thorough)])
+def test_a_swarm_whose_messages_are_all_late_drives_and_says_so(delay_ms: float) -> None:
+    simulation, laws, entered = drive(delay_ms, 28.0)
+    assert entered >= 372 / 10  # without delay they enter 372
+    assert laws.collisions == laws.lethal == []
+    notes = [note for _, note in simulation.recorder.notes if note.kind == "slow_link"]
+    assert notes
+    assert "answer slowly" in notes[0].text
+
+
+def test_with_a_second_each_way_vehicles_still_drive_and_none_meet() -> None:
+    _, laws, entered = drive(1000.0, 40.0)
+    assert entered > 0
+    assert laws.collisions == laws.lethal == []
+
+
+@pytest.mark.thorough
+def test_delays_that_vary_by_as_much_as_they_last_do_not_stop_a_swarm() -> None:
+    _, laws, entered = drive(150.0, 28.0, jitter_ms=450.0)
+    assert entered > 20
+    assert laws.collisions == laws.lethal == []
+
+
+def test_on_a_fast_link_it_is_not_said_that_a_link_is_slow() -> None:
+    simulation, _, entered = drive(50.0, 12.0)
+    assert entered > 0
+    assert not [note for _, note in simulation.recorder.notes if note.kind == "slow_link"]
