@@ -96,7 +96,7 @@ for promised in itertools.count(start + 1):
 
 def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path) -> None:
     chance, acknowledged = Random(3), 0
-    for _ in range(few(25)):
+    for _ in range(few(12)):
         command = [sys.executable, "-c", _PROMISES, str(tmp_path / "promises-a0")]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as agent:
             assert agent.stdout is not None
