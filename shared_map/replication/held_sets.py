@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -192,19 +192,14 @@ class HeldSets:
 
         author  only this author's, as the key of the query says
         """
+        return [each for each in self.asked(request, author) if each is not None]
+
+    def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
+        """The sets of `answer`, and None after those of each tile, found as they are needed."""
         wanted = frozenset(request.authors)
-        return [each for tile in self.asked_tiles(request) for each in self.asked_of(tile, wanted, author)]
-
-    def asked_tiles(self, request: MarksRequest) -> Sequence[int]:
-        """The tiles asked for, in order: all with sets if none is named."""
-        return sorted(set(request.tiles)) if request.tiles else self.tiles
-
-    def asked_of(self, tile: int, wanted: frozenset[str], author: str | None = None) -> list[MarkSet]:
-        """The sets of a tile that are asked for, in order of author.
-
-        wanted  authors that are named; empty for all
-        """
-        if author is None:
-            return [each for each in self.of_tile(tile) if not wanted or each.author in wanted]
-        held = self.get(tile, author)
-        return [] if held is None or (wanted and author not in wanted) else [held]
+        for tile in sorted(set(request.tiles)) if request.tiles else self.tiles:
+            if author is None:
+                yield from (each for each in self.of_tile(tile) if not wanted or each.author in wanted)
+            elif not wanted or author in wanted:
+                yield self.get(tile, author)
+            yield None

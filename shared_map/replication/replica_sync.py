@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 from msgspec.structs import replace
 
@@ -57,10 +56,10 @@ _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _TILES_AT_ONCE = MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
-_ANSWERS_PER_TICK, _SETS_AT_ONCE = 8192, 1024
-"""Sets sent in answers in one tick, some 10 ms, and to one asker before another has its turn."""
+_ANSWERS_PER_TICK, _TURN = 8192, 1024
+"""Sets and tiles looked at for answers in one tick, some 10 ms, and for one asker before another has its turn."""
 _LEAST_COST, _SINGLE_COST = 32, 16
-"""Cost of a question, and of a set that is sent by itself, in sets."""
+"""Cost of a question, and of a set that is sent by itself, in sets that are sent together."""
 _MOST_ANSWERS = 1024
 """Questions for sets that wait: of all agents that start at once."""
 _PART_BYTES = MOST_DIGEST_BYTES - 512
@@ -74,22 +73,6 @@ _MAX_NAMES = 4096
 _WARN_AGAIN_NS = 60 * NS_PER_S
 """An author is named once a minute (docs/design/map-merge-law.md): one that floods must not fill the log as
 well."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Answer:
-    """A question for sets that is being answered.
-
-    wanted  authors that it names; empty for all
-    author  the one whose sets it may get; None for all
-    tiles   those to come
-    """
-
-    asked: Asked
-    bulk: bool
-    wanted: frozenset[str]
-    author: str | None
-    tiles: Iterator[int]
 
 
 class MapSync:
@@ -148,7 +131,8 @@ class MapSync:
         self._changes_due_ns = 0
         self._digest_seq = 0
         # Parts of the whole digest that are not published yet, as `parts_of` gives them.
-        self._answers: deque[_Answer] = deque()
+        # Questions for sets: each with whether sets may come together, and the sets to come.
+        self._answers: deque[tuple[Asked, bool, Iterator[MarkSet | None]]] = deque()
         self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
@@ -360,33 +344,30 @@ class MapSync:
             asked.refuse(f"{MARKS.name}: too many questions wait")
             asked.end()
             return
-        tiles = iter(self.replica.held.asked_tiles(request))
-        self._answers.append(_Answer(asked, request.bulk, frozenset(request.authors), author, tiles))
+        self._answers.append((asked, request.bulk, self.replica.held.asked(request, author)))
         self._answer_some()
 
     def _answer_some(self) -> None:
         """Answers those who ask for sets, by turns, until the work of this tick is done."""
         while self._answers and self._answers_left > 0:
-            answer = self._answers.popleft()
+            asked, bulk, found = self._answers.popleft()
             sets: list[MarkSet] = []
-            looked_at = 0
-            more = False
-            for tile in () if answer.asked.expired else answer.tiles:
-                sets += self.replica.held.asked_of(tile, answer.wanted, answer.author)
-                looked_at += 1
-                more = len(sets) + looked_at // 8 >= _SETS_AT_ONCE
-                if more:
+            cost = _LEAST_COST
+            for each in () if asked.expired else found:
+                if each is not None:
+                    sets.append(each)
+                cost += _SINGLE_COST if each is not None and not bulk else 1
+                if cost >= _TURN:
+                    self._answers.append((asked, bulk, found))
                     break
-            self._answers_left -= _LEAST_COST + looked_at // 8 + len(sets) * (1 if answer.bulk else _SINGLE_COST)
-            for many in packed(sets) if answer.bulk else ():
-                answer.asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
-            for each in () if answer.bulk else sets:
+            self._answers_left -= cost
+            for many in packed(sets) if bulk else ():
+                asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
+            for each in () if bulk else sets:
                 region = region_of(self.replica.grid, each.tile)
-                answer.asked.answer(each, region=region, tile=each.tile, author=each.author)
-            if more:
-                self._answers.append(answer)
-            else:
-                answer.asked.end()
+                asked.answer(each, region=region, tile=each.tile, author=each.author)
+            if cost < _TURN:
+                asked.end()
 
     # --- late join ------------------------------------------------------------------------------------------
 
