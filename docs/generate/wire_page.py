@@ -63,10 +63,8 @@ def _how(topic: Topic) -> str:
     if topic.request is not None:
         several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
         ways.append(f"get with {_link(topic.request)}{several}")
-    if topic.trusted:
-        ways.append("with a code")
-    if topic.trusted_in is not None:
-        ways.append(f"with a code where the key has `{topic.trusted_in}`")
+    if topic.trusted or topic.trusted_in:
+        ways.append("with a code" + (f" where the key has `{topic.trusted_in}`" if topic.trusted_in else ""))
     return "; ".join(ways)
 
 

@@ -107,7 +107,7 @@ class RunFigures:
 
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
-_ROUTE_BYTES = 8_000_000
+_ROUTE_BYTES = 4_000_000
 """Size of all routes that are kept."""
 _OF_ROUTE_BYTES = 400
 """Bytes of the objects that a route consists of, beside its steps; a test counts them."""
