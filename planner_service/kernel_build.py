@@ -41,10 +41,12 @@ from planner_service.kernels import (
     stride_growth,
     stride_network,
 )
-from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
+from planner_service.kernels.compile import BEFORE_LOAD, StepKernel, cache_folder, is_loaded, is_on_disk, load
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes
+from swarm.runtime.first_use import note
 
+BEFORE_LOAD.append(note)
 Kernel = Any
 """Result of `kernels.compile.kernel`; numba has no types."""
 

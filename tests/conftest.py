@@ -13,6 +13,8 @@ import pytest
 from hypothesis import settings
 from support.effort import few, try_all
 
+from swarm.runtime import first_use
+
 TESTS = Path(__file__).parent
 # Processes that a test starts find this checkout and the support modules, whatever their folder.
 os.environ["PYTHONPATH"] = os.pathsep.join((str(TESTS.parent), str(TESTS)))
@@ -37,6 +39,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    first_use.refused = True
     # No deadline: on a busy machine a test is not to fail for taking long.
     if config.getoption("--thorough"):
         try_all()

@@ -1,7 +1,7 @@
 """Decision whether a process hangs, from what its launcher sees of it.
 
 A process is dead if it had the processor and did not tick. On a machine that is far too busy time alone proves
-nothing: a process that compiles or imports there is nearly done when it is killed, and begins anew.
+nothing: a process that compiles or imports there is nearly done when it is killed, and begins again.
 
 The main thread of a process runs its loop. At each look of the launcher, time is added to a sum; at `STILL_S` the
 process hangs. `passed` is the time since the look before, `used` what of it the main thread had a processor for.

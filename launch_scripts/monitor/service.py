@@ -11,6 +11,8 @@ import logging
 from collections.abc import Callable
 from functools import partial
 
+from PIL import Image
+
 from launch_scripts.monitor.ground.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.live_layout import (
@@ -260,6 +262,7 @@ def load_view(
 
     Raises SwarmError where a file or a port cannot be opened
     """
+    Image.preinit()  # loads what writes pictures, or the first frame would wait for it
     scenario, config = setup.scenario, setup.scenario.monitor
     seen = load_terrain(setup)  # mapped once more: of what the mesh has read most is not read again
     load_classes(setup, seen)

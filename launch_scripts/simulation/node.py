@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, cast
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
+from launch_scripts.simulation.world.walks import WAY_MODULES
+from planner_service.kernel_build import needed_kernels
+from planner_service.kernels.compile import load
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
+from shared_map.keeper.zone_orders import ZONE_MODULES
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Bus, Event, Post, Worker
 from swarm.bus.memory_bus import MemoryBus
@@ -24,6 +28,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.recording.recording import Recording
 from swarm.recording.service_boundary import Boundary
+from swarm.runtime.first_use import Modules, in_loop
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED
@@ -55,16 +60,21 @@ def built(
     bus = boundary.bus(outside.bus)
     match setup.role:
         case "keeper":
+            Modules(ZONE_MODULES).wait()
             store = boundary.external(cast(KeeperStore, outside.store), KEEPER_STORE)
-            return KeeperService(setup, terrain, bus, post, store)
+            modules: Callable[[], bool] | None = boundary.function("modules of zones", None, bool)
+            return KeeperService(setup, terrain, bus, post, store, modules)
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
             prepared = boundary.external(outside.prepared, PREPARED_COSTS)
             worker = boundary.worker(outside.worker)
+            for kernel in needed_kernels(setup.scenario):
+                load(kernel)
             return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
         case "targets":
+            Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)
         case "agent":
             promises = boundary.external(cast(PromiseStore, outside.promises), PROMISE_STORE)
@@ -204,7 +214,8 @@ class Node:
         return None
 
     def _work(self, work: Callable[[int], None], now_ns: int, looks: bool) -> None:
-        work(now_ns)
+        with in_loop(None):
+            work(now_ns)
         for look in self._simulation.after_tick if looks else ():
             look(self)
 

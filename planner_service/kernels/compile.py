@@ -46,6 +46,9 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 KERNELS: dict[str, Any] = {}
 """Name -> kernel, of all that Python calls, in the order in which modules were imported."""
 
+BEFORE_LOAD: list[Callable[[str], None]] = []
+"""Called with what is loaded or compiled next, on the thread that waits for it."""
+
 
 class _ReadOnlyLocator(caching.UserProvidedCacheLocator):
     """The folder NUMBA_CACHE_DIR where it is there and cannot be written to, as in an image of a container."""
@@ -235,6 +238,8 @@ def _load(compiled: Any) -> Any:
     """The kernel's code, from disk or compiled."""
     argument_types, _ = sigutils.normalize_signature(compiled.declared)
     if not is_loaded(compiled):
+        for look in BEFORE_LOAD:
+            look(f"kernel {compiled.__name__}")
         compiled.compile(argument_types)
         compiled.disable_compile()
     return compiled.overloads[argument_types].entry_point

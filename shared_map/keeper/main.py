@@ -7,10 +7,12 @@ from pathlib import Path
 
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
+from shared_map.keeper.zone_orders import ZONE_MODULES
 from shared_map.terrain.store import load_terrain
 from swarm.bus.bus import Bus
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
+from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.role import RoleSetup
 
@@ -37,6 +39,7 @@ def run(
         inbox = Inbox()
 
         def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> KeeperService:
-            return KeeperService(setup, terrain, bus, inbox.post, boundary.external(store, KEEPER_STORE))
+            modules = boundary.function("modules of zones", Modules(ZONE_MODULES).there, bool)
+            return KeeperService(setup, terrain, bus, inbox.post, boundary.external(store, KEEPER_STORE), modules)
 
         run_role(setup, terrain.digest, stop_when, make, inbox, TICK_HZ)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import suppress
 
 import msgspec
@@ -61,9 +62,21 @@ class KeeperService:
 
     replica   the marks
     counters  what the process publishes of itself
+    modules   whether what zones are drawn with is loaded; the first call begins that. If not given, it is
     """
 
-    def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, store: KeeperStore) -> None:
+    def __init__(
+        self,
+        setup: RoleSetup,
+        terrain: Terrain,
+        bus: Bus,
+        post: Post,
+        store: KeeperStore,
+        modules: Callable[[], bool] | None = None,
+    ) -> None:
+        self._can_draw = modules or (lambda: True)
+        self._zones_held: list[tuple[Asked, ZoneOrder]] = []
+        """Orders of zones that wait until they can be drawn."""
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters = self._member.counters
         self._bus = bus
@@ -163,6 +176,8 @@ class KeeperService:
             self._sync.on_map_event(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
+        while self._zones_held and self._can_draw():
+            self._order_zone(*self._zones_held.pop(0), now_ns)
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
         if now_ns >= self._compact_due_ns and not self._keeper.waiting:
@@ -235,6 +250,9 @@ class KeeperService:
 
     def _order_zone(self, asked: Asked, order: ZoneOrder, now_ns: int) -> None:
         """Writes the marks of a zone: on the disk first, as an answer promises that they stay."""
+        if order.action == "add" and not self._can_draw():
+            self._zones_held.append((asked, order))
+            return
         sets: list[MarkSet] = []
         if order.action != "list":
             if not order.name:

@@ -46,6 +46,9 @@ MOST_IN_ALL = MAX_MARKS // 8
 _LIMIT = 1 << 62
 """Numbers of sets are below this."""
 
+ZONE_MODULES = ("shapely", "rasterio.warp", "shared_map.importers.georeference")
+"""Modules that the zone of an order is drawn with. They take 0.4 s: a keeper loads them at its first zone."""
+
 
 def zone_sets(
     order: ZoneOrder,
@@ -172,7 +175,7 @@ def _names(replica: MapReplica, now_ns: int) -> str:
 
 def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     """Cells whose middle lies in the zone; why there is no such zone."""
-    import shapely  # a keeper that is given no zone needs none of it
+    import shapely
 
     grid = terrain.grid
     corners = order.polygon

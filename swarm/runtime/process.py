@@ -16,15 +16,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 from zlib import crc32
 
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
+from swarm.runtime.first_use import in_loop
 from swarm.runtime.health import Health
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.job_slots import JobSlots
-from swarm.runtime.stats import CPU_S, ENDED, RSS_BYTES, Counters
+from swarm.runtime.stats import CPU_S, ENDED, FIRST_USES, RSS_BYTES, Counters
+
+if TYPE_CHECKING:
+    import psutil
 
 _OBJECTS = 50_000
 """New containers until a collection. At Python's 700 a message of a few hundred vehicles sets one off by itself; a
@@ -212,14 +216,17 @@ class Process:
             self._run()
 
     def _run(self) -> None:
-        counters = self._service.counters
+        import psutil  # clients import this module, too, and have none
+
+        counters, usage = self._service.counters, psutil.Process()
         counters.count("ticks_dropped", 0)
         counters.count("ticks_late", 0)
+        counters.count(FIRST_USES, 0)
         counters.set_counts(self._inbox.counts)
         self._service.start(self._clock.now_ns())
         try:
-            with collected_rarely():
-                self._loop(counters)
+            with collected_rarely(), in_loop(counters):
+                self._loop(counters, usage)
             counters.gauge(ENDED, 1.0)  # not where an error ends it
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
@@ -236,7 +243,7 @@ class Process:
         self._gather()
         return self._clock.now_ns()
 
-    def _loop(self, counters: Counters) -> None:
+    def _loop(self, counters: Counters, usage: psutil.Process) -> None:
         due_ns = events_until_ns = self._clock.now_ns()
         phase_ns = self._phase_ns
         usage_due_ns = due_ns
@@ -253,9 +260,7 @@ class Process:
                 if now_ns >= usage_due_ns:
                     usage_due_ns = now_ns + NS_PER_S
                     counters.gauge(CPU_S, time.process_time())
-                    import psutil
-
-                    counters.gauge(RSS_BYTES, float(psutil.Process().memory_info().rss))
+                    counters.gauge(RSS_BYTES, float(usage.memory_info().rss))
                 now_ns = self._after_inbox_ns()
                 self._service.tick(now_ns)
                 if self._health is not None:

@@ -42,6 +42,8 @@ RESTARTS = "restarts"
 """Gauge: how often the process was started again in this run."""
 MESSAGES_PER_S = "messages_per_s"
 """Gauge: messages that the process sent per second, over the last second or so."""
+FIRST_USES = "first_uses"
+"""Counter: modules and kernels that were loaded in the loop of a process, which waited for them; must be 0."""
 
 READY = "ready"
 """Gauge: 1 while the process has all that its role needs."""

@@ -5,23 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from launch_scripts.simulation.world.service import TICK_HZ, TargetsService
+from launch_scripts.simulation.world.walks import WAY_MODULES
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
+from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.role import RoleSetup
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Moves all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
+    modules = Modules(WAY_MODULES)
+    modules.there()  # they begin to load
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
 
     def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> TargetsService:
+        modules.wait()
         return TargetsService(setup, terrain, truth, bus, inbox.post)
 
     run_role(setup, terrain.digest, stop_when, make, inbox, TICK_HZ)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 WAY_HALF_CELLS = 96
 """Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
+WAY_MODULES = ("scipy.sparse.csgraph",)
+"""Modules that ways are computed with. They take 0.2 s, for which the start of all other processes would wait."""
 _TURN_SHARE = 1 / 20
 """Chance of a new heading at each step: 20 cells straight on in the mean, so that a walk leaves the place where it
 began."""
@@ -112,7 +114,6 @@ class TrueTerrain:
     def way(self, start: int, chance: random.Random) -> list[int]:
         """Returns the cells (without `start`) of the cheapest path to a random reachable cell in the window around
         `start`, at least `WAY_HALF_CELLS // 3` cells away if there is one. Empty if no cell can be reached."""
-        # Imported here: it takes 0.2 s, for which the start of all other processes would wait.
         from scipy.sparse.csgraph import dijkstra
 
         window = self.grid.around(start, WAY_HALF_CELLS)
