@@ -357,7 +357,7 @@ def test_places_in_reverse_are_told_apart_from_places_elsewhere(tmp_path: Path) 
 
 
 def closed_in(file: str, grid: GridSpec) -> np.ndarray:
-    return np.isinf(painted([ZoneConfig(kind="forbidden", file=file, crs="local")], grid)[0])
+    return np.asarray(np.isinf(painted([ZoneConfig(kind="forbidden", file=file, crs="local")], grid)[0]))
 
 
 def collection_of(geometries: Iterable[Any]) -> str:
