@@ -125,7 +125,7 @@ def _rasterize(
     place = Affine.translation(window.col0, window.row0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        rasterize(pairs, out=out, transform=place, all_touched=everywhere, skip_invalid=True)
+        rasterize(pairs, out=out, transform=place, all_touched=everywhere, skip_invalid=False)
 
 
 def _parts(shape: Any) -> list[Any]:

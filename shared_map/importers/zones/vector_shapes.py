@@ -106,8 +106,7 @@ class Placing:
         if self._reach is None:
             raise TerrainError(f"{what} holds no feature")
         if not self._touched:
-            turned = self._degrees and self._on(_turned(np.array([self._reach])))[0]
-            hint = "are longitude and latitude in reverse?" if turned else "is crs right?"
+            hint = "are x and y in reverse?" if self._reversed(np.array([self._reach]))[0] else "is crs right?"
             raise TerrainError(
                 f"{what} does not touch the terrain: it reaches from {_shown(self._reach)}, the terrain from"
                 f" {_shown(self._box)} in {self.crs}; {hint}"
@@ -119,6 +118,13 @@ class Placing:
         high = (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
         wide = [(bounds[:, 0] <= east + by) & (bounds[:, 2] >= west + by) for by in self._shifts]
         return np.asarray(high & np.any(wide, axis=0))
+
+    def _reversed(self, bounds: Floats64) -> NDArray[np.bool_]:
+        """True for each of (n, 4) bounds that meets the terrain only if x and y change places. A terrain whose x
+        and y are much alike tells nothing."""
+        west, south, east, north = self._box
+        alike = abs(west + east - south - north) < 8 * max(east - west, north - south)
+        return ~self._on(bounds) & self._on(bounds[:, [1, 0, 3, 2]]) & (not alike)
 
     def _check_bounds(self, features: Features, bounds: Floats64) -> None:
         """Raises TerrainError if it is not sure where features lie."""
@@ -133,10 +139,8 @@ class Placing:
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
                 if _jumps(features.shapes[n]):
                     raise _unusable(what, features, n, "an edge of it spans more than 180 degrees: cut it at 180")
-            for n in np.flatnonzero(self._on(_turned(bounds)) & ~self._on(bounds)):
-                raise _unusable(
-                    what, features, n, "it is on the terrain if longitude and latitude change places, else outside"
-                )
+        for n in np.flatnonzero(self._reversed(bounds)) if self._touched or self._on(bounds).any() else ():
+            raise _unusable(what, features, n, "it is on the terrain only if x and y change places")
 
     def place(self, features: Features) -> Shapes:
         """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
@@ -249,11 +253,6 @@ def _degrees_around(crs: Any, lon_deg: float) -> Any:
     import rasterio
 
     return rasterio.CRS.from_proj4(f"+proj=longlat +pm={lon_deg!r} +datum=WGS84 +no_defs")
-
-
-def _turned(bounds: Floats64) -> Floats64:
-    """Bounds with longitude and latitude in reverse."""
-    return bounds[:, [1, 0, 3, 2]]
 
 
 def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:

@@ -221,17 +221,20 @@ class _Worth:
     def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool, bool]]:
         """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge, whether all
         else is closed)."""
-        ways: dict[int, tuple[Way | None, bool, bool]] = {}
+        ways: dict[tuple[int, bool], tuple[Way | None, bool, bool]] = {}
         for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
             id = features.id(n)
-            if n not in ways:
+            key = n, shape.geom_type == "Polygon"
+            if key not in ways:
                 tags = way_classes.unpacked(features.tags(n))
+                if key[1]:  # an area has its own extent
+                    tags = {name: value for name, value in tags.items() if not states_extent(name)}
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
                 inside = self._zone.kind == "keep_in" or (self._closes and tags.get(INCLUSION) == "yes")
-                ways[n] = way, bridge, inside
-            way, bridge, inside = ways[n]
+                ways[key] = way, bridge, inside
+            way, bridge, inside = ways[key]
             if way is not None:
                 if inside and not way.width_m and shape.geom_type != "Polygon":
                     raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")

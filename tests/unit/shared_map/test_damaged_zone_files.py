@@ -7,7 +7,7 @@ import os
 import random
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from shared_map.importers.zones.outlines import outlines_of
 from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
+from swarm.grid import GridSpec
 
 Damage = Callable[[dict[str, Any], random.Random], None]
 
@@ -328,3 +329,37 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
         painted([zone])
     with pytest.raises(TerrainError, match=r"cannot read zone"):
         outlines_of(zone, UTM, 256)
+
+
+def test_places_in_reverse_are_told_apart_from_places_elsewhere(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    file = geojson(path, [feature(AREA), feature(shapely.box(80, 80, 85, 85)), feature(shapely.box(5, 5, 7, 7))])
+    before, text = closed_by(file, "forbidden"), json.loads(path.read_text())
+    reverse(text["features"][2], random.Random(0))
+    path.write_text(json.dumps(text))
+    with pytest.raises(TerrainError, match="feature 2 cannot be used: it is on the terrain only if x and y change"):
+        closed_by(file, "forbidden")
+    for each in text["features"][:2]:
+        reverse(each, random.Random(0))
+    path.write_text(json.dumps(text))
+    with pytest.raises(TerrainError, match=r"does not touch the terrain.*are x and y in reverse"):
+        closed_by(file, "forbidden")
+    alike = GridSpec(40, 50, 10.0, 500.0, 600.0)  # x and y of this one tell nothing
+    squares_ = [
+        [[[x, y], [x + 80, y], [x + 80, y + 90], [x, y + 90], [x, y]]] for x, y in ((510, 300), (-300, 800))
+    ]
+    path.write_text(json.dumps({"type": "MultiPolygon", "coordinates": squares_[:1]}))
+    inside = closed_in(file, alike)
+    path.write_text(collection_of({"type": "Polygon", "coordinates": each} for each in squares_))
+    assert (closed_in(file, alike) == inside).all()
+    assert inside.sum() >= 72
+    assert before.any()
+
+
+def closed_in(file: str, grid: GridSpec) -> np.ndarray:
+    return np.asarray(np.isinf(painted([ZoneConfig(kind="forbidden", file=file, crs="local")], grid)[0]))
+
+
+def collection_of(geometries: Iterable[Any]) -> str:
+    features = [{"type": "Feature", "properties": {}, "geometry": each} for each in geometries]
+    return json.dumps({"type": "FeatureCollection", "features": features})
