@@ -16,6 +16,7 @@ from shared_map.learning.measurements import Measurement, columns_of, measuremen
 from shared_map.replication.marks import Statements, fault, is_zone, mark_set, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile, grid_cells, tile_cells, tile_corners
+from swarm.config.explain import explain, located
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
@@ -126,6 +127,11 @@ def from_json(text: str | bytes) -> ExportedMap:
     """Reads an export. Raises StoreError with the place of the fault."""
     try:
         read = msgspec.json.decode(text, type=_Export)
+    except msgspec.ValidationError as error:
+        reason = explain(str(error), msgspec.json.decode(text), _Export, "file")
+        if reason.endswith("something else"):
+            reason = f"{reason.partition(':')[0]}: {located(str(error))[0]}"
+        raise StoreError(f"not an exported map: {reason}") from error
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"not an exported map: file: {error}") from error
     sets = []

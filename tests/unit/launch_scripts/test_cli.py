@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import socket
 import subprocess
@@ -9,14 +10,25 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.command import Swarm
+from support.makers import run_info
 
 from launch_scripts import ports
+from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.launcher import options
+from launch_scripts.observe.run_observer import frame_of_members
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario, TlsConfig
-from swarm.errors import BusError
+from swarm.errors import BusError, TerrainError
+from swarm.grid import GridSpec
+from swarm.places import cell_of
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import CostReply, RouteReply
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 
 def test_the_version_is_the_packages(swarm: Swarm) -> None:
@@ -95,3 +107,104 @@ def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(swarm: Swarm,
     assert report["run_id"] == last.resolve().name
     again = load_scenario(last / "scenario.toml")
     assert (again.name, again.seed, again.seconds) == ("synthetic", 9, 2.0)
+
+
+# --- `swarm route --target` ---------------------------------------------------------------------------------------
+
+GRID = GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+FRAME = MapFrame(GRID)
+START = GRID.cell(10, 10)
+
+
+def answer(status: RouteStatus = RouteStatus.OK, target: int | None = START - 80 * 2 + 3) -> Answer:
+    """A route of two steps to the north-east and one to the east, or none."""
+    found = {"directions": bytes([1, 1, 2]), "cost_s": 30.0, "lower_bound_s": 29.0, "length_m": 76.57}
+    route = Route(status=status, start=START, **(found if status is RouteStatus.OK else {}))
+    reply = RouteReply(
+        target="t3", incarnation=1, target_cell=target, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
+        routes=RouteBatch.of([route]).columns(),
+    )  # fmt: skip
+    return Answer(reply, FRAME, START, 2.0)
+
+
+def test_an_answer_names_its_places_so_that_they_can_be_given_again(capsys: pytest.CaptureFixture[str]) -> None:
+    show(answer())
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first.startswith("from cell:10,10 (xy:500210,5199790, latlon:46.9")
+    assert second.startswith("to t3 at cell:8,13 (xy:500270,5199830, latlon:46.9")
+    assert "30.0 s, proven within 3.45 % of the best" in second
+    for line, cell in ((first, START), (second, GRID.cell(8, 13))):
+        assert cell_of(line.partition("latlon:")[2].partition(")")[0], FRAME, "--from") == cell
+    show(answer(RouteStatus.LETHAL_START))
+    assert "the cell is lethal" in capsys.readouterr().out
+    cost = CostReply(
+        target="t3", incarnation=1, target_cell=START, map_version=0, tree_age_ms=1.0,
+        cost_to_go_s=pack_column([12.5], "<f4"),
+    )  # fmt: skip
+    show(Answer(cost, FRAME, START, 1.0))
+    assert "to t3 at cell:10,10 (" in capsys.readouterr().out
+
+
+def test_programs_get_the_way_in_metres_and_degrees(tmp_path: Path) -> None:
+    told = json.loads(as_json(answer()))
+    assert (told["crs"], told["to"]["row"], told["to"]["col"]) == ("EPSG:32632", 8, 13)
+    assert told["path"]["x"] == [500_210, 500_230, 500_250, 500_270]
+    assert told["path"]["y"] == [5_199_790, 5_199_810, 5_199_830, 5_199_830]
+    degrees = FRAME.to_degrees(told["path"]["x"], told["path"]["y"])
+    assert np.array([told["path"]["lat"], told["path"]["lon"]]) == pytest.approx(degrees, abs=1e-8)
+    assert "path" not in json.loads(as_json(answer(RouteStatus.UNREACHABLE, None)))
+    write(answer(), tmp_path / "way.csv")
+    with (tmp_path / "way.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["row"], row["col"]) for row in rows] == [("10", "10"), ("9", "11"), ("8", "12"), ("8", "13")]
+    assert rows[-1]["at_m"] == "76.57"
+    assert "height_m" not in rows[0]
+    with pytest.raises(TerrainError, match="there is no route"):
+        write(answer(RouteStatus.UNREACHABLE), tmp_path / "none.csv")
+
+
+def test_of_a_search_the_place_to_look_at_is_told_and_where_the_target_was_last(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole, cut = (
+        Route(
+            status=RouteStatus.SEARCHING,
+            start=START,
+            directions=bytes([1, 1, 2]),
+            cost_s=30.0,
+            length_m=76.57,
+            remaining_s=rest_s,
+        )
+        for rest_s in (0.0, 12.0)
+    )
+    seen = GRID.cell(50, 70)
+
+    def told(route: Route) -> Answer:
+        reply = RouteReply(
+            target="t3", incarnation=1, target_cell=seen, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
+            routes=RouteBatch.of([route]).columns(),
+        )  # fmt: skip
+        return Answer(reply, FRAME, START, 2.0)
+
+    fields = json.loads(as_json(told(whole)))
+    assert fields["searching"] is True
+    assert (fields["to"]["row"], fields["to"]["col"]) == (8, 13)
+    assert (fields["last_seen"]["row"], fields["last_seen"]["col"]) == (50, 70)
+    assert json.loads(as_json(told(cut)))["to"] is None, "the end of a part is not the place"
+    known = json.loads(as_json(answer()))
+    assert (known["searching"], "last_seen" in known) == (False, False)
+    for route, place in ((whole, "cell:8,13"), (cut, "where this leads")):
+        show(told(route))
+        assert f"t3 is unseen; {place}" in capsys.readouterr().out
+
+
+def test_the_frame_is_that_of_most_processes() -> None:
+    def info(id: str, crs: str, rows: int = 60) -> RunInfo:
+        return run_info(GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, crs), id=id, rows=rows)
+
+    frame = frame_of_members(
+        [info("a", "local"), info("b", "EPSG:32632"), info("c", "EPSG:32632"), info("d", "x", 0)]
+    )
+    assert frame is not None
+    assert frame.grid == GRID
+    assert frame_of_members([info("d", "x", 0)]) is None

@@ -61,20 +61,6 @@ def test_a_swarm_that_no_number_of_machines_carries_is_refused_with_what_is_full
         fewest_machines(Estimate(swarm(10_000, 100)), Machine(4, 64, 10))
 
 
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (["--map", "0"], "--map is 0, expected 4000 to 268435456 cells for 1000 vehicles"),
-        (["--vehicles", "100", "--map", "100"], "--map is 100, expected 1024 to"),
-        (["--vehicles", "100", "--map", "300000000"], "--map is 300000000, expected 1024 to"),
-    ],
-)
-def test_an_option_that_cannot_be_is_named(options: list[str], complaint: str) -> None:
-    ran = CliRunner().invoke(app, ["size", *options])
-    assert isinstance(ran.exception, ConfigError), ran.output
-    assert complaint in str(ran.exception)
-
-
 def test_a_small_swarm_fits_one_machine_and_a_full_process_is_named() -> None:
     ran = CliRunner().invoke(app, ["size", "--vehicles", "100", "--targets", "4", "--json"])
     assert ran.exit_code == 0, ran.output

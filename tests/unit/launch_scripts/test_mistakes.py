@@ -174,6 +174,8 @@ def test_a_mistake_is_answered_with_what_to_do(
         for name, begin in (("TINY", TINY), ("LAKE", LAKE), ("RING", RING)):
             text = text.replace(name, begin)
         (place / "s.toml").write_text(text)
+    for name, text in mistake.get("files", {}).items():
+        (place / name).write_text(text, encoding="utf-8")
     given = GIVEN[mistake["given"]](place, request) if "given" in mistake else {}
     line = mistake.get("do", "check s.toml")
     for word, value in given.items():

@@ -54,20 +54,6 @@ def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:
     assert [spec.name for spec in chosen] == names
 
 
-@pytest.mark.parametrize(
-    ("word", "answer"),
-    [
-        ("planner.t9", "no planner 't9' in scenario x; it has t"),
-        ("agnet.a0", "did you mean 'agent'"),
-        ("keeper.a/b", "--only 'a/b' is not 1 to 64 of letters"),
-    ],
-)
-def test_a_process_that_there_is_not_is_refused_in_a_sentence(word: str, answer: str) -> None:
-    with pytest.raises(ConfigError) as raised:
-        chosen_processes(Scenario(name="x"), [word], None)
-    assert answer in str(raised.value)
-
-
 def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
     assert "targets-0" in [spec.name for spec in processes_of(scenario)]

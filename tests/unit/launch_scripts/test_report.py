@@ -1,11 +1,13 @@
-"""The results of a run: the numbers and the picture."""
+"""The results of a run: its folder, its numbers, which add up, and its picture."""
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -13,14 +15,21 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 from support import fake_run
 
+from launch_scripts.launcher.options import SCENARIOS, find_scenario
 from launch_scripts.observe.fact_table import verdict
+from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
+from launch_scripts.observe.run_results import Driven
 from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
-from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.report.write_report import TABLES, make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.clock import NS_PER_S
+from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.errors import StoreError
+from swarm.config.write import scenario_text
+from swarm.errors import ConfigError, StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
@@ -105,3 +114,217 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenari
     for path in (Path("/dev/full"), Path("/sys/notes")):  # ENOSPC, EACCES
         with pytest.raises(StoreError, match=rf"cannot write {path}: (No space|Permission)"):
             write_file(path, b"1")
+
+
+# --- the folder of a run ------------------------------------------------------------------------------------------
+
+F, W = VehicleState.FOLLOWING, VehicleState.WAITING
+
+ODD = """
+name = "odd"
+plugin_folder = "plug ins"
+[terrain]
+source = "dem.tif"
+cover_codes = "corine"
+cover_classes = { "12" = "forest", "40000" = 3, "5" = "lethal" }
+[[terrain.hidden.zones]]
+kind = "road"
+file = "a \\"b\\" \\u007f\\t\\\\.geojson"
+classes = { "way of 'mud'" = { width_m = 3, factor = "ignored" } }
+[cost]
+preset = "tracked"
+class_factor = { rock = 9.5 }
+[[cost.layers]]
+layer = "mine:Layer"
+options = { deep = [[1, 2.5], { "a b" = true, at = 2026-01-02T03:04:05Z }], huge = 1e300, tiny = 5e-324 }
+[[cost.zones]]
+kind = "forbidden"
+polygon = ["46.81,9.85", "xy:1,2", "cell:4,2"]
+[[targets]]
+name = "t"
+start = [3, 4]
+tracker = "sighted"
+walk_options = { inner = { twice = 2 }, none = {} }
+[[targets]]
+name = "u"
+start = "46.81,9.85"
+[[groups]]
+name = "g.1"
+targets = ["u"]
+cells = [[1, 2], "cell:3,4"]
+[network]
+tls = { ca = "ca.pem", certificate = ".", key = "/keys" }
+admit = ["router.north"]
+"""
+
+
+@pytest.mark.parametrize("name", [*sorted(path.stem for path in SCENARIOS.glob("*.toml")), "odd", "presets"])
+def test_a_scenario_that_was_written_is_read_as_the_same_from_any_folder(name: str, tmp_path: Path) -> None:
+    if name == "odd":
+        scenario = parse_scenario(ODD, base=tmp_path / "elsewhere")
+    elif name == "presets":
+        scenario = parse_scenario('[cost]\npreset = "hiker"\nslope_rule = "linear"', base=tmp_path)
+    else:
+        scenario = find_scenario(name)
+    written = tmp_path / "run" / "scenario.toml"
+    written.parent.mkdir()
+    written.write_text(scenario_text(scenario, tmp_path))
+    assert load_scenario(written) == scenario
+    assert scenario_text(load_scenario(written), Path("/nowhere")) == scenario_text(scenario, tmp_path)
+
+
+def test_every_setting_that_has_a_value_is_written(tmp_path: Path) -> None:
+    written = scenario_text(Scenario(), tmp_path)
+
+    def keys(struct: msgspec.Struct) -> set[str]:
+        values = {each.encode_name: getattr(struct, each.name) for each in msgspec.structs.fields(struct)}
+        inner = [value for value in values.values() if isinstance(value, msgspec.Struct)]
+        inner += [each for value in values.values() if isinstance(value, tuple) for each in value]
+        own = {key for key, value in values.items() if value is not None}
+        return own.union(*(keys(each) for each in inner if isinstance(each, msgspec.Struct)))
+
+    assert [key for key in sorted(keys(Scenario())) if key not in written] == []
+
+
+def test_a_relative_path_of_a_scenario_leads_to_the_same_file_when_written(tmp_path: Path) -> None:
+    scenario = parse_scenario('[terrain]\nsource = "dem.tif"')
+    folder = tmp_path / "runs" / "r1"
+    folder.mkdir(parents=True)
+    begin_run(folder, scenario, "r1")
+    assert load_scenario(folder / "scenario.toml").terrain.source == str(Path.cwd() / "dem.tif")
+    facts = json.loads((folder / "run.json").read_text())
+    assert facts["versions"]["numpy"] == np.__version__
+    assert (facts["run_id"], facts["seed"]) == ("r1", 1)
+    with pytest.raises(ConfigError, match="has not ended yet"):
+        read_report(folder)
+    begin_run(folder, scenario, "r1", recorded=False)
+    with pytest.raises(ConfigError, match="the launcher of another machine records the run"):
+        read_report(folder)
+
+
+# --- which run was last -------------------------------------------------------------------------------------------
+
+
+def test_last_is_the_run_that_began_last(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        assert point_last(tmp_path / name) is None
+        assert (tmp_path / "LAST").resolve() == tmp_path / name
+        assert find_run("LAST", tmp_path).resolve() == tmp_path / name
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["LAST", "first", "second"]
+
+
+def test_where_no_links_can_be_made_last_is_a_file_and_that_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object, **options: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    said = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        said.append(point_last(tmp_path / name))
+        assert find_run("LAST", tmp_path) == tmp_path / name
+        assert find_run(str(tmp_path / "LAST"), Path("nowhere")) == tmp_path / name
+    assert "LAST is a file" in str(said[0])
+    assert said[1] is None
+
+
+def test_a_folder_called_last_is_left_alone_and_said(tmp_path: Path) -> None:
+    (tmp_path / "LAST").mkdir()
+    (tmp_path / "r").mkdir()
+    assert "still means another run" in str(point_last(tmp_path / "r"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["LAST", "r"]
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400])
+def test_a_number_that_no_report_has_is_damage(number: str, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(f'{{"seconds": {number}}}')
+    with pytest.raises(StoreError, match=r"report\.json is damaged"):
+        read_report(tmp_path)
+
+
+@pytest.mark.parametrize("facts", ["5", "[1]", "[" * 100_000, "no JSON"])
+def test_a_damaged_file_of_a_run_does_not_keep_it_from_its_report(facts: str, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(facts)
+    assert ended(tmp_path) == {}
+
+
+# --- results ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def left(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recorder]:
+    folder = tmp_path_factory.mktemp("run")
+    scenario = parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 6.0\n[[targets]]\nname = "t"\ncount = 2\ntracker = "sighted"\n'
+        '[[groups]]\nname = "north"\nvehicles = 6\n[[groups]]\nname = "south"\nvehicles = 3\n'
+        "[vehicles]\nper_agent = 3\n"
+    )
+    begin_run(folder, scenario, "r1")
+    terrain = terrain_of_pace(np.full((24, 32), 0.1, np.float32), 25.0)
+    recorder = fake_run.played(terrain, terrain.pace_s_per_m, scenario)
+    write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain)
+    return folder, recorder
+
+
+def test_results_per_target_group_and_vehicle_add_up_to_those_of_the_run(left: tuple[Path, Recorder]) -> None:
+    folder, recorder = left
+    report = json.loads((folder / "report.json").read_text())
+    proven = recorder.observed.histogram("followed_gap_excess").count
+    assert report["captures"] == len(recorder.captures) > 0
+    assert proven > 0
+    for section in TABLES:
+        rows = report[section].values()
+        assert sum(row["captures"] for row in rows) == report["captures"], section
+        assert sum(row["routes"] for row in rows) == proven, section
+        assert (
+            max(row["certified_gap"]["max"] for row in rows if row["routes"]) == report["certified_gap"]["max"]
+        ), section
+    vehicles = report["by_vehicle"]
+    for name, group in report["by_group"].items():
+        own = [row for row in vehicles.values() if row["group"] == name]
+        assert group["vehicles"] == len(own)
+        assert group["distance_m"] == pytest.approx(sum(row["distance_m"] for row in own), rel=1e-4)
+    assert {name: group["vehicles"] for name, group in report["by_group"].items()} == {"north": 6, "south": 3}
+    assert report["made"]["began"] <= report["made"]["ended"]
+    summary = recorder.summary(recorder.observed.last_ns or 0)
+    assert {line.id: line.captures for line in summary.targets} == {
+        id: row["captures"] for id, row in report["by_target"].items()
+    }
+    assert summary.certified_gap.mean == pytest.approx(report["certified_gap"]["mean"], rel=1e-5)
+
+
+def test_the_tables_are_those_of_the_report(left: tuple[Path, Recorder]) -> None:
+    folder, _ = left
+    report = json.loads((folder / "report.json").read_text())
+    for section, (file, what) in TABLES.items():
+        rows = list(csv.DictReader((folder / file).read_text().splitlines()))
+        assert [row[what] for row in rows] == list(report[section])
+        for row in rows:
+            told = report[section][row[what]]
+            assert int(row["captures"]) == told["captures"]
+            assert row["certified_gap_p95"] == ("" if told["routes"] == 0 else str(told["certified_gap"]["p95"]))
+
+
+def columns(ids: list[str], places: list[float], states: list[VehicleState]) -> VehicleColumns:
+    east_m = np.array(places, np.float32)
+    none: NDArray[np.int64] = np.full(len(ids), -1, np.int64)
+    return VehicleColumns(ids, east_m, np.zeros_like(east_m), np.array(states, np.uint8), none, [])
+
+
+def test_distance_and_waiting_are_those_of_each_vehicle_also_of_one_that_comes_later_or_leaves() -> None:
+    driven = Driven()
+    samples = [
+        (["b"], [0.0], [W]),
+        (["a", "b"], [7.0, 0.0], [F, W]),
+        (["a", "b"], [7.0, 3.0], [F, F]),
+        (["a"], [17.0], [F]),
+        (["a", "b"], [17.0, 5.0], [W, F]),
+    ]
+    for second, (ids, places, states) in enumerate(samples):
+        driven.add(2 * second * NS_PER_S, columns(ids, places, states), lambda: {"a": "g"})
+    told = dict(zip(driven.ids, driven.totals.T.tolist(), strict=True))
+    assert told == {"a": [10.0, 2.0, 2.0], "b": [5.0, 2.0, 0.0]}
+    assert driven.groups == {"a": "g", "b": ""}

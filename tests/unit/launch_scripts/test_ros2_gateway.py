@@ -408,42 +408,6 @@ def test_a_peer_that_will_never_hear_us_is_named_once(changes: dict[str, Any], s
 # --- settings ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ('forward = ["mpa"]', "settings: forward: no topic 'mpa' in the table; did you mean 'map'?"),
-        (
-            '[topics.odom]\ntopic = "/x"',
-            "topics.odom.topic is '/x', expected a topic such as /a/b",
-        ),
-        (
-            '[topics.odom]\ntopic = "/{vehicle}/o d"',
-            "topics.odom.topic is '/{vehicle}/o d', expected a topic such as /a/b",
-        ),
-        ('[topics.poses]\ntopic = "/targets"', "two topics are called /targets"),
-        ("[topics.odom]\nhz = 200", "topics.odom.hz: found 200"),
-        ("[topics.map]\nhz = 2", "topics.map.hz: map is put when something changes"),
-        ('[ros]\nendpoint = "tcp/10.0.0.1:7447"', "leaves this machine in the clear"),
-        ('[ros]\nendpoint = "udp/x:1"', "is not an endpoint"),
-        ('[ros]\ndistribution = "foxy"', "ros.distribution: found 'foxy'"),
-        ("[ros]\ndomain = 233", "ros.domain: found 233"),
-        ('[frames]\nmap = "{vehicle}"', "frames.map: found"),
-        ("[rso]\ndomain = 3", "rso"),
-        ('[frames]\nmap = "terrain"', "frames.map is 'terrain', which is the frame of the terrain's coordinates"),
-        ('[frames]\nmap = "map/"', "frames.map: found 'map/'"),
-        ('[[incoming.robots]]\nframe = "{x}/odom"', "incoming.robots[0].frame: found '{x}/odom'"),
-        ("ros = 3", "ros: found 3"),
-    ],
-)
-def test_a_mistake_in_the_settings_is_one_sentence_that_names_the_key(text: str, says: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        parse_settings(text)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match="settings with options: "):
-        parse_settings(text, options={"ros.node": "gateway"})
-
-
 def test_ros_nodes_beyond_this_machine_need_a_word() -> None:
     text = '[ros]\nendpoint = "tcp/10.0.0.1:7447"\nin_the_clear = true'
     assert parse_settings(text).ros.endpoint == "tcp/10.0.0.1:7447"
@@ -458,3 +422,5 @@ def test_options_change_what_they_name_and_nothing_else(text: str, tmp_path: Pat
     before, after = parse_settings(text), load_settings(file, said)
     assert after == replace(before, ros=replace(before.ros, domain=3))
     assert load_settings(file, dict.fromkeys(said)) == before
+    with pytest.raises(ConfigError, match="settings with options: "):
+        parse_settings("rso = 3", options={"ros.node": "gateway"})

@@ -20,11 +20,7 @@ from support.ros_messages import path
 from support.ros_node import FakeNode
 
 from launch_scripts.gateways.ros2.gateway_settings import (
-    GridSettings,
-    IncomingSettings,
     Robots,
-    ZoneSettings,
-    check_incoming,
 )
 from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import (
@@ -314,43 +310,6 @@ def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
 
 
 # --- settings --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        (IncomingSettings(robots=(Robots(topic="/odom"),)), "expected {robot} in it, or an id"),
-        (IncomingSettings(robots=(Robots(id="a"),)), "expected {robot} in it, or an id and none in it"),
-        (
-            IncomingSettings(robots=(Robots(plan="/plan"),)),
-            "plan is '/plan', expected a topic such as /a/b, of letters, digits and _, with {robot} once",
-        ),
-        (IncomingSettings(targets=("fox",), goal_targets=("fox",)), "'fox' is there twice"),
-        (IncomingSettings(robots=(Robots(), Robots())), "topics: '/{robot}/odom' is there twice"),
-        (
-            IncomingSettings(zones=(ZoneSettings(name="z", topic="/a"), ZoneSettings(name="z", topic="/b"))),
-            "zones: 'z' is there twice",
-        ),
-        (
-            IncomingSettings(
-                robots=(Robots(id="r", topic="/r/odom"),), grids=(GridSettings(name="r", topic="/seen"),)
-            ),
-            "robots and grids: 'r' is there twice",
-        ),
-        (IncomingSettings(targets=("a-b", "a_b")), "'/targets/a_b/set_pose' is there twice"),
-        (IncomingSettings(robots=(Robots(plan="/{robot}/odom"),)), "expected three topics"),
-        (IncomingSettings(robots=(Robots(topic="/{robot}//odom"),)), "topic is '/{robot}//odom', expected a topic"),
-        *(
-            (IncomingSettings(zones=(ZoneSettings(name="z", topic=topic),)), f"zones[0].topic is {topic!r}")
-            for topic in ("/a//b", "/a/", "//", "/1a", "a", "/{x}", "/{robot}", "/a*", "/a b")
-        ),
-    ],
-)
-def test_settings_that_contradict_themselves_get_a_sentence(settings: IncomingSettings, says: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        check_incoming(settings, "ros2.toml")
-    assert str(error.value).startswith("ros2.toml: ")
-    assert says in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,37 @@
-"""`report.html`: the page that a run leaves; and the comparison of runs."""
+"""The page of a run and its recording for Foxglove."""
 
 from __future__ import annotations
 
+import dataclasses
 import html.parser
+import itertools
 import json
+import math
 import re
 import shutil
+import sys
+from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from support.command import Swarm
-from support.fake_run import leave, little_scenario, played
+from support.fake_run import BEGAN_NS, leave, little_scenario, played
 
+from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.report.mcap_export import export_mcap, frame_names, instants_of
+from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
+from swarm.grid import GridSpec
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.processes import Note
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
@@ -135,3 +151,233 @@ def test_a_comparison_says_first_what_makes_runs_unlike(run: Path, tmp_path: Pat
     code, told, _ = swarm("runs compare r1 r2 --runs", tmp_path)
     assert (code, "\x1b" in told) == (0, False)
     assert json.loads(swarm("runs compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []
+
+
+# --- `swarm runs export --format mcap` ----------------------------------------------------------------------------
+
+GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+TOPICS = {"/map", "/marks", "/rosout", "/swarm/markers", "/swarm/poses", "/targets", "/tf", "/tf_static"}
+
+
+@pytest.fixture(scope="module")
+def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that a recorded run leaves."""
+    folder = tmp_path_factory.mktemp("runs") / "r1"
+    scenario = little_scenario(20.0, vehicles=4)
+    pace = np.full((48, 64), 0.1, np.float32)
+    pace[:10, :10], pace[30:, 20:40], pace[40:, 60:] = 0.2, 0.4, np.inf
+    terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
+    truth = np.array(pace)
+    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
+    recorder = played(terrain, truth, scenario)
+    note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
+    recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
+    leave(folder, recorder, terrain, truth)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracks(recorded_run: Path) -> RunTracks:
+    return read_tracks(recorded_run / TRACKS_FILE)
+
+
+@pytest.fixture(scope="module")
+def recording(recorded_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    export_mcap(recorded_run, out, force=False)
+    return out / "r1.mcap"
+
+
+@pytest.fixture(scope="module")
+def heard(recording: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Topic -> (time, message), as mcap and mcap-ros2-support read them by the definitions in the file."""
+    topics = defaultdict(list)
+    with recording.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
+            topics[channel.topic].append((message.log_time, decoded))
+    return topics
+
+
+def in_map(xy_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[tuple[float, float]]:
+    return [RosMap(GRID).to_ros(x, y) for x, y in xy_m.tolist()]
+
+
+# --- values -------------------------------------------------------------------------------------------------------
+
+
+def test_every_vehicle_is_at_every_time_where_its_track_says(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    expected = {
+        (f"{ros_name(each.id)}/base_link", int(time_ns)): place
+        for each in tracks.vehicles
+        for time_ns, place in zip(each.time_ns, in_map(each.xy_m), strict=True)
+    }
+    found, turned = {}, defaultdict(list)
+    for time_ns, told in heard["/tf"]:
+        for each in told.transforms:
+            assert each.header.stamp.sec * NS_PER_S + each.header.stamp.nanosec == time_ns
+            assert each.header.frame_id == each.child_frame_id.replace("base_link", "odom")
+            place = each.transform.translation
+            found[each.child_frame_id, time_ns] = (place.x, place.y)
+            turned[each.child_frame_id].append((place, each.transform.rotation))
+    assert found == expected
+    for places in turned.values():
+        for (here, rotation), (there, _) in itertools.pairwise(places):
+            step = there.x - here.x, there.y - here.y
+            if any(step):
+                yaw = 2 * math.atan2(rotation.z, rotation.w)
+                assert (math.cos(yaw), math.sin(yaw)) == pytest.approx(np.array(step) / math.hypot(*step))
+    for (time_ns, told), (_, poses) in zip(heard["/tf"], heard["/swarm/poses"], strict=True):
+        assert poses.header.frame_id == "map"
+        at = [(each.position.x, each.position.y) for each in poses.poses]
+        assert at == [found[each.child_frame_id, time_ns] for each in told.transforms]
+
+
+def test_every_frame_hangs_on_the_terrain(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
+    ((time_ns, still),) = heard["/tf_static"]
+    assert time_ns == min(times[0][0] for times in heard.values())
+    parents = {each.child_frame_id: each.header.frame_id for each in still.transforms}
+    for _, told in heard["/tf"]:
+        parents |= {each.child_frame_id: each.header.frame_id for each in told.transforms}
+    origin = still.transforms[0].transform.translation
+    assert (parents["map"], origin.x, origin.y) == ("terrain", 500_000, 5_200_000 - 48 * 25)
+    for each in tracks.vehicles:
+        assert parents[parents[f"{ros_name(each.id)}/base_link"]] == "map"
+
+
+def test_marks_are_in_the_last_grid_as_they_were_at_the_end(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    grids = [np.array(told.data, np.int8) for _, told in heard["/marks"]]
+    assert len(grids) > 1
+    for before, after in itertools.pairwise(grids):
+        assert (after[before >= 0] == before[before >= 0]).all()
+        assert (after >= 0).sum() > (before >= 0).sum()
+    last = grids[-1].reshape(48, 64)[::-1].reshape(-1)
+    marked = tracks.marks.kinds != MarkKind.CLEAR
+    assert set(np.flatnonzero(last >= 0).tolist()) == set(tracks.marks.cells[marked].tolist())
+    lethal = tracks.marks.cells[tracks.marks.kinds == MarkKind.LETHAL]
+    assert (last[lethal] == 100).all()
+    paced = tracks.marks.kinds == MarkKind.PACE
+    lost = 100 * (1 - 0.1 / tracks.marks.paces[paced])
+    assert np.abs(last[tracks.marks.cells[paced]] - lost).max() <= 0.51
+
+
+def test_markers_show_the_route_that_each_vehicle_has_begun_last(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    assert len(tracks.routes) > len(tracks.vehicles)
+    for now_ns, told in heard["/swarm/markers"]:
+        newest = {route.vehicle: route for route in tracks.routes if route.time_ns <= now_ns}
+        shown = [each for each in told.markers if each.ns == "routes" and each.action == 0]
+        ends = {((p := each.points)[0].x, p[0].y, p[-1].x, p[-1].y) for each in shown}
+        wanted = set()
+        for route in newest.values():
+            if len(route.cells) > 1:
+                first, last = (RosMap(GRID).to_ros(*GRID.centre_m(int(route.cells[n]))) for n in (0, -1))
+                wanted.add((*first, *last))
+        assert ends == wanted
+        captured = {each.id for each in tracks.captures if now_ns - 5 * NS_PER_S < each.time_ns[0] <= now_ns}
+        assert len([each for each in told.markers if each.ns == "captures" and each.action == 0]) == len(captured)
+
+
+def test_the_log_has_every_note_alarm_and_capture(
+    heard: dict[str, list[tuple[int, Any]]], recorded_run: Path, tracks: RunTracks
+) -> None:
+    report = json.loads((recorded_run / "report.json").read_text())
+    lines = [(time_ns, told.name, told.msg, told.level) for time_ns, told in heard["/rosout"]]
+    for note in report["notes"]:
+        at_ns = BEGAN_NS + note["t_s"] * NS_PER_S
+        assert any(
+            abs(time_ns - at_ns) < 1e6 and (name, text, level) == (note["from"], note["text"], 20)
+            for time_ns, name, text, level in lines
+        )
+    captured = [time_ns for time_ns, _, text, _ in lines if "captured" in text]
+    assert len(captured) == len(tracks.captures) > 0
+    assert np.abs(np.array(captured) - [each.time_ns[0] for each in tracks.captures]).max() < 2e6
+    for alarm in report["alarms"]:
+        assert any(alarm["text"] in text and level >= 30 for *_, text, level in lines) or alarm["since_s"] is None
+
+
+# --- the file -----------------------------------------------------------------------------------------------------
+
+
+def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(recording: Path) -> None:
+    with recording.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert {each.topic for each in summary.channels.values()} == TOPICS
+        assert {each.message_encoding for each in summary.channels.values()} == {"cdr"}
+        assert {each.encoding for each in summary.schemas.values()} == {"ros2msg"}
+        assert {each.compression for each in summary.chunk_indexes} == {"zstd"}
+        (about,) = reader.iter_metadata()
+        assert (about.metadata["run"], about.metadata["crs"]) == ("r1", "EPSG:32632")
+        times = [message.log_time for *_, message in reader.iter_messages(log_time_order=False)]
+        assert times == sorted(times)
+        assert len(times) == summary.statistics.message_count
+
+
+def test_an_older_run_has_no_map_and_says_so(recorded_run: Path, tmp_path: Path, swarm: Swarm) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    shutil.copy(recorded_run / TRACKS_FILE, old)
+    code, out, _ = swarm("runs export --format mcap", old)
+    assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
+    with (old / "export" / "old.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert {each.topic for each in summary.channels.values()} == TOPICS - {"/map"}
+
+
+def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
+    recorded_run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = tmp_path / "damaged"
+    for file, content, complaint in (
+        (TRACKS_FILE, b"PK", "tracks.npz is damaged"),
+        (GROUND_PACE_FILE, b"PK", "ground.npz is damaged"),
+        ("report.json", b'{"notes": [{"t_s": "soon"}]}', "report.json is damaged: Expected `float`, got `str`"),
+        ("report.json", b'{"notes": 5}', "report.json is damaged"),
+        ("report.json", b"[]", "report.json is damaged"),
+    ):
+        damaged.mkdir(exist_ok=True)
+        for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
+            (damaged / each).write_bytes(content if each == file else (recorded_run / each).read_bytes())
+        code, _, told = swarm("runs export --format mcap", damaged)
+        assert (code > 0, complaint in told, told.count("\n")) == (True, True, 1), told
+        assert not list(damaged.rglob("*.mcap*"))
+    with monkeypatch.context() as patched:
+        patched.delitem(sys.modules, "launch_scripts.report.mcap_export")
+        patched.setitem(sys.modules, "mcap.writer", None)
+        code, _, told = swarm("runs export --format mcap", recorded_run)
+    needed = "swarm: this needs mcap, which is not installed: install the extra 'ros2' (docs/start/install.md)"
+    assert (code, told.strip()) == (2, needed)
+    (tmp_path / "empty").mkdir()
+    code, _, told = swarm("runs export --format mcap", tmp_path / "empty")
+    assert (code, "has no tracks.npz" in told) == (2, True)
+
+
+@given(st.lists(st.integers(-(10**9), 10**12)), st.integers(0, 10**11), st.integers(0, 10**12), st.integers(2, 50))
+def test_changes_are_told_soon_seldom_and_all(changes: list[int], first_ns: int, lasts_ns: int, most: int) -> None:
+    last_ns = first_ns + lasts_ns
+    instants = instants_of(changes, first_ns, last_ns, most)
+    assert instants == sorted(set(instants))
+    assert len(instants) <= most + 1
+    period_ns = max(NS_PER_S, lasts_ns // (most - 1) + 1)
+    for change in changes:
+        within = min(max(change, first_ns), last_ns)
+        assert any(within <= each <= within + period_ns for each in instants)
+    assert all(first_ns <= each <= last_ns for each in instants)
+
+
+@given(st.sets(st.text("aA1_-.", min_size=1, max_size=4)))
+def test_no_two_vehicles_share_a_frame(ids: set[str]) -> None:
+    names = frame_names(ids)
+    assert set(names) == ids
+    assert len(set(names.values())) == len(ids)
+    assert all(name in (ros_name(id), id) for id, name in names.items())

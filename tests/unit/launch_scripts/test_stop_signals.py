@@ -1,4 +1,4 @@
-"""Signals that ask a launcher to end, and output whose reader has gone."""
+"""Signals that ask a launcher or a command to end, and output whose reader has gone."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pytest
+from support import contained
+from support.processes import eventually
 
 from launch_scripts.launcher.signals import StopAsked
+from launch_scripts.stop_requests import stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -133,3 +138,50 @@ def test_a_terminal_that_is_closed_loses_no_report(tmp_path: Path) -> None:
         process.send_signal(signal.SIGHUP)
         assert process.wait(20) == 7
     assert (tmp_path / "report").read_text() == "report 1"
+
+
+# --- a command that runs until it is asked to end does so, even where the exception is lost -----------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_request_is_known_though_a_library_swallows_the_exception(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with stop_requests() as stopping:
+        assert not stopping()
+        with suppress(BaseException):
+            signal.raise_signal(number)
+        assert stopping()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert signal.getsignal(number) is before
+
+
+# --- the processes that ` -----------------------------------------------------------------------------------------
+
+STARTS = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_a_stopped_command_leaves_in_another_session_is_ended(number: signal.Signals) -> None:
+    command = [sys.executable, str(Path(contained.__file__)), sys.executable, "-c", STARTS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        orphan = int(process.stdout.readline())
+        process.send_signal(number)
+        assert process.wait(30) != 0
+    eventually(lambda: not psutil.pid_exists(orphan), 5, "the end of the orphan")
+
+
+def test_the_exit_code_is_that_of_the_command() -> None:
+    assert contained_code("raise SystemExit(5)") == 5
+    assert contained_code("") == 0
+
+
+def contained_code(program: str) -> int:
+    command = [sys.executable, str(Path(contained.__file__)), sys.executable, "-c", program]
+    return subprocess.run(command, timeout=30, check=False).returncode

@@ -71,35 +71,6 @@ vehicles.per_agent = 3
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "study: missing required field `scenarios`, a list"),
-        ('scenarios = ["a"]\nsede = 1', "unknown key sede; did you mean 'seeds'?"),
-        ('scenarios = ["a"]\nseeds = "5"', "seeds: '5' is not A:B with A < B"),
-        ('scenarios = ["a"]\n[parameters]\nmap.learning = true', "map.learning: found true, expected a list"),
-        ('scenarios = ["a"]\n[parameters]\nseconds = []', "seconds: found [], expected a list of values"),
-        (
-            'scenarios = ["a"]\n[parameters]\nseconds = [3]\n[variants.x]\nseconds = 4',
-            "variants.x.seconds: it is one of the parameters, too",
-        ),
-        ('scenarios = ["a"]\nseeds = "0:1000001"', "it has 1,000,001 trials, expected at most 1,000,000"),
-        ('scenarios = ["doors"]', "'doors' is a small world, which goes with faults = true"),
-        ('scenarios = ["mix"]\nfaults = true\n[parameters]\nseconds = [3]', "takes no parameters"),
-        ('scenarios = ["a"]\noutcomes = [""]', "outcomes[0]: found ''"),
-        (f'scenarios = ["a"]\noutcomes = ["{"x" * 300}"]', "text in quotes, 1 to 200 characters that print"),
-        ('scenarios = ["a"]\n[variants."\\u001b[31mred"]', "variants: found"),
-        ('scenarios = ["a"]\n[parameters]\nseed = [1, 2]', "seed: it is no setting of a study"),
-        ('scenarios = ["a"]\nseconds = 3\n[parameters]\nseconds = [1, 2]', "seconds: it does nothing where"),
-    ],
-)
-def test_a_study_that_cannot_be_is_refused_with_the_key_and_what_was_expected(text, said):
-    with pytest.raises(ConfigError) as error:
-        parse_study(text, "s.toml")
-    assert str(error.value).startswith("s.toml: ")
-    assert said in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
         ('scenarios = ["nowhere"]', "no scenario 'nowhere'"),
         (f"{STUDY}map.lerning = [true]", "unknown key map.lerning; did you mean 'learning'?"),
         (f"{STUDY}planner.routes = ['grid', 'straight']", "planner.routes: found 'straight'"),

@@ -14,7 +14,6 @@ from launch_scripts.commands.terrain_commands import app
 from launch_scripts.report import terrain_figure
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.load import load_scenario
-from swarm.errors import SwarmError
 
 runner = CliRunner()
 
@@ -117,21 +116,3 @@ def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) 
     assert "learnt, on polygons not seen" in said
     with rasterio.open(tmp_path / "classes.tif") as file:
         assert set(np.unique(file.read(1))) == {2, 4}
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("info", "nowhere.tif"), "does not exist"),
-        (("cost", "nowhere"), "no scenario 'nowhere'"),
-        (("generate", "--out", "dem.xyz", "--rows", 9, "--cols", 9), "write .tif or .tiff or .npz"),
-        (("generate", "--out", "/nowhere/dem.tif", "--rows", 9, "--cols", 9), "cannot write"),
-        (("cost", "synthetic", "--picture", "/nowhere/cost.png"), "--picture .* cannot write there, the folder"),
-        (("rules", "--picture", "/proc/rules.png"), r"cannot write /proc/rules\.png: No such file"),
-        (("cost", "synthetic", "--picture", "/tmp"), "it is a folder"),
-        (("generate", "--out", "d.tif", "--photo", "photo.png", "--rows", 9, "--cols", 9), "write .tif or .tiff"),
-    ],
-)
-def test_a_mistake_is_a_sentence(words: tuple[object, ...], sentence: str) -> None:
-    with pytest.raises(SwarmError, match=sentence):
-        run(*words)

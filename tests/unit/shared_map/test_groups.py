@@ -12,7 +12,6 @@ from shared_map.replication.mark_filter import MarkFilter, readable_for_target, 
 from shared_map.replication.replica import MapReplica
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.map_data import MarkKind, MarkSet
@@ -78,19 +77,6 @@ targets = ["t1"]
         readable_for_target(scenario, t, lambda group: book.targets_of(group, scenario)) for t in ("t0", "t1")
     ]
     assert ordered == [{"red"}, {"blue", "grey"}]
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('[[groups]]\nname = "red"\nreads = ["blu"]\n[[groups]]\nname = "blue"', "reads names 'blu'"),
-        ('[[groups]]\nname = "red"\nwrites = ["gold"]', "writes names 'gold', which is no group"),
-        ('[[groups]]\nname = "a"\n[[groups]]\nname = "a.b"', "begins with the name of another group"),
-    ],
-)
-def test_a_policy_that_names_nobody_is_refused(text: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        parse_scenario(text)
 
 
 # --- replicas -----------------------------------------------------------------------------------------------

@@ -277,31 +277,6 @@ def test_settings_of_a_scenario_win_over_those_of_its_preset_key_by_key() -> Non
     assert cost.class_factor == {"forest": 1.5, "rock": 4.0, "soil": 1.0, "snow": 1.5}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('preset = "hoover"', "cost.preset"),
-        ("preset = 3", "cost.preset"),
-        ("preset = ['hiker']", "cost.preset"),
-        ('slope_rule = "table"', 'slope_rule = "table" needs slope_table or slope_csv'),
-        ("slope_table = [[0, 1]]", 'slope_rule = "quadratic" reads no slope_table or slope_csv'),
-        ('slope_rule = "table"\nslope_table = [[0, 1], [-5, 2]]', "-5 degrees follow on 0, expected rising slopes"),
-        ('slope_rule = "table"\nslope_table = [[-9, 2], [9, 2]]', "level ground takes 2 times the flat pace"),
-        ('slope_rule = "table"\nslope_table = [[0, nan]]', "cost.slope_table"),
-        ('slope_rule = "table"\nslope_table = [[0, 1]]\nslope_csv = "a.csv"', "exclude each other"),
-        ("top_speed_m_per_s = 4", "top_speed_m_per_s: 4 is less than flat_speed_m_per_s = 10"),
-        ("max_climb_deg = 4", "max_climb_deg is about steps: set directional = true"),
-        ("max_descent_deg = 4", "max_descent_deg is about steps: set directional = true"),
-        ("flat_speed_m_per_s = 1000", "cost.flat_speed_m_per_s"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused_in_one_sentence(text: str, said: str) -> None:
-    with pytest.raises(ConfigError, match="scenario") as refused:
-        parse_scenario(f"[cost]\n{text}")
-    assert said in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
 # --- tables in files --------------------------------------------------------------------------------------------
 
 
@@ -321,30 +296,6 @@ def test_a_table_in_a_file_is_of_factors_paces_or_speeds_by_degrees_or_percent(t
         np.testing.assert_allclose(other.slope_table, by_factor.slope_table, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("table", "said"),
-    [
-        ("", "the first line is ''"),
-        ("slope,factor\n0,1\n", "expected two columns, slope_deg or slope_percent and factor or pace_s_per_m"),
-        ("slope_deg,factor\n0,1\n3,quick\n", "line 3 is '3,quick'"),
-        ("slope_deg,factor\n0,1\n3\n", "line 3 is '3'"),
-        ("slope_deg,factor\n0,nan\n", "line 2"),
-        ("slope_deg,factor\nnan,1\n", "line 2"),
-        ("slope_deg,speed_m_per_s\n0,0\n", "line 2"),
-        ("slope_deg,factor\n0,1\n95,2\n", "line 3"),
-        ("slope_percent,speed_m_per_s\n0,5\n", "level ground takes 2 times the flat pace"),
-        ("slope_deg,factor\n", "needs slope_table or slope_csv"),
-        ('slope_deg,factor\n"' + "0" * 200_000, "is no table of comma-separated values"),
-    ],
-)
-def test_a_table_that_cannot_be_read_names_file_and_line(tmp_path: Path, table: str, said: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        scenario_with(tmp_path, table)
-    assert said in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('cost.slope_csv = "no.csv"\ncost.slope_rule = "table"')
-    with pytest.raises(ConfigError, match=r"cannot read slope table .*no\.csv"):
-        load_scenario(tmp_path / "mine.toml")
+def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is no table of comma-separated values"):
+        scenario_with(tmp_path, 'slope_deg,factor\n"' + "0" * 200_000)

@@ -55,42 +55,6 @@ def test_classes_keep_the_preset_of_the_common_cost() -> None:
     assert cost.rough_per_m == 1
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('classes = [{ name = "a" }, { name = "a" }]', "classes: two classes are called 'a'; rename one"),
-        ('classes = [{ name = "ground" }]', "classes: 'ground' is the class of [cost] and [vehicles] itself"),
-        ('classes = [{ name = "a", wings = 2 }]', "wings"),
-        ('classes = [{ name = "a", kind = "air" }]', "kind"),
-        (
-            'classes = [{ name = "a", cost = { directional = true } }]',
-            "cost.directional is for all classes",
-        ),
-        (
-            'classes = [{ name = "a" }, { name = "b", air = { speed_m_per_s = 8 } }]\nwind = { speed_m_per_s = 8 }',
-            "classes[1].air.speed_m_per_s: expected more than wind.speed_m_per_s, 8, as b makes no headway else",
-        ),
-        ("wind = { speed_m_per_s = -1 }", "wind.speed_m_per_s"),
-        ("wind = { speed_m_per_s = nan }", "wind.speed_m_per_s"),
-        ("wind = { from_deg = 361 }", "wind.from_deg"),
-        ("wind = { towards_deg = 10 }", "wind.towards_deg"),
-        ('classes = [{ name = "a", cost = { slope_rule = "table" } }]', "classes[0]: cost: slope_rule"),
-        ('classes = [{ name = "a", cost = { preset = "plane" } }]', "classes[0].cost.preset"),
-        ("classes = [3]", "classes[0]"),
-        ('groups = [{ class = "boat" }]', "groups: all: class is 'boat', which is no class; there are 'ground'"),
-        ('groups = [{ clas = "boat" }]', "did you mean 'class'?"),
-        ('groups = [{ vehicle_class = "ground" }]', "unknown key groups[0].vehicle_class; did you mean"),
-        ("classes = 3", "classes"),
-        ("classes = [{ }]", "name"),
-    ],
-)
-def test_a_fault_is_said_in_one_sentence(text: str, said: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        parse_scenario(text)
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_an_unknown_class_is_said_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
         of_class(Scenario(), "boat")
