@@ -25,7 +25,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
-from swarm.wire.fields import pack_column
+from swarm.wire.fields import MOST_VEHICLES, pack_column
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -41,9 +41,10 @@ FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
 MAX_GAP = 1.5
 """A served route whose certified gap (cost over proven bound) exceeds this asks for a full growth."""
-MOST_ROUTES = 20_000
-MOST_STEPS = 4 << 20
-"""In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
+MOST_ROUTES = MOST_VEHICLES
+"""Routes of one answer: for all vehicles of an agent. They take some 10 ms."""
+MOST_STEPS = 1 << 19
+"""Steps in one answer, some 10 ms: longer routes are cut, as if `max_cells` had asked for that."""
 MOST_PULLED_STEPS = MOST_STEPS >> 3
 """The same of routes that are pulled, which cross twice as many cells at most and may have a leg for each step."""
 GOOD_GAP = 1.05

@@ -70,8 +70,8 @@ _PRESENCE_NS = 5 * NS_PER_S
 """A vehicle of which nothing was heard for so long sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 """A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
-_CELLS_AT_ONCE = 1 << 16
-"""Cells asked for after which waiting queries wait for the next tick or event."""
+_AT_ONCE, _ROUTE_COST = 1 << 16, 64
+"""Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
 
 
 class PlannerService:
@@ -139,6 +139,8 @@ class PlannerService:
         self._removed = False
         """True if its target was removed: then it serves no queries."""
         self._now_ns = 0
+        self._forced = False
+        """True if another than an agent has forced the tree to grow since the last tick."""
         self._served = False
         self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
@@ -261,6 +263,7 @@ class PlannerService:
             self._perform(planner, planner.tick(now_ns), now_ns)
         self._now_ns = now_ns
         self._obedience.tick(now_ns)
+        self._forced = False
         self._answer(now_ns)
         self._look_for_strides()
         for name in ("marks_merged", "sets_foreign"):
@@ -336,11 +339,11 @@ class PlannerService:
     def _answer(self, now_ns: int) -> None:
         """Answers queries. If there will be a tree to answer from soon, a query waits for that, but not long.
 
-        A query for one class never waits for the tree of another. Agents come first. After `_CELLS_AT_ONCE` cells
-        the others wait for the next call.
+        A query for one class never waits for the tree of another. Agents come first. After `_AT_ONCE` costs
+        the others wait for the next call. Of others than agents one query a tick may force the tree to grow.
         """
         held, self._held = self._held, []
-        cells = 0
+        spent = 0
         for n, (asked_ns, event) in enumerate(sorted(held, key=_is_of_others)):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
@@ -353,10 +356,12 @@ class PlannerService:
             planner = self._planners.used(name, now_ns)
             crowded = len(self._held) + len(held) - n > _MOST_HELD
             must_wait = self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS
-            if must_wait or cells > _CELLS_AT_ONCE:
+            if must_wait or spent > _AT_ONCE:
                 self._held.append((asked_ns, event))
                 continue
-            cells += len(request.cells) + 1
+            spent += (len(request.cells) + 1) * (_ROUTE_COST if isinstance(request, RouteRequest) else 1)
+            if isinstance(request, RouteRequest) and request.force and not is_own(event.asker):
+                request, self._forced = msgspec.structs.replace(request, force=not self._forced), True
             planner.answer(request, now_ns, partial(self._send, event))
 
     def _send(self, asked: Asked, answer: Answer) -> None:

@@ -22,6 +22,8 @@ class Peer:
 
 _MOST_LIVES = 64
 """Largest number of tokens of one process: the holder of its certificate may raise any number."""
+_MOST_ALIVE = 1 << 14
+"""Largest number of processes: on loopback, any program may raise tokens under any name."""
 
 
 class Roster:
@@ -29,7 +31,7 @@ class Roster:
 
     A token of a new incarnation may appear before that of the old one falls, so all incarnations of a process are
     kept, and the order in which tokens come and go does not matter. Repeated and unknown ones change nothing. Of a
-    process with more than 64 tokens only the newest count.
+    process with more than 64 tokens only the newest count. Beyond 16,384 processes a newcomer is not noticed.
     """
 
     def __init__(self) -> None:
@@ -38,6 +40,8 @@ class Roster:
 
     def appeared(self, peer: Peer) -> None:
         """A token is up."""
+        if (peer.role, peer.id) not in self._alive and len(self._alive) >= _MOST_ALIVE:
+            return
         incarnations = self._alive.setdefault((peer.role, peer.id), [])
         if peer.incarnation not in incarnations:
             incarnations.append(peer.incarnation)

@@ -103,6 +103,8 @@ class AgentService:
         self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._roster = Roster()
+        self._planners_changed = False
+        """True if a planner has come or gone, or a target, since the agent was told of them."""
         self._now_ns = 0
         self.when_over: Callable[[], None] | None = None
         self._removed: set[str] = set()
@@ -201,6 +203,7 @@ class AgentService:
         parts.zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
         agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
+        self._set_planners(now_ns)
         agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
         if places:
             self._sync.enter(parts.near_marks.update(places))
@@ -245,6 +248,7 @@ class AgentService:
         agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
         if self._obeyed_version != orders.book.version:
             self._obeyed_version = orders.book.version
+            self._planners_changed = True
             scenario, book = self._setup.scenario, orders.book
             agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
             agent.set_pace(
@@ -355,15 +359,24 @@ class AgentService:
             self._sync.publish(self._replica.write_learned(said, now_ns))
 
     def _on_planner(self, event: Appeared | Disappeared, now_ns: int) -> None:
-        """A planner has come or gone: each target has the planner of the best rank that lives."""
+        """A planner has come or gone."""
+        self._planners_changed = True
         if isinstance(event, Appeared):
             self._roster.appeared(event.peer)
             if event.peer.role == "planner":
                 self._detector.retell(job_of(event.peer.id), now_ns)
         else:
             self._roster.gone(event.peer)
-        alive = self._roster.alive("planner")
-        self.agent.set_planners({job_of(id): alive[id] for id in sorted(alive, reverse=True)}, now_ns)
+
+    def _set_planners(self, now_ns: int) -> None:
+        """Gives each target the planner of the best rank that lives, once at a tick, as names cost nothing."""
+        if self._planners_changed:
+            self._planners_changed = False
+            alive = self._roster.alive("planner")
+            chased = {vehicle.target for vehicle in self.agent.vehicles.values()}
+            known = chased.union(self._obedience.book.targets(self._setup.scenario))
+            planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
+            self.agent.set_planners(planners, now_ns)
 
     def _on_routes(self, replied: Replied, reply: RouteReply, now_ns: int) -> None:
         self.counters.observe("route_query_ms", replied.took_s * 1e3)

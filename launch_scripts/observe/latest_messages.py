@@ -35,6 +35,8 @@ from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 _VEHICLES_LAST_NS = 3 * NS_PER_S
 """A vehicle whose agent raises no liveliness token is there for this long after its last word."""
+_MOST_ALIVE = 1 << 14
+"""Processes whose tokens are remembered: on loopback any program may raise tokens under any name."""
 _ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """Counts of planners: poses which do not count, or look wrong."""
 
@@ -265,6 +267,8 @@ class LatestState(Counts):
         if peer.incarnation not in self._started.get(key, (peer.incarnation,)):
             return
         if up:
+            if key not in self._alive and len(self._alive) >= _MOST_ALIVE:
+                return
             self._alive.setdefault(key, set()).add(peer.incarnation)
             self._told_ns[key] = now_ns
         elif key in self._alive:

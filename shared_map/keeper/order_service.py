@@ -43,6 +43,7 @@ class KeptOrders:
         self._post = post
         self._added: set[str] = set()
         """Agents that have appeared and are not in the scenario: how many vehicles they have is theirs to know."""
+        self._planned = {plan.id for plan in plan_agents(scenario)}
         self._publish_due_ns = 0
         self._unsaved: list[Order] = []
         """Orders heard of another keeper that are not on our disk yet."""
@@ -61,7 +62,7 @@ class KeptOrders:
         or the reason for refusing it."""
         match event:
             case Appeared(peer=Peer(role="agent", id=id)):
-                if len(self._added) < _MOST_ADDED and all(plan.id != id for plan in plan_agents(self._scenario)):
+                if len(self._added) < _MOST_ADDED and id not in self._planned:
                     self._added.add(id)
                 return True
             case Disappeared(peer=Peer(role="agent")):

@@ -26,6 +26,7 @@ from swarm.liveness import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.order_book import described
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import figures
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import Order, ZoneOrder, Zones
 from swarm.wire.messages.planning import Sighted
@@ -45,6 +46,11 @@ _NAME_AT_MOST = 16
 _COMPACT_EVERY_NS = NS_PER_S
 _COMPACT_TILES = 16
 """Compacted at once: what sets that arrive wait for is bounded."""
+_MOST_FIGURES = 1 << 20
+"""Figures in all `Stats` together, some 100 MB: those of 1,000 processes with 1,000 each. Beyond it those of a
+newcomer are not remembered."""
+_MOST_FIGURES_TOLD = 1 << 15
+"""Figures in the answers to one question, some 10 ms."""
 _MOST_PROCESSES = 4096
 """Number of remembered `Stats`: the holder of a certificate may write under any number of ids."""
 
@@ -70,6 +76,8 @@ class KeeperService:
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
         self._stats: dict[tuple[str, str], Stats] = {}
         """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
+        self._stats_size = 0
+        """Figures in all of these."""
         self._roster = Roster()
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
@@ -130,10 +138,7 @@ class KeeperService:
                 self._receive_stats(stats)
                 return
             case Asked(topic=topic) if topic is STATS:
-                for _, stats in sorted(self._stats.items()):
-                    if not self._roster.is_alive(stats.role, stats.id):
-                        event.answer(stats, role=stats.role, id=stats.id)
-                event.end()
+                self._answer_stats(event)
                 return
             case Appeared(peer):  # others want to know it, too
                 self._roster.appeared(peer)
@@ -174,12 +179,23 @@ class KeeperService:
         self._save(now_ns)
         self._member.publish_stats(now_ns)
 
+    def _answer_stats(self, asked: Asked) -> None:
+        """Answers with the last figures of processes that have ended, as far as one tick has time for them."""
+        left = _MOST_FIGURES_TOLD
+        for (role, id), stats in sorted(self._stats.items()):
+            wanted = asked.fields["role"] in ("*", role) and asked.fields["id"] in ("*", id)
+            if wanted and not self._roster.is_alive(role, id) and left > 0:
+                left -= figures(stats)
+                asked.answer(stats, role=role, id=id)
+        asked.end()
+
     def _receive_stats(self, stats: Stats) -> None:
         key = (stats.role, stats.id)
         known = self._stats.get(key)
-        if known is None and len(self._stats) >= _MOST_PROCESSES:
+        if known is None and (len(self._stats) >= _MOST_PROCESSES or self._stats_size >= _MOST_FIGURES):
             return
         if known is None or (stats.incarnation, stats.stamp_ns) >= (known.incarnation, known.stamp_ns):
+            self._stats_size += figures(stats) - (0 if known is None else figures(known))
             self._stats[key] = stats
 
     def _save_sightings(self, now_ns: int) -> None:

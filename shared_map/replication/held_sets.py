@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -192,9 +192,14 @@ class HeldSets:
 
         author  only this author's, as the key of the query says
         """
-        wanted = set(request.authors)
-        tiles: Sequence[int] = sorted(set(request.tiles)) if request.tiles else self.tiles
-        if author is not None:
-            found = (self.get(tile, author) for tile in tiles if not wanted or author in wanted)
-            return [each for each in found if each is not None]
-        return [each for tile in tiles for each in self.of_tile(tile) if not wanted or each.author in wanted]
+        return [each for each in self.asked(request, author) if each is not None]
+
+    def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
+        """The sets of `answer`, and None after those of each tile, found as they are needed."""
+        wanted = frozenset(request.authors)
+        for tile in sorted(set(request.tiles)) if request.tiles else self.tiles:
+            if author is None:
+                yield from (each for each in self.of_tile(tile) if not wanted or each.author in wanted)
+            elif not wanted or author in wanted:
+                yield self.get(tile, author)
+            yield None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from msgspec.structs import replace
 
@@ -56,6 +56,12 @@ _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _TILES_AT_ONCE = MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
+_ANSWERS_PER_TICK, _TURN = 8192, 1024
+"""Sets and tiles looked at for answers in one tick, some 10 ms, and for one asker before another has its turn."""
+_LEAST_COST, _SINGLE_COST = 32, 16
+"""Cost of a question, and of a set that is sent by itself, in sets that are sent together."""
+_MOST_ANSWERS = 1024
+"""Questions for sets that wait: of all agents that start at once."""
 _PART_BYTES = MOST_DIGEST_BYTES - 512
 """Rows and names of authors in one digest, without its other fields."""
 _QUANTUM = 16_384
@@ -125,6 +131,9 @@ class MapSync:
         self._changes_due_ns = 0
         self._digest_seq = 0
         # Parts of the whole digest that are not published yet, as `parts_of` gives them.
+        # Questions for sets: each with whether sets may come together, and the sets to come.
+        self._answers: deque[tuple[Asked, bool, Iterator[MarkSet | None]]] = deque()
+        self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
@@ -208,6 +217,8 @@ class MapSync:
             assert isinstance(digest.message, Digest)
             self._on_digest(digest.message.author, now_ns)
             self._receive_digest(digest.message, now_ns)
+        self._answers_left = _ANSWERS_PER_TICK
+        self._answer_some()
         self._take_in(now_ns)
         self._merge_waiting(now_ns)
         self._choose_digests(now_ns)
@@ -329,15 +340,34 @@ class MapSync:
         author = None if "*" in named else named
         if not self._serves_all:
             author = self.replica.author
-        sets = self.replica.held.answer(request, author)
-        if request.bulk:
-            for many in packed(sets):
+        if len(self._answers) >= _MOST_ANSWERS:
+            asked.refuse(f"{MARKS.name}: too many questions wait")
+            asked.end()
+            return
+        self._answers.append((asked, request.bulk, self.replica.held.asked(request, author)))
+        self._answer_some()
+
+    def _answer_some(self) -> None:
+        """Answers those who ask for sets, by turns, until the work of this tick is done."""
+        while self._answers and self._answers_left > 0:
+            asked, bulk, found = self._answers.popleft()
+            sets: list[MarkSet] = []
+            cost = _LEAST_COST
+            for each in () if asked.expired else found:
+                if each is not None:
+                    sets.append(each)
+                cost += _SINGLE_COST if each is not None and not bulk else 1
+                if cost >= _TURN:
+                    self._answers.append((asked, bulk, found))
+                    break
+            self._answers_left -= cost
+            for many in packed(sets) if bulk else ():
                 asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
-        else:
-            for each in sets:
+            for each in () if bulk else sets:
                 region = region_of(self.replica.grid, each.tile)
                 asked.answer(each, region=region, tile=each.tile, author=each.author)
-        asked.end()
+            if cost < _TURN:
+                asked.end()
 
     # --- late join ------------------------------------------------------------------------------------------
 

@@ -129,6 +129,10 @@ class Member:
         self._asked_all = self._confirmed
         """True if a round of replies has ended in which no other run was alone."""
         self._needs: list[tuple[str, Callable[[], bool]]] = []
+        self._router_appeared = False
+        """True if a router's token has risen since others were asked for their run. All are asked once a second at
+        most: a token costs its sender nothing."""
+        self._ask_due_ns = 0
         self._older = False
         """True if a process of the run was heard which does not know the names of askers."""
         # The first differing reply of the current round, in words.
@@ -182,7 +186,7 @@ class Member:
                 self._asked_all = True
                 return True
             case Appeared(peer=Peer(role=role)) if role == ROUTER:
-                self._post(LinkChanged(up=True, beyond=True))
+                self._router_appeared = True
                 return True
             case Disappeared(peer=Peer(role=role)) if role == ROUTER:
                 return True
@@ -201,6 +205,9 @@ class Member:
             text = f"{self._name} was started again, restart {self.info.restarts}"
             self.alarms.happened("restarted", self._name, text, now_ns)
         self._now_ns = now_ns
+        if self._router_appeared and now_ns >= self._ask_due_ns:
+            self._router_appeared, self._ask_due_ns = False, now_ns + NS_PER_S
+            self._post(LinkChanged(up=True, beyond=True))
         for sentence in self._to_name:
             self.note(now_ns, "stranger", sentence)
         self._to_name.clear()

@@ -127,6 +127,16 @@ def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
     return whole
 
 
+def figures(stats: Stats) -> int:
+    """Returns the number of figures in counters: what they take in memory, in 100 bytes."""
+    histograms = [
+        *stats.histograms.values(),
+        *(each for of in stats.histograms_by.values() for each in of.values()),
+    ]
+    by = sum(map(len, stats.counts_by.values()))
+    return len(stats.counts) + len(stats.gauges) + by + sum(1 + len(each) for each in histograms)
+
+
 def carried(before: Stats, own: Stats) -> Stats:
     """The statistics of a life that goes on counting where the one before it ended. Gauges are of now."""
     return msgspec.structs.replace(

@@ -316,7 +316,7 @@ ROUTE = Topic(
     "route", "target/{target}/route/{asker}", planning.RouteReply, "routes from cells to the target", "asked",
     access(serve="planner:target", ask="agent:asker rover:asker"),
     request=planning.RouteRequest, published=False, costly=True,
-    ask_bytes=_LONG, answer_bytes=_FILE,
+    ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
@@ -329,7 +329,7 @@ NAMELESS_ROUTE = Topic(
     "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
     access(serve="planner:target", ask="agent rover"),
     request=planning.RouteRequest, published=False, costly=True,
-    ask_bytes=_LONG, answer_bytes=_FILE,
+    ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 NAMELESS_COST = Topic(
     "nameless-cost", "target/{target}/cost", planning.CostReply,

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 from support.effort import few
 from support.message_fuzzer import NAMES, MessageFuzzer
 
 from swarm.bus.bus import Bus, Post
 from swarm.errors import ProtocolError
+from swarm.liveness import Peer
 from swarm.wire.codec import encode
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import TOPICS, Topic, check_size
-from tests.laws.test_no_message_harms import AUTHORS, NAMED, Lied, ignore
+from tests.laws.test_no_message_harms import AUTHORS, NAMED, PACE, Lied, ignore
 
 REPEATS = 3
 NAMES_SENT = tuple(dict.fromkeys((*NAMES, *NAMED, *AUTHORS)))
@@ -87,6 +90,38 @@ def test_the_longest_message_of_each_topic_costs_no_service_much(topic: Topic, s
             ask = partial(sender.ask, topic, request, ignore, tag="q")
             assert swarm.cost_ms(ask) < MOST_MS, type(request)
     sender.close()
+
+
+def questions(swarm: Lied, seconds: float) -> Counter[str]:
+    """Questions and samples of the run's processes in the next seconds, by topic."""
+    since = len(swarm.deliveries)
+    swarm.run(seconds)
+    return Counter(topic for _, source, _, topic, _ in swarm.deliveries[since:] if source != "liar")
+
+
+@pytest.mark.parametrize("roles", [("agent", "planner"), ("router", "keeper"), ("targets", "monitor", "rover")])
+def test_invented_tokens_start_few_questions_and_delay_no_known_process(roles: tuple[str, ...]) -> None:
+    swarm = Measured("plain")
+    before = questions(swarm, 3)
+    agent = swarm.services["agent-a0"]
+    liar = swarm.bus("liar")
+    told: list[object] = []
+    tell = agent.agent.set_planners
+    agent.agent.set_planners = lambda *arguments: (told.append(arguments), tell(*arguments))
+    for n in range(120 // len(roles)):
+        for role in roles:
+            liar.declare_alive(Peer(role, f"q{n}", n + 1))
+    after = questions(swarm, 3)
+    for topic in ("run", "known", "cost", "marks", "orders", "stats", "digest"):
+        assert after[topic] <= 3 * before[topic] + 4 * 10 * 10, topic
+    assert len(told) <= 31
+    assert len(agent.agent._planners) <= len(swarm.scenario.target_ids)
+    liar.close()
+    swarm.run(3)
+    home = int(np.flatnonzero(np.isfinite(PACE))[0])
+    [reply] = swarm.routes(home)
+    assert reply.routes[0].status is RouteStatus.OK
+    swarm.close()
 
 
 def test_a_payload_beyond_the_limit_of_its_topic_is_rejected_unread(swarm: Measured) -> None:

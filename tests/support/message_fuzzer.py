@@ -81,6 +81,8 @@ class MessageFuzzer:
         self._chance = random.Random(seed)
         self.largest: tuple[int, ...] | None = None
         """Numbers of items in lists and maps; None for few."""
+        self._left = 0
+        """Items that a large message may still have."""
 
     def fields(self, topic: Topic, message: Message) -> dict[str, Any]:
         """The fields of the message's key: what the message says itself, the region of its tile and the agent of
@@ -312,7 +314,13 @@ class MessageFuzzer:
 
     def _many(self, most: int) -> int:
         """Number of items in a list, map or column."""
-        return self._chance.choice((0, 1, 2, most) if self.largest is None else self.largest)
+        if self.largest is None:
+            return self._chance.choice((0, 1, 2, most))
+        many = self._chance.choice(self.largest)
+        self._left -= many
+        if self._left < 0:
+            raise ValueError("more items than the bound has bytes")
+        return many
 
     def large(self, kind: type[M], most_bytes: int) -> M:
         """A message about as long as a bound on its bytes lets it be: one of several shapes, each list or map in it
@@ -331,11 +339,10 @@ class MessageFuzzer:
 
     def _fits(self, kind: type[M], most_bytes: int) -> M | None:
         """A message of this type which decodes, if it has no more bytes than that."""
-        for _ in range(4):
-            with contextlib.suppress(ProtocolError, ValueError):
-                made = self._made(kind)
-                payload = encode(made)
-                return decode(payload, kind) if len(payload) <= most_bytes else None
+        self._left = most_bytes
+        with contextlib.suppress(ProtocolError, ValueError):
+            payload = encode(self._made(kind))
+            return decode(payload, kind) if len(payload) <= most_bytes else None
         return None
 
 

@@ -76,7 +76,8 @@ class TargetDetector:
 
     def retell(self, target: str, now_ns: int) -> None:
         """Repeats the last sighting for a planner that has restarted."""
-        self._retell_ns[target] = now_ns + _RETELL_NS
+        if target in self._last:
+            self._retell_ns[target] = now_ns + _RETELL_NS
 
     def retold(self, now_ns: int) -> list[Sighted]:
         """Last sightings to publish once more, as they were."""

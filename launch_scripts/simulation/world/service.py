@@ -13,7 +13,7 @@ from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.liveness import Roster, job_of
+from swarm.liveness import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient
@@ -138,8 +138,9 @@ class TargetsService:
                 self._world.planner_up(job_of(peer.id), True)
             case Disappeared(peer):
                 self._planners.gone(peer)
-                left = {job_of(id) for id in self._planners.alive(peer.role)}
-                self._world.planner_up(job_of(peer.id), job_of(peer.id) in left)
+                job = job_of(peer.id)
+                ids = (ranked_id(job, rank) for rank in range(HIGHEST_RANK + 1))
+                self._world.planner_up(job, any(self._planners.is_alive(peer.role, id) for id in ids))
             case Heard(message=TargetPose() as pose):
                 self._world.hear_pose(pose, now_ns)
 

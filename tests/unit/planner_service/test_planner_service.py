@@ -18,11 +18,12 @@ from planner_service.target_watch import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
 from swarm.runtime.stats import Counters
-from swarm.wire.codec import MAX_PAYLOAD_BYTES, encode
+from swarm.wire.codec import encode
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import (
     CostReply,
@@ -217,7 +218,7 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
     reply = planner.answer(RouteRequest(cells=[198 * 200] * MOST_ROUTES), 0)
     assert isinstance(reply, RouteReply)
     assert all(route.remaining_s > 0 for route in reply.routes)
-    assert len(encode(reply)) < MAX_PAYLOAD_BYTES
+    assert len(encode(reply)) < ROUTE.answer_bytes
 
 
 def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
@@ -270,3 +271,36 @@ def test_the_same_events_give_the_same_messages_byte_for_byte() -> None:
         return swarm.deliveries
 
     assert run() == run()
+
+
+def test_questions_that_waited_for_a_tree_are_answered_in_bounded_work_a_tick_and_agents_first() -> None:
+    """400 expensive questions of ten sessions wait for the first tree, and then one of a vehicle."""
+    swarm = Swarm()
+    answered: list[str] = []
+
+    def ask(asker: str, request: CostRequest | RouteRequest) -> None:
+        topic = COST if isinstance(request, CostRequest) else ROUTE
+        swarm.ear.bus.ask(
+            topic, request, lambda event: answered.append(asker) if isinstance(event, Replied) else None, tag=asker,
+            target="t", asker=asker, timeout_s=10.0,
+        )  # fmt: skip
+
+    swarm.cells["t"] = GRID.cell(5, 5)
+    swarm.run(0.5)
+    planner, waits = swarm.planners["t"], [True]
+    planner._planners.must_wait = lambda name, now_ns: waits[0]  # type: ignore[method-assign]
+    for n in range(200):
+        ask(f"rover.q{n % 10}", CostRequest(cells=list(range(2000)) * 10))
+    ask("agent.a0", RouteRequest(cells=[GRID.cell(0, 20)]))
+    swarm.run(0.02)
+    assert answered == []
+    waits[0] = False
+    per_tick = []
+    for _ in range(60):
+        before = len(answered)
+        planner.tick(swarm.now_ns)
+        swarm.run(0.001)
+        per_tick.append(len(answered) - before)
+    assert answered[0] == "agent.a0"
+    assert max(per_tick) <= 5
+    assert len(answered) == 201

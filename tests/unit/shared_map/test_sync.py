@@ -15,7 +15,7 @@ from shared_map.replication import replica_sync
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
-from swarm.bus.bus import Asked, Event, Replied
+from swarm.bus.bus import Asked, AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
 from swarm.wire.codec import decode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest
@@ -240,3 +240,34 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
     listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[3]}
+
+
+def test_a_question_for_everything_is_answered_over_ticks_and_delays_no_other() -> None:
+    swarm = SwarmModel()
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    keeper.replica.merge(
+        [set_of(f"x{n // 6}.1", n % 6, 1, {5: (LETHAL, 0, 1)}) for n in range(1200)], measured=False
+    )
+    order: list[str] = []
+    asker = swarm.network.bus("asker")
+
+    def ask(tag: str, request: MarksRequest) -> None:
+        def note(event: Event) -> None:
+            order.append(f"{tag} ends" if isinstance(event, AskEnded) else tag)
+
+        asker.ask(MARKS, request, note, tag=tag, timeout_s=30.0)
+
+    for n in range(8):
+        ask(f"all{n}", MarksRequest())
+    ask("mine", MarksRequest(authors=["x7.1"], bulk=True))
+    answered = []
+    for _ in range(30):
+        before = len(order)
+        keeper.tick(swarm.now_ns)
+        swarm.run(0.001)
+        answered.append(len(order) - before)
+    assert order.count("mine") == 1
+    assert order.index("mine ends") < 2 * 8 * 64 + 512  # two turns of each of the others
+    assert max(answered) <= 2 * 520  # the keeper has ticks of its own
+    assert sum(each.endswith("ends") for each in order) == 9
+    assert order.count("all3") == 1200
