@@ -194,9 +194,8 @@ def key_fields(topic: Topic) -> dict[str, str]:
 def example(topic: Topic) -> str:
     """The shortest JSON for a topic: its key, and what its message needs and the key does not say."""
     hints = typing.get_type_hints(topic.message, include_extras=True)
-    needed = (field.name for field in msgspec.structs.fields(topic.message) if field.required)
-    meant = {"key": topic.below(key_fields(topic))}
-    return json.dumps(meant | {name: _value(name, hints[name]) for name in needed if name not in topic.fields})
+    needed = [f.name for f in msgspec.structs.fields(topic.message) if f.required and f.name not in topic.fields]
+    return json.dumps({"key": topic.below(key_fields(topic))} | {n: _value(n, hints[n]) for n in needed})
 
 
 def _value(name: str, hint: Any) -> Any:
