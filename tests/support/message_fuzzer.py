@@ -147,7 +147,7 @@ class MessageFuzzer:
         if kind is MarkSets:
             author = self._chance.choice(self._authors)
             own = {"author": author, "group": author.partition(".")[0]}
-            sets = [msgspec.structs.replace(self._made(MarkSet), **own) for _ in range(max(1, self._many(3)))]
+            sets = [msgspec.structs.replace(self._made(MarkSet), **own) for _ in range(max(self._many(3), 1))]
             return next(iter(packed({each.tile: each for each in sets}.values())))
         hints = _hints(kind)  # type: ignore[arg-type]
         fields = {name: self._value(name, hint) for name, hint in hints.items() if not _per(hint)}
