@@ -14,6 +14,7 @@ began_ns = time.time_ns()
 with zenoh.open(config) as session:
     for seq in range(1, 10**6):
         pose = {
+            "key": f"target/{target}/pose",
             "tracker": tracker,
             "incarnation": began_ns,
             "seq": seq,

@@ -19,7 +19,6 @@ from swarm.bus import bus
 from swarm.wire import codec
 from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
-from swarm.wire.meant import SHARED
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.vehicles import VehicleState
@@ -193,11 +192,10 @@ def key_fields(topic: Topic) -> dict[str, str]:
 
 
 def example(topic: Topic) -> str:
-    """The shortest JSON for a topic: what its message needs and its key does not say."""
+    """The shortest JSON for a topic: its key, and what its message needs and the key does not say."""
     hints = typing.get_type_hints(topic.message, include_extras=True)
-    needed = (field.name for field in msgspec.structs.fields(topic.message) if field.required)
-    said = {"key": topic.below(key_fields(topic))} if topic.message in SHARED else {}
-    return json.dumps({name: _value(name, hints[name]) for name in needed if name not in topic.fields} | said)
+    needed = [f.name for f in msgspec.structs.fields(topic.message) if f.required and f.name not in topic.fields]
+    return json.dumps({"key": topic.below(key_fields(topic))} | {n: _value(n, hints[n]) for n in needed})
 
 
 def _value(name: str, hint: Any) -> Any:

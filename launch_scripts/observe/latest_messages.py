@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,13 @@ from swarm.wire.messages.processes import Beat, RunInfo, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
+K = TypeVar("K")
+V = TypeVar("V")
+
 _VEHICLES_LAST_NS = 3 * NS_PER_S
 """A vehicle whose agent raises no liveliness token is there for this long after its last word."""
-_MOST_ALIVE = 1 << 14
-"""Processes whose tokens are remembered: on loopback any program may raise tokens under any name."""
+_MOST_NAMES = 1 << 14
+"""Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
 _ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """Counts of planners: poses which do not count, or look wrong."""
 
@@ -170,6 +173,12 @@ class MarkedCells:
     stamps_ns: NDArray[np.int64]
 
 
+def _remember(known: dict[K, V], key: K, value: V) -> None:
+    """Keeps the newest value of a key, unless too many other keys are known."""
+    if key in known or len(known) < _MOST_NAMES:
+        known[key] = value
+
+
 class LatestState(Counts):
     """The newest message per sender of a run, so that its memory does not grow with time.
 
@@ -227,9 +236,9 @@ class LatestState(Counts):
                 self._told_ns[message.role, message.id] = now_ns
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
-                self.status[message.target] = message
+                _remember(self.status, message.target, message)
             case Beat(leads=leads):
-                self.leads[message.role, message.id] = leads
+                _remember(self.leads, (message.role, message.id), leads)
                 if leads:
                     job, rank = split_rank(message.id)
                     self._ranks[message.role, job] = rank
@@ -237,7 +246,7 @@ class LatestState(Counts):
                 self.moved_ns = self.fleet_ns = max(self.moved_ns, now_ns)
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
-                    self._fleets[message.author, message.region] = message
+                    _remember(self._fleets, (message.author, message.region), message)
                     self._vehicles = None
                 if message.ids:
                     self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
@@ -267,7 +276,7 @@ class LatestState(Counts):
         if peer.incarnation not in self._started.get(key, (peer.incarnation,)):
             return
         if up:
-            if key not in self._alive and len(self._alive) >= _MOST_ALIVE:
+            if key not in self._alive and len(self._alive) >= _MOST_NAMES:
                 return
             self._alive.setdefault(key, set()).add(peer.incarnation)
             self._told_ns[key] = now_ns

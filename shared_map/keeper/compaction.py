@@ -25,6 +25,9 @@ from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import Statements, base_seq, mark_set, next_expiry_ns, statements, taken
 from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, TILE_AREA, MarkKind, MarkSet
 
+_MOST_AUTHORS = 1 << 14
+"""Authors that count as living: names cost a sender nothing."""
+
 
 class CompactionPlan:
     """Dead authors, and tiles that may need compaction. Core: time is an argument.
@@ -45,7 +48,8 @@ class CompactionPlan:
 
     def heard(self, author: str, now_ns: int) -> None:
         """An author lives."""
-        self._heard_ns[author] = now_ns
+        if author in self._heard_ns or len(self._heard_ns) < _MOST_AUTHORS:
+            self._heard_ns[author] = now_ns
 
     def is_gone(self, author: str) -> bool:
         """Returns True if an author counts as dead since the last update."""

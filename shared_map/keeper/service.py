@@ -82,6 +82,7 @@ class KeeperService:
         self._bus = bus
         self._post = post
         self._id = setup.id
+        self._scenario = setup.scenario
         self._terrain = terrain
         self._numbers = class_numbers(setup.scenario)
         self._base_map = BaseMapServer(terrain, setup.id)
@@ -221,7 +222,8 @@ class KeeperService:
     def _save_sightings(self, now_ns: int) -> None:
         """Saves the newest sightings. They are for people to look at, so a full disk is no reason to try again."""
         self._sightings_due_ns = now_ns + NS_PER_S
-        new = {id: each for id, each in self._sightings.best(now_ns).items() if self._seen.get(id) != each}
+        best, targets = self._sightings.best(now_ns), self._orders.book.targets(self._scenario)
+        new = {id: best[id] for id in best if id in targets and self._seen.get(id) != best[id]}
         self._sightings.expire(now_ns)
         if new:
             self._seen.update(new)

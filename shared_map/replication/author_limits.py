@@ -19,6 +19,10 @@ _MAX_WAITING = 1 << 14
 """Sets of throttled processes that wait, in all. Sets without a place are requested again once a digest names them
 (docs/design/map-merge-law.md)."""
 
+_MOST_OWNERS = 4096
+"""Processes with a budget of their own; all later ones share one, as names cost a sender nothing."""
+_OTHERS = ""
+
 _BURST_S = 10
 """A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""
 _FORGET_NS = 60 * NS_PER_S
@@ -161,6 +165,8 @@ class Quota:
         return each.own.left > 0 and (self._total.left > 0 or each.share.left > 0)
 
     def _filled(self, owner: str, now_ns: int) -> _Budget:
+        if owner not in self._owners and len(self._owners) >= _MOST_OWNERS:
+            owner = _OTHERS
         each = self._owners.get(owner)
         if each is None:
             own, share = self._author_rate * _BURST_S, self._share(now_ns) * _BURST_S

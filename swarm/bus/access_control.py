@@ -83,8 +83,8 @@ def common_name(name: str, revoked: Collection[str]) -> str:
 
 def patterned(key: str) -> str:
     """A key expression of a subscription or queryable, so that it begins with a wildcard: routers number no part of
-    such a one, and so can confuse none (docs/design/misrouted-keys.md). It also matches in each namespace which
-    ends as that of the key: its owner compares the namespace of what comes."""
+    such a one, and so can confuse none (docs/design/misrouted-keys.md). It also matches in each namespace with
+    the same ending: a receiver compares the namespace."""
     return f"$*{key}"
 
 

@@ -79,7 +79,7 @@ def test_garbage_is_left_to_the_decoder_or_is_a_protocol_error(payload, key):
 
 
 def test_topics_that_share_a_message_are_known():
-    """A new one makes JSON on its topics refuse what does not say its key."""
+    """JSON must name its key on topics of another one, too."""
     uses = Counter(topic.message for topic in TOPICS if topic.published)
     assert {kind for kind in uses if uses[kind] > 1} == SHARED == {TargetPose}
 

@@ -24,7 +24,7 @@ from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher.router import Admission
 from launch_scripts.launcher.router_door import FREE_TRIES
 from launch_scripts.ports import free_ports
-from swarm.bus.access_control import ROUTER, Bearer, bearer, common_name
+from swarm.bus.access_control import ROUTER, Bearer, bearer, common_name, patterned
 from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_config import session_config
 from swarm.config.scenario import NetworkConfig, TlsConfig
@@ -195,7 +195,7 @@ class Trial:
         time.sleep(SETTLE_S)
 
     def _hear(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
-        for key in keys:
+        for key in forms(keys):
             subscriber = self.tried.declare_subscriber(key, lambda sample: got.add(str(sample.key_expr)))
             stack.callback(subscriber.undeclare)
         time.sleep(SETTLE_S)
@@ -209,7 +209,7 @@ class Trial:
         got |= {key for key in keys if replies(self.tried, key)}
 
     def _serve(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
-        for key in keys:
+        for key in forms(keys):
             stack.callback(self.tried.declare_queryable(key, reply).undeclare)
         time.sleep(SETTLE_S)
         got |= {key for key in keys if replies(self.counterpart, concrete(key))}
@@ -229,7 +229,7 @@ class Trial:
             stack.callback(self.tried.liveliness().declare_token(key).undeclare)
 
     def _watch(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
-        for key in keys:
+        for key in forms(keys):
             watcher = self.tried.liveliness().declare_subscriber(
                 key, lambda sample: got.add(str(sample.key_expr)), history=True
             )
@@ -243,6 +243,11 @@ class Trial:
         time.sleep(SETTLE_S)
         for key in keys:
             got |= {str(each.ok.key_expr) for each in self.tried.liveliness().get(key, timeout=1.0) if each.ok}
+
+
+def forms(keys: list[str]) -> list[str]:
+    """Key expressions of declarations: every second one begins with a wildcard, as those of our buses."""
+    return [patterned(key) if number % 2 else key for number, key in enumerate(keys)]
 
 
 def concrete(key: str) -> str:

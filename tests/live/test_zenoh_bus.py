@@ -37,6 +37,7 @@ from swarm.runtime.stats import Counters
 from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
+from swarm.wire.meant import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
@@ -129,7 +130,7 @@ def test_any_zenoh_session_gets_a_readable_answer(world):
     serve_cost(world.bus("planner"), requests)
     stranger = world.bus("stranger").session
     world.settle()
-    replies = list(stranger.get("swarm/target/*/cost?row=4;col=5;format=json", timeout=2.0))
+    replies = list(stranger.get("swarm/target/*/cost?row=4;col=5;format=json;key=target/*/cost", timeout=2.0))
     assert [str(reply.ok.key_expr) for reply in replies] == ["swarm/target/t0/cost"]
     assert json.loads(replies[0].ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
     assert replies[0].ok.encoding == zenoh.Encoding.APPLICATION_JSON
@@ -157,13 +158,15 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
     for selector, payload, complaint in (
         ("swarm/target/t0/cost?rwo=4", None, b"unknown parameter 'rwo'"),
         ("swarm/target/t0/cost?row=4", None, b"both row and col"),
+        ("swarm/target/t0/cost?row=4;col=5;key=target/t0/route", None, b"it is meant for 'target/t0/route'"),
+        ("swarm/target/t0/cost", meant_for("target/t1/cost", encode(CostRequest(row=4, col=5))), b"is meant for"),
         ("swarm/target/t0/cost", b"garbage", b"cost: "),
         ("swarm/target/t0/cost", encode(Nothing()), b"schema"),
     ):
         (reply,) = stranger.get(selector, payload=payload, timeout=2.0)
         assert complaint in reply.err.payload.to_bytes()
     assert requests == []
-    assert planner.counts["payloads_dropped"] == 4
+    assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (4, 2)
 
 
 def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):

@@ -288,16 +288,20 @@ def test_samples_of_one_sender_come_in_order(world: World):
 
 
 def test_two_namespaces_do_not_hear_each_other(world: World):
-    a, b, other = world.bus("a"), world.bus("b"), world.bus("c", "other")
+    a, b, other = world.bus("a"), world.bus("b"), world.bus("c", "warm")  # which "swarm" ends with
     box, foreign = Box(), Box()
     b.subscribe(NOTE, box)
     other.subscribe(NOTE, foreign)
+    other.collect(NOTE)
+    other.watch_alive(foreign)
     other.serve(RUN, answering((run_info(id="c"), {})), role="agent", id="c")
     world.settle()
+    a.declare_alive(Peer("agent", "a0", 7))
     a.publish(NOTE, note("x"), role="agent", id="a0")
     world.until(lambda: box)
     assert asked(world, a, RUN, Nothing()).of(AskEnded) == [AskEnded("q", RUN, 0, None)]
-    assert foreign == []
+    assert foreign == other.collected(NOTE) == []
+    assert not any(other.counts.values())
 
 
 def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):

@@ -37,6 +37,8 @@ MOST_LABELS = 40
 """With more labels nothing can be read."""
 OVER_S = 8.0
 """An alarm that is over is seen for so long."""
+_SHOWN = 256
+"""Targets whose searches are shown, as names cost a sender nothing."""
 _MOST_MARKS = 24
 """The serious come first, as in the list of alarms."""
 _UNSEEN = 2
@@ -119,7 +121,7 @@ class MoversView:
                 self._fleets_new = True
             case Sighted() as sighted:
                 self._sightings.receive(sighted, now_ns)
-            case Believed() as believed:
+            case Believed(target=target) as believed if target in self._believed or len(self._believed) < _SHOWN:
                 self._believed[believed.target] = believed, now_ns
             case Body() as body:
                 self._bodies.take_report(body, now_ns)

@@ -18,7 +18,7 @@ async fn main() -> zenoh::Result<()> {
 
     let started = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as u64;
     for seq in 1..=50 {
-        let body = json!({"incarnation": started, "seq": seq, "x_m": 1805.0, "y_m": -1215.0, "radius_m": 5.0});
+        let body = json!({"key": "body/rusty", "incarnation": started, "seq": seq, "x_m": 1805.0, "y_m": -1215.0, "radius_m": 5.0});
         session.put("swarm/body/rusty", body.to_string()).encoding(Encoding::APPLICATION_JSON).await?;
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
