@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import socket
 import threading
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
@@ -291,7 +292,11 @@ class Door:
         asyncio.run_coroutine_threadsafe(what, self._loop).result(_LISTEN_WITHIN_S)
 
     async def _listen(self, host: str, port: int) -> None:
-        server = await self._loop.create_server(lambda: _Visitor(self), host, port, backlog=_BACKLOG)
+        if host == "::":  # of both protocols, as Zenoh listens; asyncio would leave IPv4 out
+            listening = socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
+            server = await self._loop.create_server(lambda: _Visitor(self), sock=listening, backlog=_BACKLOG)
+        else:
+            server = await self._loop.create_server(lambda: _Visitor(self), host, port, backlog=_BACKLOG)
         self._servers.append(server)
         self.places += [each.getsockname()[:2] for each in server.sockets]
 

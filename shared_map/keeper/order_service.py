@@ -93,10 +93,17 @@ class KeptOrders:
             case _:
                 return False
 
+    @property
+    def authenticated(self) -> bool:
+        """True if codes authenticate orders: without certificates."""
+        return self._fresh is not None
+
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
         match asked.request:
-            case (GiveOrder() | ZoneOrder()) as order if order.changes and self._fresh is not None:
+            case (GiveOrder() | ZoneOrder()) as order if (
+                order.changes and self._fresh is not None and asked.topic.trusted
+            ):
                 return self._fresh.fault(order.stamp_ns, now_ns)
         return None
 

@@ -365,9 +365,15 @@ LEAD = Topic(
     put_bytes=_SHORT,
 )  # fmt: skip
 ZONES = Topic(
-    "zones", "order/{keeper}/zones", orders.Zones, "adds, removes and lists zones: areas that operators close",
+    "zones", "order/{keeper}/zone", orders.Zones, "adds, removes and lists zones: areas that operators close",
     "asked by people", access(serve="keeper:keeper"),
     request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    answer_bytes=_FILE,
+)  # fmt: skip
+SHORT_ZONES = Topic(
+    "short-zones", "order/{keeper}/zones", orders.Zones,
+    "the same without a code: on loopback such a zone ends after 10 s, and changes no other", "asked by people",
+    access(serve="keeper:keeper"), request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
     answer_bytes=_FILE,
 )  # fmt: skip
 GIVE_ORDER = Topic(
@@ -406,7 +412,7 @@ NOTE = Topic(
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
     LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST,
-    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
+    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES, SHORT_ZONES,
     GIVE_ORDER, ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 

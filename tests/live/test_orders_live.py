@@ -154,7 +154,7 @@ def test_a_program_in_any_language_orders_with_the_secret_and_each_order_counts_
     assert "counts once" in again
     (undated,) = ours.order("give", subject="pause")
     assert "stamp_ns is 0, expected the time of the order" in undated
-    (zones,) = ours.order("zones", action="list")
+    (zones,) = ours.order("zone", action="list")
     assert zones["zones"] == []
 
 
@@ -166,9 +166,7 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
         assert "no code" in str(stranger.order("give", **fields))
         assert "a false code" in str(guesses.order("give", **fields))
     assert "not in a payload" in str(stranger.ask("swarm/order/0/give?subject=pause", None, None))
-    assert "no code" in str(
-        stranger.order("zones", action="add", polygon=[[1, 1], [1, 9], [9, 9]], stamp_ns=now_ns)
-    )
+    assert "no code" in str(stranger.order("zone", action="add", polygon=[[1, 1], [1, 9], [9, 9]], stamp_ns=now_ns))
     # A keeper's whole book, forged: launchers and all processes drop it.
     added = {"subject": "target", "name": "forged", "stamp_ns": now_ns, "cell": 40, "added": True}
     session.put("swarm/orders/keeper/0", json.dumps({"orders": [added]}), encoding=zenoh.Encoding.APPLICATION_JSON)

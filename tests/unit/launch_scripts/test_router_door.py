@@ -175,6 +175,16 @@ def test_a_router_that_reopens_is_no_fault_of_its_visitors(door: Door, inside: I
         assert visitor.recv(1)
 
 
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="no IPv6 here")
+def test_a_door_at_all_addresses_of_ip_6_serves_ip_4_too(inside: Inside) -> None:
+    door = Door([("::", 0)], inside.listening.getsockname())
+    for host in ("127.0.0.1", "::1"):
+        with socket.create_connection((host, door.places[0][1]), 10) as visitor:
+            visitor.sendall(HELLO)
+            assert visitor.recv(1)
+    door.close()
+
+
 def test_a_closed_door_frees_its_port_and_a_taken_one_is_named(door: Door) -> None:
     place = door.places[0]
     with pytest.raises(BusError, match=rf"cannot listen on 127.0.0.1:{place[1]}: .*is the port taken"):
