@@ -274,6 +274,7 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         return
     yield from scenario_check.places(scenario, terrain, truth)
     yield from scenario_check.plots(scenario, terrain.grid)
+    yield from scenario_check.one_way_ground(scenario, terrain, truth)
     wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
     yield from machine.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)
