@@ -10,10 +10,12 @@ import numpy as np
 
 from launch_scripts.check.findings import Finding, failure, warning
 from launch_scripts.process_table import ROLES, certificate_names
+from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.sources import FILE_KINDS, is_terrain
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
@@ -24,11 +26,15 @@ from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.errors import ConfigError, SwarmError, TerrainError
-from swarm.grid import REGION_CELLS, GridSpec
+from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.places import cell_of
 from swarm.plugins.find import find_plugin
 from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Plots, fitting_regions
 from vehicle_agent.placement import spawn_cells
+
+_MOST_STEPS_CELLS = 1 << 21
+"""Each cell has eight steps: more would take seconds and gigabytes."""
+_TRAPS_SHARE = 0.01
 
 
 def files_of(scenario: Scenario) -> dict[str, str]:
@@ -189,6 +195,40 @@ def plots(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
             f"{agents} agents share {many} plots of right of way, and speak of each in which vehicles drive"
             f" {scenario.vehicles.tick_hz:g} times a second; set it to {fitting}, for larger ones",
         )
+
+
+def one_way_ground(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Finding]:
+    """Ground which vehicles of a class can enter and not leave, as they climb less steep slopes than they descend.
+
+    Larger terrains than `_MOST_STEPS_CELLS` are not looked at.
+    """
+    if not scenario.cost.directional or terrain.grid.cells > _MOST_STEPS_CELLS:
+        return
+    for name, own in class_grounds(scenario, terrain, truth).items():
+        if own.terrain.climb is None:
+            continue
+        share = traps(TrueTerrain(terrain.grid, own.truth, own.terrain.climb, own.homes))
+        if share >= _TRAPS_SHARE:
+            whom = "vehicles" if name == GROUND else f"vehicles of the class {name}"
+            yield warning(
+                "cost",
+                f"{share:.0%} of the ground that {whom} reach leads nowhere: they can enter it downhill, cannot"
+                " climb out, and strand there; raise max_climb_deg, lower max_descent_deg, or close it by a zone",
+            )
+
+
+def traps(ground: TrueTerrain) -> float:
+    """Returns the share of cells without a way back, among those to which ways lead from the largest part in which
+    each cell is reached from each other."""
+    from scipy.sparse import csgraph
+
+    _, graph = ground.steps_graph(Window(0, 0, ground.grid.rows, ground.grid.cols))
+    _, parts = csgraph.connected_components(graph, directed=True, connection="strong")
+    sizes = counted(parts, int(parts.max()) + 1)
+    reached = csgraph.breadth_first_order(
+        graph, int((parts == sizes.argmax()).argmax()), directed=True, return_predecessors=False
+    )
+    return float(1.0 - sizes.max() / len(reached))
 
 
 def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:

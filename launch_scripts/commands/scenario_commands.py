@@ -279,6 +279,7 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         from launch_scripts.check.plugin_check import not_made
 
         yield from not_made(scenario, terrain.grid, truth)
+    yield from scenario_check.one_way_ground(scenario, terrain, truth)
     wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
     yield from machine.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)

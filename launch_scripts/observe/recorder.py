@@ -283,7 +283,7 @@ class Recorder(RunFigures):
 
 _TOTALS = (
     "routes_received", "growths", "window_growths", "messages_out", "messages_in", "bytes_out", "bytes_in",
-    "ticks_late", "ticks_dropped",
+    "ticks_late", "ticks_dropped", "first_uses",
 )  # fmt: skip
 """Counts that are reported, summed over all processes."""
 DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")

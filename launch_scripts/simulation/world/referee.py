@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Container, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -37,12 +37,26 @@ several reports state one encounter."""
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """Two vehicles on one cell at one time; reported once per encounter."""
+    """Two vehicles on one cell at one time; reported once per encounter.
+
+    evidence  the two stays that overlap: the reports on which they rest are in the recordings of the run
+    """
 
     first: str
     second: str
     cell: int
     stamp_ns: int
+    evidence: tuple[Stay, Stay] = field(compare=False)
+
+    def sentence(self, began_ns: int) -> str:
+        """Returns what was found, and the reports which prove it; times are since the run began."""
+
+        def said(stay: Stay) -> str:
+            begin_s, end_s = ((each_ns - began_ns) / NS_PER_S for each_ns in (stay.begin_ns, stay.end_ns))
+            reports = f"reports {stay.first_seq} to {stay.seq} of {stay.author}"
+            return f"{stay.vehicle} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
+
+        return f"{self.first} and {self.second} on one cell: {' and '.join(map(said, self.evidence))}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +100,7 @@ class Stay:
     """A vehicle on a cell, from the first to the last time at which it is known to be there.
 
     since_ns  the earliest time at which it may have come there
-    author    of the last report of it, which has the number `seq`
+    author    of the last report of it, which has the number `seq`; the first has `first_seq`
     """
 
     vehicle: str
@@ -96,6 +110,7 @@ class Stay:
     since_ns: int
     author: str
     seq: int
+    first_seq: int
 
 
 Encounters = dict[tuple[str, str], int]
@@ -162,7 +177,7 @@ class Referee:
                 continue
             stay = vehicles.get(id)
             if stay is None:
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, author, seq), fleet, broken)
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, author, seq, seq), fleet, broken)
                 continue
             before_ns = stay.end_ns
             if stamp_ns <= before_ns:
@@ -176,7 +191,7 @@ class Referee:
                     broken.extend(self._meetings(stay))
             if not stands:
                 since_ns = stamp_ns if gapless else before_ns
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, author, seq), fleet, broken)
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, author, seq, seq), fleet, broken)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)
         return broken
@@ -195,10 +210,11 @@ class Referee:
             overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
             if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
                 continue
-            first, second = sorted((stay.vehicle, other.vehicle))
+            both = (stay, other) if stay.vehicle < other.vehicle else (other, stay)
+            first, second = both[0].vehicle, both[1].vehicle
             until_ns = min(stay.end_ns, other.end_ns)
             if _is_new(self._encounters, (first, second), until_ns):
-                yield Collision(first, second, stay.cell, until_ns)
+                yield Collision(first, second, stay.cell, until_ns, (replace(both[0]), replace(both[1])))
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""

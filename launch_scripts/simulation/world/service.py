@@ -89,7 +89,7 @@ class TargetsService:
         )
         self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
-        self._anew = setup.anew
+        self._anew, self._began_ns = setup.anew, setup.started_ns
         self._heard: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._throttle = PoseThrottle(terrain.grid.resolution_m)
@@ -194,7 +194,7 @@ class TargetsService:
                     self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell, target=target)
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
-                    self._alarm("collision", f"{first} {second}", f"{first} and {second} on one cell", cell, now_ns)
+                    self._alarm("collision", f"{first} {second}", action.sentence(self._began_ns), cell, now_ns)
                 case Body():
                     self._bus.publish(BODY, action, id=action.id)
                 case BodyHit(cell=cell, by_vehicle=by_vehicle):

@@ -117,7 +117,7 @@ class TrueTerrain:
         from scipy.sparse.csgraph import dijkstra
 
         window = self.grid.around(start, WAY_HALF_CELLS)
-        cells, graph = self._steps_graph(window)
+        cells, graph = self.steps_graph(window)
         here = int(np.searchsorted(cells, start))
         cost, before = dijkstra(graph, directed=True, indices=np.asarray(here), return_predecessors=True)
         reached = np.isfinite(cost)
@@ -133,7 +133,7 @@ class TrueTerrain:
             at = int(before[at])
         return way[::-1]
 
-    def _steps_graph(self, window: Window) -> tuple[NDArray[np.int64], csr_array[np.float64]]:
+    def steps_graph(self, window: Window) -> tuple[NDArray[np.int64], csr_array[np.float64]]:
         """The cells of a window, int64 (n,), and the graph of all possible steps between them (n, n): an edge costs
         what the step does, in cells."""
         from scipy.sparse import csr_array

@@ -13,12 +13,14 @@ import pytest
 import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import places, plots
+from launch_scripts.check.scenario_check import places, plots, traps
 from launch_scripts.commands.scenario_commands import Choices, _asked
+from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.agents import plan_agents
@@ -278,6 +280,38 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
     row, col = start
     fine = 0 <= row < 6 and 0 <= col < 4 and np.isfinite(pace[row, col])
     assert bool(found) == (not fine), found
+
+
+class Steps:
+    """A climb of at most one, and any descent."""
+
+    def __init__(self, heights: NDArray[np.int64]) -> None:
+        self.heights = heights.reshape(-1)
+
+    def allows(self, tail: int, head: int) -> bool:
+        return bool(self.heights[head] - self.heights[tail] <= 1)
+
+    def along(self, tails: NDArray[np.int64], heads: NDArray[np.int64]) -> NDArray[np.float32]:
+        return np.where(self.heights[heads] - self.heights[tails] <= 1, 1.0, np.inf).astype(np.float32)
+
+
+@FEW
+@given(st.lists(st.integers(0, 4), min_size=20, max_size=20))
+def test_ground_that_can_be_entered_and_not_left_is_what_steps_lead_to_and_not_back(heights: list[int]) -> None:
+    tall = np.array(heights, np.int64).reshape(4, 5)
+    ground = TrueTerrain(GridSpec(4, 5, 1.0), np.ones((4, 5), np.float32), Steps(tall))  # type: ignore[arg-type]
+
+    def reached(cell: int) -> frozenset[int]:
+        found, new = {cell}, [cell]
+        while new:
+            new = [to for at in new for _, to in ground.steps(at) if to not in found and not found.add(to)]  # type: ignore[func-returns-value]
+        return frozenset(found)
+
+    ways = {cell: reached(cell) for cell in range(20)}
+    parts = [{to for to in ways[cell] if cell in ways[to]} for cell in range(20)]
+    most = max(map(len, parts))
+    shares = {1 - most / len(ways[cell]) for cell in range(20) if len(parts[cell]) == most}
+    assert any(abs(traps(ground) - share) < 1e-9 for share in shares)
 
 
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,12 @@ def a(stamp_ms: float, cell: int, **fields: Any) -> Fleet:
 
 def test_two_vehicles_on_one_cell_at_one_time_collide() -> None:
     (collision,) = judged(a(100, 5), b(150, 5), a(200, 6), b(250, 5))
-    assert collision == Collision("a", "b", 5, 200_000_000)
+    assert isinstance(collision, Collision)
+    assert (collision.cell, collision.stamp_ns) == (5, 200_000_000)
+    by_a, by_b = ("a from 0.100 to 0.200 s", "b from 0.150 to 0.250 s")
+    assert re.sub(r" \(reports \d+ to \d+ of a\d\.1\)", "", collision.sentence(0)) == (
+        f"a and b on one cell: {by_a} and {by_b}"
+    )
 
 
 def test_an_encounter_counts_once_and_the_next_one_again() -> None:

@@ -68,6 +68,7 @@ def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
     assert service.counters.counts == {
         "ticks_dropped": 2,
         "ticks_late": 2,
+        "first_uses": 0,
         "events_dropped": 0,
         "asks_expired": 0,
     }
