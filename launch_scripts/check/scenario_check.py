@@ -64,8 +64,9 @@ def _of_source(name: str) -> Iterator[Finding]:
 def _of_file(key: str, path: Path) -> Iterator[Finding]:
     if not path.exists():
         yield failure(key, f"no such file {path}")
-    elif path.is_dir():
-        yield failure(key, f"found {path}, it is a folder; expected a file")
+    elif not path.is_file():  # to open a pipe waits for a writer
+        what = "a folder" if path.is_dir() else "a device or pipe"
+        yield failure(key, f"found {path}, it is {what}; expected a file")
     else:
         try:
             with path.open("rb"):

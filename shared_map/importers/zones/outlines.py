@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from shared_map.importers.zones.burn import Drawn
 from shared_map.importers.zones.zone_files import Drawing, FileFacts, closed_shapes, draw_zone
 from swarm.config.ground import ZoneConfig
@@ -13,6 +15,10 @@ from swarm.grid import GridSpec
 
 Corner = tuple[float, float]
 MOST_OUTLINES = 50
+_POLYGON = 3
+_LEAST_HALF = 0.71
+"""Half the least width of a line or a point in cells: the middle of each cell that it crosses is within it, and an
+order closes a cell by its middle."""
 _TOLERANCES_CELLS = (0.01, 0.05, 0.1, 0.25)
 """Tolerances for dropped corners, tried in order until few enough are left."""
 
@@ -30,8 +36,8 @@ def outlines_of(zone: ZoneConfig, grid: GridSpec, most_corners: int) -> list[lis
     Raises
     ------
     TerrainError
-        A scenario's zone would be refused with the same file, or a line or a point has no width, or an area has
-        more than `most_corners` corners, or there are too many areas.
+        A scenario's zone would be refused with the same file, or an area has more than `most_corners` corners, or
+        there are too many areas.
     """
 
     what = f"zone {zone.file}"
@@ -53,11 +59,9 @@ def _outlines(drawing: Drawing, grid: GridSpec, what: str, most_corners: int) ->
     import shapely
 
     drawn = closed_shapes(drawing, grid)
-    if any(each.shape.geom_type != "Polygon" and not each.width_cells for each in drawn):
-        raise TerrainError(
-            f"{what} holds a line or a point without a width, which an order cannot close; buffer it"
-        )
-    areas = [shapely.buffer(each.shape, each.width_cells / 2) if each.width_cells else each.shape for each in drawn]
+    shapes = np.array([each.shape for each in drawn], object)
+    halves = np.maximum([each.width_cells / 2 for each in drawn], _LEAST_HALF)
+    areas = np.where(shapely.get_type_id(shapes) == _POLYGON, shapes, shapely.buffer(shapes, halves))
     parts = shapely.get_parts(shapely.union_all(areas))
     if not len(parts):
         raise TerrainError(f"{what} holds no area on the terrain")

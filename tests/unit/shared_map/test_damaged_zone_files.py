@@ -19,9 +19,11 @@ from hypothesis import strategies as st
 from support.effort import few
 from support.zone_shapes import UTM, feature, geojson, in_crs, middles, painted, squares, written
 
+from launch_scripts.check.scenario_check import files_named
 from shared_map.importers.zones.outlines import outlines_of
 from shared_map.terrain.layers import polygon_mask
-from swarm.config.ground import ZoneConfig
+from swarm.config.ground import CostConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -325,6 +327,10 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
     elif name == "folder":
         path.mkdir()
     zone = ZoneConfig(kind="forbidden", file=str(path))
+    if len(name) < 9:
+        scenario = Scenario(cost=CostConfig(zones=(zone,)))
+        found = [each.text for each in files_named(scenario) if each.about.startswith("cost.zones")]
+        assert len(found) == 1
     with pytest.raises(TerrainError, match=r"cannot read zone"):
         painted([zone])
     with pytest.raises(TerrainError, match=r"cannot read zone"):
