@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import LiveSwarm
+from support.live_swarm import swarm as command
 from support.processes import eventually
 
 from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, connect
@@ -29,10 +30,11 @@ RUST = os.environ.get("RUST_VEHICLE", "")
 class Run:
     """A script under way."""
 
-    def __init__(self, text: str, endpoint: str) -> None:
+    def __init__(self, text: str, endpoint: str, *arguments: object) -> None:
         text = text.replace("tcp/127.0.0.1:7447", endpoint)
         self.process = subprocess.Popen(
-            [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            [sys.executable, "-c", text, *map(str, arguments)], stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
 
@@ -73,6 +75,25 @@ def test_the_tracker_of_the_page_moves_its_target_and_the_planner_follows(live: 
         place = watching.targets["fox"]
         eventually(lambda: watching.targets["fox"].x_m != place.x_m, 10, "its moving")
         assert run.end(within_s=40) == ""
+
+
+def test_a_tracker_with_zenoh_alone_owns_its_target_until_it_is_dead(live: LiveSwarm, swarm: Swarm) -> None:
+    place = swarm.frame.centre_m(swarm.frame.grid.cell(50, 60))
+    said = ("fox", "radar", *place), ("fox", "camera", place[0], place[1] + 300)
+    text = (EXAMPLES / "tracker.py").read_text()
+    route = ("route", "--target", "fox", "--from", "cell:40,40", "--connect", live.endpoint)
+    with swarm.observer() as watching:
+        first = Run(text, live.endpoint, live.endpoint, *said[0])
+        eventually(lambda: (fox := watching.targets.get("fox")) and fox.tracker == "radar", 20, "the first tracker")
+        second = Run(text, live.endpoint, live.endpoint, *said[1])
+        eventually(lambda: live.said("poses of tracker camera are refused, as tracker radar owns it"), 20, "a note")
+        assert (watching.targets["fox"].x_m, watching.targets["fox"].y_m) == place
+        first.process.kill()
+        eventually(lambda: watching.targets["fox"].tracker == "camera", 20, "the second tracker")
+        second.process.kill()
+        eventually(lambda: watching.targets["fox"].lost, 20, "the loss")
+    lost = "fox is lost: it has no tracker, and this is its position"
+    eventually(lambda: lost in command(*route).stdout, 20, "that the planner says so")
 
 
 def test_a_live_vehicle_hears_routes_by_callbacks_and_streams_and_what_is_wrong_in_sentences(swarm: Swarm) -> None:

@@ -12,10 +12,9 @@ import pytest
 from launch_scripts.commands.simulation_commands import simulate_seeds
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
-from launch_scripts.simulation.many_seeds import MIX, Verdict, parse_seeds, run_seeds, try_seed, world_of
+from launch_scripts.simulation.many_seeds import MIX, Verdict, run_seeds, try_seed, world_of
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
-from swarm.errors import ConfigError
 from vehicle_agent.traffic.steering import Steering
 
 
@@ -41,13 +40,6 @@ def test_a_scenario_of_ones_own_is_tried_too():
     given = msgspec.structs.replace(SMALL, name="mine")
     [verdict] = run_seeds("mine", range(3, 4), jobs=1, seconds=4, given=given)
     assert same(verdict) == same(msgspec.structs.replace(try_seed("small", 3, 4)[0], world="mine"))
-
-
-@pytest.mark.parametrize("text", ["5", "5:5", "6:5", "-1:3", "a:b", "1:2:3", "1:" + "9" * 40])
-def test_seeds_that_are_no_range_are_refused_with_what_was_expected(text):
-    with pytest.raises(ConfigError, match="is not A:B with A < B"):
-        parse_seeds(text)
-    assert list(parse_seeds("5:8")) == [5, 6, 7]
 
 
 def test_a_process_that_never_comes_back_breaks_a_law():

@@ -107,13 +107,6 @@ def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it
         check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
 
 
-def test_a_name_that_the_router_would_not_know_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    told = run("certs", tmp_path / "certs", "keeper.0", "car1")
-    assert isinstance(told.exception, ConfigError)
-    assert "'car1' is no name of a process: write ROLE.ID or agent.GROUP.ID" in str(told.exception)
-    assert not (tmp_path / "certs").exists()
-
-
 def test_zenohd_admits_the_processes_of_a_scenario_and_needs_one_with_certificates(
     tmp_path: Path, scenario: Path
 ) -> None:

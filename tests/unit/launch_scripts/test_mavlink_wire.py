@@ -214,15 +214,6 @@ def test_addresses_are_read(text: str, shown: str) -> None:
     assert str(read_address(text)) == shown
 
 
-@pytest.mark.parametrize(
-    "text", ["", "14550", "udp:1.2.3.4:5", "udpin:1.2.3.4", "udpin:host:0", "udpin:host:65536", "tcp::5", "serial:",
-             "serial:/dev/x:fast", "udpin:a:b:5", "log.bin"],
-)  # fmt: skip
-def test_what_is_no_address_is_one_sentence(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"LINK: found .* expected udpin:HOST:PORT"):
-        read_address(text)
-
-
 @contextlib.contextmanager
 def opened(text: str) -> Iterator[UdpLink | StreamLink]:
     link = open_link(read_address(text))

@@ -108,7 +108,7 @@ def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
     assert FLEET.name in [heard.topic.name for heard in observer.due(NS_PER_S // 2, all=True)]
 
 
-# --- `swarm status` says which processes speak an older wire version, and names those that are too ----------------
+# --- `swarm status` during an upgrade -----------------------------------------------------------------------------
 
 MEMBER = keeper_info(GridSpec(4, 5, 90.0))
 

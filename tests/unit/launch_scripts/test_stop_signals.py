@@ -156,7 +156,7 @@ def test_a_request_is_known_though_a_library_swallows_the_exception(number: sign
     assert signal.getsignal(number) is before
 
 
-# --- the processes that ` -----------------------------------------------------------------------------------------
+# --- processes that ./launch_scripts/test starts end with it ----------------------------------------------------
 
 STARTS = """
 import subprocess, sys, time

@@ -68,20 +68,6 @@ vehicles.per_agent = 3
     assert len({(scenario, label) for scenario, _, label, _ in cases}) == len(cases)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('scenarios = ["nowhere"]', "no scenario 'nowhere'"),
-        (f"{STUDY}map.lerning = [true]", "unknown key map.lerning; did you mean 'learning'?"),
-        (f"{STUDY}planner.routes = ['grid', 'straight']", "planner.routes: found 'straight'"),
-    ],
-)
-def test_a_setting_that_no_scenario_has_is_refused_before_anything_runs(tmp_path, text, said):
-    with pytest.raises(ConfigError) as error:
-        Sweep(write_study(tmp_path, text), tmp_path / "out")
-    assert said in str(error.value)
-
-
 def test_a_key_of_a_result_follows_from_what_decides_it_and_from_nothing_else(tmp_path):
     def keys(text: str = STUDY) -> set[str]:
         path = write_study(tmp_path, text)
@@ -290,20 +276,6 @@ def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws
     assert "sense_range_m = 120" in shown.out
     assert "failed: swarm simulate" in shown.out
     assert "1 of 6 trials broke a law" in shown.out
-
-
-@pytest.mark.parametrize(
-    ("scheduler", "workers", "said"),
-    [
-        ("nonsense", None, "--scheduler: found 'nonsense', expected an address such as tcp://127.0.0.1:8786"),
-        ("inproc://127.0.0.1:8786", None, "--scheduler: found 'inproc://127.0.0.1:8786'"),
-        ("tcp://127.0.0.1:8786", 2, "--workers goes without --scheduler"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(tmp_path, scheduler, workers, said):
-    with pytest.raises(ConfigError) as error:
-        sweep_study(str(write_study(tmp_path)), scheduler, workers, tmp_path / "out", as_json=False)
-    assert said in str(error.value)
 
 
 # --- intervals ---------------------------------------------------------------------------------------------------

@@ -29,7 +29,6 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
-from swarm.errors import ConfigError
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note, Stats
@@ -276,17 +275,6 @@ def test_a_pose_with_the_highest_incarnation_that_there_is_leaves_a_standby_its_
     pose = standby.poses()["t"]
     assert (pose.incarnation, pose.captures, pose.jumps) == (5, 1, 1)
     assert decode(encode(pose), TargetPose) == pose
-
-
-@pytest.mark.parametrize(
-    ("start", "sentence"),
-    [((40, 3), r"target t: start is \[40, 3\], outside the terrain: 40 x 50"), ((0, 0), "is lethal")],
-)
-def test_a_start_nobody_can_stand_on_is_refused(start: tuple[int, int], sentence: str) -> None:
-    pace = flat()
-    pace[0, 0] = np.inf
-    with pytest.raises(ConfigError, match=sentence):
-        World(TargetConfig(start=start), pace=pace)
 
 
 # --- what is told ---------------------------------------------------------------------------------------------
