@@ -100,6 +100,7 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
         "stopwatch": time.thread_time_ns,
         "all kernels": lambda: next(calls) > 40,
         "kernels of classes": lambda: True,
+        "modules of zones": lambda: True,
     }
     function, outside = Recording.function, Recording.external
 
