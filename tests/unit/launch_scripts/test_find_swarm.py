@@ -164,26 +164,30 @@ def test_a_process_which_outlives_its_launcher_is_seen_and_ended(
     code = "import os; log = open('agent-a0.log', 'a'); log.write('last\\n'); log.flush(); os.kill(os.getpid(), 19)"
     words = [sys.executable, "-c", code, "swarm" if is_ours else "other"]
     with subprocess.Popen(words, cwd=tmp_path / "r", start_new_session=True) as left:
-        os.waitpid(left.pid, os.WUNTRACED)
-        (run,) = json.loads(swarm("ps --json")[1])
-        told = swarm("down r")
-        assert (run["state"], run["processes"]) == ("left over", 1)
-        assert told[0] == (0 if is_ours else 2)
-        assert ("killed: agent-a0" if is_ours else "r does not run here") in told[1] + told[2]
-        assert (left.wait(30) if is_ours else left.poll()) == (-9 if is_ours else None)
-        left.kill()
+        try:
+            os.waitpid(left.pid, os.WUNTRACED)
+            (run,) = json.loads(swarm("ps --json")[1])
+            told = swarm("down r")
+            assert (run["state"], run["processes"]) == ("left over", 1)
+            assert told[0] == (0 if is_ours else 2)
+            assert ("killed: agent-a0" if is_ours else "r does not run here") in told[1] + told[2]
+            assert (left.wait(30) if is_ours else left.poll()) == (-9 if is_ours else None)
+        finally:
+            left.kill()
     assert json.loads(swarm("ps -a --json")[1])[0]["state"] == "broke off"
 
 
 def test_a_stopped_launcher_is_shown_so(tmp_path: Path, swarm: Swarm) -> None:
     make_run(tmp_path, "r", 9, "2026-11-01T00:00:00Z")
     with subprocess.Popen([sys.executable, "-c", "import os; os.kill(os.getpid(), 19)"]) as stopped:
-        os.waitpid(stopped.pid, os.WUNTRACED)
-        (file,) = (tmp_path / "state" / "runs").iterdir()
-        entry = json.loads(file.read_text()) | {"pid": stopped.pid, "started_s": _started_s(stopped.pid)}
-        file.write_text(json.dumps(entry))
-        assert json.loads(swarm("ps --json")[1])[0]["state"] == "stopped"
-        stopped.kill()
+        try:
+            os.waitpid(stopped.pid, os.WUNTRACED)
+            (file,) = (tmp_path / "state" / "runs").iterdir()
+            entry = json.loads(file.read_text()) | {"pid": stopped.pid, "started_s": _started_s(stopped.pid)}
+            file.write_text(json.dumps(entry))
+            assert json.loads(swarm("ps --json")[1])[0]["state"] == "stopped"
+        finally:
+            stopped.kill()
 
 
 @pytest.mark.parametrize(
