@@ -234,8 +234,8 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     """Draws a plan for a run of a scenario: everything at once in the first three fifths, nothing in the rest.
 
     Returns random faults: crashes of any process; partitions, unnoticed, noticed and one-way; hangs; clock offsets
-    and steps; second lives of agents; stops within calls; messages lost, late, repeated and out of order. A seed
-    may leave any of them out, so that a failure shows what it needs.
+    and steps; second lives of agents; messages lost, late, repeated and out of order. A seed may leave any of them
+    out, so that a failure shows what it needs.
 
     Agents with at most one other in their layer, on the ground or in the air, have no second life elsewhere: a plot
     of theirs has one member, and it is unknown which of its files is the first.
@@ -283,8 +283,6 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
         hangs=tuple(hangs),
         twins=tuple(twins),
     )
-    if not plan.hangs:  # which a stop would end early
-        plan = replace(plan, stutter=chance.choice((0.0, 0.01)))
     return replace(plan, clock_steps=_within_half_a_day(clock_steps, plan.skews_ms))
 
 
