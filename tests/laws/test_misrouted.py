@@ -103,6 +103,7 @@ def test_a_pose_that_comes_as_a_true_pose_is_not_believed():
         a.publish(topic, pose(), target="t0")
     world.settle()
     assert not poses
+    b.gather()
     assert not b.collected(TRUE_POSE)
     assert (b.counts["payloads_misrouted"], b.counts["payloads_dropped"]) == (2, 0)
     b.swap = None

@@ -56,6 +56,7 @@ def test_a_zone_is_heard_only_from_who_knows_the_secret_and_other_marks_from_eve
         bus.publish(MARKS, marks(author, 0), region=0, tile=0, author=author)
 
     def authors():
+        hears.gather()
         ticks.extend(hears.collected_together(MARKS))
         return {message.author for _, message in ticks}
 

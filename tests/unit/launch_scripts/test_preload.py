@@ -23,6 +23,11 @@ simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m
 from launch_scripts.simulation.worlds import crowd
 from swarm.bus.endpoints import listening
 
+from launch_scripts.simulation.world.walks import WAY_MODULES
+from shared_map.keeper.zone_orders import ZONE_MODULES
+from swarm.runtime.first_use import Modules
+
+Modules([*ZONE_MODULES, *WAY_MODULES]).wait()  # loaded beside the loops of one role each
 scenario, terrain = crowd("open", 1, 8, 4)
 simulation = simulate.Simulation(scenario, terrain=terrain)
 before = set(sys.modules)

@@ -415,9 +415,9 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
         f"{role}-{id} was silent" for role, id in recorder.observed.plan.crew if id != "a0"
     }
     assert "keeper-0 was silent for 15 s" in facts.verdict({"vehicles": 0, "alarms": told_at_end})
-    ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
-    hear(recorder, ended, at_s=at_s + 1)
-    assert not [alarm for alarm in recorder.summary(int((at_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
+    ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
+    hear(recorder, ended, at_s=later_s + 1)
+    assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
 
 
 def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(

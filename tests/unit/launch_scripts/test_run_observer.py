@@ -102,9 +102,11 @@ def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
         agent.publish(FLEET, report, region=0, author=report.author)
         agent.publish(STATS, stats("a0"), role="agent", id="a0")
         swarm.run(0.1)
+        observer._bus.gather()
         due = [heard.topic.name for heard in observer.due(tick * NS_PER_S // 4)]
         assert (FLEET.name in due) == (tick == 0)
         assert STATS.name in due
+    observer._bus.gather()
     assert FLEET.name in [heard.topic.name for heard in observer.due(NS_PER_S // 2, all=True)]
 
 
