@@ -126,9 +126,10 @@ def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
 def from_json(text: str | bytes) -> ExportedMap:
     """Reads an export. Raises StoreError with the place of the fault."""
     try:
-        read = msgspec.json.decode(text, type=_Export)
+        found = msgspec.json.decode(text)
+        read = msgspec.convert(found, _Export)
     except msgspec.ValidationError as error:
-        reason = explain(str(error), msgspec.json.decode(text), _Export, "file")
+        reason = explain(str(error), found, _Export, "file")
         if reason.endswith("something else"):
             reason = f"{reason.partition(':')[0]}: {located(str(error))[0]}"
         raise StoreError(f"not an exported map: {reason}") from error
