@@ -57,7 +57,7 @@ def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
         kept = serve_raw(bus)
         pipe.send("ready")
-        run_service(service, inbox, pipe, lambda *_: None)
+        run_service(service, bus, inbox, pipe, lambda *_: None)
         del kept
 
 
@@ -204,7 +204,7 @@ def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
         raw = bus.session.declare_subscriber(f"{RAW}/fleet/**", zenoh.handlers.FifoChannel(1 << 14))
         kept = read_on_thread(raw, lambda sample: raw_received.append(len(sample.payload.to_bytes())))
         pipe.send("ready")
-        run_service(watcher, inbox, pipe, answer)
+        run_service(watcher, bus, inbox, pipe, answer)
         del kept
 
 
