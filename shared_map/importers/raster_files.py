@@ -95,6 +95,8 @@ describes in memory."""
 
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
+    if not path.is_file():  # a pipe would wait for ever
+        return False
     if path.suffix.lower() in (*_DRIVERS_BY_ENDING, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:

@@ -151,6 +151,8 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         raise TerrainError(f"terrain {path} does not exist: no such file; give one, or jacksboro or synthetic")
     if path.is_dir():
         raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
+    if not path.is_file():
+        raise TerrainError(f"terrain {path} is a pipe or a device; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()
     if suffix not in _READERS and not is_raster(path):
         raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")

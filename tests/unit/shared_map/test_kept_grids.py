@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -183,6 +184,13 @@ def test_a_refusal_states_what_was_found(
         write_raster(path, 10.0, numbers=HEIGHTS * np.float32(scale), **profile)
     with pytest.raises(TerrainError, match=words):
         load(path)
+
+
+@pytest.mark.parametrize("ending", ["tif", "asc", "npz", "xyz", "yaml", "geojson"])
+def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
+    os.mkfifo(tmp_path / f"dem.{ending}")
+    with pytest.raises(TerrainError, match="is a pipe or a device"):
+        load(tmp_path / f"dem.{ending}")
 
 
 def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
