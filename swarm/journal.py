@@ -166,7 +166,7 @@ class Journal:
         """Open files; -1 is none."""
         self._at = self._size = self._spare_size = 0
         """Position of the next record, and the length of the two files."""
-        self._synced = True
+        self._synced, self._is_broken = True, False
         self._seal = Seal(f"{kind.what} 1", secrets.token_bytes(8), 0, 0, b"")
         """The seal of all records, also of those which are not synced."""
         self.found: list[bytes] = []
@@ -226,9 +226,15 @@ class Journal:
     def sync(self) -> None:
         """Returns once all records are on the disk, and the seal counts them."""
         if not self._synced:
+            if self._is_broken:  # the system tells only once of a write that was lost: all is written again
+                self._switch()
+                self._is_broken = False
+                return
+            self._is_broken = True
             with writing(self._path):
                 os.fdatasync(self._file)
                 os.pwrite(self._file, self._seal.packed(), 0)
+            self._is_broken = False
             self._lock.witness(self._seal)
             self._synced = True
 

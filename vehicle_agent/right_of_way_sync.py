@@ -62,6 +62,8 @@ _PROMISE_TIMEOUT_S = 10.0
 """A late member replies late, and its promise counts until we claim again: by epoch, so it does no harm."""
 _MOST_REFUSALS_TOLD = 100
 """Liars may say as many different things as they like."""
+_MOST_DIGITS = 9
+"""Digits of a plot's number in a key."""
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
@@ -229,7 +231,7 @@ class RightOfWaySync:
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
         """A claim is answered to the member whose epoch it is, under its own name."""
-        if not asked.fields["plot"].isdecimal():
+        if not asked.fields["plot"].isdecimal() or len(asked.fields["plot"]) > _MOST_DIGITS:
             return
         plot, plots = int(asked.fields["plot"]), self.core.plots
         if plot in plots.all and asked.fields["member"] == plots.warden(plot, epoch):

@@ -27,6 +27,10 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
     return sum(told) if told else None
 
 
+_MOST_LIVES = 1 << 13
+"""Lives of processes that are counted: names may be made up by strangers."""
+
+
 class Counts:
     """The newest counts of every incarnation of every process."""
 
@@ -43,6 +47,8 @@ class Counts:
         """Takes in what a process says."""
         key = (stats.role, stats.id, stats.incarnation)
         known = self._stats.get(key)
+        if known is None and len(self._stats) >= _MOST_LIVES:
+            return
         if known is None or stats.stamp_ns >= known.stamp_ns:
             self._stats[key] = stats
             self._counting = None

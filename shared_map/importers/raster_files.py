@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.terrain.row_bands import bands
-from swarm.config.input_files import FileKind, check_bytes, size
+from swarm.config.input_files import FileKind, check_bytes, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -146,19 +146,35 @@ def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iter
         dataset = files.enter_context(rasterio.open(name, driver=driver))
         _check_size(dataset, what)
         if driver in _TEXT_DRIVERS:
-            dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), files)
+            beside = _system_beside(path, what) if str(name).startswith("/vsisubfile/") else None
+            dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), beside, files)
         if dataset.transform.is_identity and dataset.gcps[0]:
             dataset = files.enter_context(WarpedVRT(dataset))
         yield dataset
 
 
-def _in_memory(dataset: Any, numbers: NDArray[Any], nodata: float | None, files: contextlib.ExitStack) -> Any:
+def _system_beside(path: Path, what: str) -> Any:
+    """The system of a .prj, which GDAL does not find beside a part of a file."""
+    import rasterio
+
+    found = path.with_suffix(".prj")
+    if not found.is_file():
+        return None
+    try:
+        return rasterio.CRS.from_wkt(read_text(found, FileKind.ROS_MAP), morph_from_esri_dialect=True)
+    except ValueError as error:
+        raise TerrainError(f"{what}: {found} holds no coordinate system") from error
+
+
+def _in_memory(
+    dataset: Any, numbers: NDArray[Any], nodata: float | None, beside: Any, files: contextlib.ExitStack
+) -> Any:
     """The same raster with other numbers."""
     from rasterio import MemoryFile
 
     memory = files.enter_context(MemoryFile())
     profile = {"count": 1, "height": dataset.height, "width": dataset.width, "dtype": numbers.dtype}
-    place = {"crs": dataset.crs, "transform": dataset.transform, "nodata": nodata}
+    place = {"crs": dataset.crs or beside, "transform": dataset.transform, "nodata": nodata}
     with memory.open(driver="GTiff", BIGTIFF="YES", **profile, **place) as copy:
         copy.write(numbers, 1)
         copy.update_tags(**{AS_TEXT: dataset.driver})
@@ -174,13 +190,13 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
     numbers = np.empty(dataset.height * dataset.width, np.float32)
     expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
     with path.open("rb") as file:
-        lines, void = _skip_header(file, dataset.driver)
+        lines, void = _skip_header(file, dataset.driver, what)
         count, rest, last = 0, b"", False
         while not last:
             piece = file.read(_TEXT_PIECE_BYTES)
             last = not piece
-            end = len(piece) if last else piece.rfind(b"\n") + 1 or piece.rfind(b" ") + 1
-            text, rest = rest + piece[:end], piece[end:] if end else rest + piece
+            end = len(piece) if last else max(piece.rfind(space) for space in (b"\n", b" ", b"\t", b"\r")) + 1
+            text, rest = (rest + piece[:end], piece[end:]) if end or last else (b"", rest + piece)
             words = text.replace(b",", b".").split()
             fits = words[: numbers.size - count]
             try:
@@ -203,21 +219,39 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
     nodata = math.nan if void is not None and not _is_number(void) else dataset.nodata
     grid = numbers.reshape(dataset.height, dataset.width)
     grid = grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
-    return (grid.astype(np.int32) if whole else grid), None if whole and nodata != nodata else nodata
+    is_beyond = whole and not abs(nodata or 0.0) < 2**24
+    return (grid.astype(np.int32) if whole else grid), None if is_beyond else _as_stored(nodata)
 
 
-def _skip_header(file: BinaryIO, driver: str) -> tuple[int, bytes | None]:
+def _as_stored(nodata: float | None) -> float | None:
+    """A value of no height as float32 has it: one beyond its range is read as infinite."""
+    with np.errstate(over="ignore"):
+        return None if nodata is None else float(np.float32(nodata))
+
+
+def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:
     """Returns the number of the first line behind the header, and the word that stands for a void, if one does."""
-    void, number = None, 1
+    said: dict[bytes, bytes] = {}
+    void, number = (b"*" if driver == "GRASSASCIIGrid" else None), 1
     while line := file.readline(_HEADER_LINE_BYTES):
-        words = line.replace(b":", b" ").split()
+        words = line.replace(b":", b" ", 1).split()
         is_header = number <= _SURFER_LINES if driver == "GSAG" else _HEADER_LINE.match(line)
         if not is_header:
             file.seek(-len(line), 1)
             break
         if words and words[0].lower() in (b"nodata_value", b"nodata", b"null"):
             void = words[-1]
+        said |= {words[0].lower(): words[-1]} if words else {}
         number += 1
+    corner = [key for key in said if key.startswith((b"xll", b"yll"))]
+    if driver == "AAIGrid" and len({key[3:] for key in corner}) + (len(corner) != 2) != 1:
+        raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")
+    if driver == "GRASSASCIIGrid":  # of which GDAL reads a part only
+        turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(said.get(key, b""))]
+        if turned or said.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
+            raise TerrainError(
+                f"{what}: its header has degrees and minutes or a multiplier; r.out.gdal writes a .tif"
+            )
     return number, void
 
 
@@ -324,7 +358,10 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
             raise TerrainError(f"{what} names {name[:LONGEST_REASON]!r}; expected a file that lies on this machine")
         source = path.parent / name
         with source.open("rb") as file:
-            virtual = file.read(16).startswith(b"<VRTDataset")
+            head = file.read(4096)
+        # GDAL knows other kinds, also of the network.
+        _driver(head[:_HEAD_BYTES], source.suffix.lower(), f"{what}: {source}")
+        virtual = b"<VRTDataset" in head  # anywhere, for GDAL
         if virtual:
             if depth >= _DEEPEST:
                 raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")

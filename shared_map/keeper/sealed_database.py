@@ -200,6 +200,9 @@ class SealedDatabase:
             with writing(self.path):
                 part.unlink(missing_ok=True)
                 self._begun(_connect(part)).close()
+                # A log beside it is of a store that was moved away; SQLite would replay it.
+                for tail in ("-wal", "-shm"):
+                    Path(f"{self.path}{tail}").unlink(missing_ok=True)
                 part.replace(self.path)
                 sync_folder(self.path.parent)
         witness = witness_of(self.path, _KIND)

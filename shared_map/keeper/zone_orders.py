@@ -185,6 +185,10 @@ def _names(replica: MapReplica, now_ns: int) -> str:
     return f"there are {', '.join(names[:20])}" if names else "there are none"
 
 
+_FURTHEST = 1e12
+"""Cells: beyond it floats of the polygon overflow."""
+
+
 def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     """Cells whose middle lies in the zone; why there is no such zone."""
     import shapely
@@ -198,6 +202,8 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
             return str(error)
     if order.polygon_m:
         corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
+    if not all(abs(part) <= _FURTHEST for ring in (corners, *order.holes) for corner in ring for part in corner):
+        return "polygon: a corner is far from the terrain"
     side_m = grid.resolution_m
     inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
     for hole in order.holes:

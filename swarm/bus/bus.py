@@ -24,6 +24,7 @@ Bugs        Unknown fields, missing fields, a wildcard where one value is meant:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
@@ -136,10 +137,13 @@ class Undecoded(Question):
     size: int = 0
 
 
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,129}")
+
+
 def asker_in(fields: Mapping[str, str]) -> str:
     """The asker that the fields of a key name; "" if they name none."""
     asker = fields.get("asker", "")
-    return "" if asker == "*" else asker
+    return asker if _NAME.fullmatch(asker) else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -289,9 +289,9 @@ class Intake:
     def drop(self, key: str, error: ProtocolError) -> None:
         with self._counting:
             self.counts[counter_of(error)] += 1
-        now_s = time.monotonic()
+        key, now_s = key[:200], time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > _LOGGED_KEYS:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
-            log.warning("dropped a payload on %s: %s", key[:200], error)
+            log.warning("dropped a payload on %s: %s", key, error)

@@ -138,7 +138,7 @@ class Inbox:
     def _put_question(self, question: Question) -> Question | None:
         """Adds a question. Returns the one that has to go for it."""
         costly = question.topic.costly
-        asker = question.asker or (_NAMELESS if costly else question.topic.name)
+        asker = question.asker or (_NAMELESS if costly else f"{_NAMELESS}{question.topic.name}")
         rank = 1 if costly and not is_own(asker) else 0
         with self._lock:
             self._next += 1

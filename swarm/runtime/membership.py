@@ -309,7 +309,7 @@ class Member:
                     self._to_name.append(str(error))
         else:
             self._confirmed = True
-            self._older |= other.wire_version < NAMED_SINCE
+            self._older |= other.role == "planner" and other.wire_version < NAMED_SINCE
 
     def _ask(self) -> None:
         self._bus.ask(RUN, Nothing(), self._post, tag=_TAG, timeout_s=2.0)

@@ -231,6 +231,8 @@ JSON_ENCODING = "application/json"
 """Zenoh's encoding by which a payload is read as JSON."""
 MAX_JSON_BYTES = 1 << 18
 """Longer JSON is refused unread: an empty object of two bytes takes 64 bytes of memory."""
+_MOST_DIGITS = 20
+"""An integer of 64 bits has no more."""
 _QUOTED = 60
 """Most characters of a wrong value in an error."""
 
@@ -272,7 +274,8 @@ def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str,
     hints = _hints_of(message_type)
     for name, chunk in (named or {}).items():
         if name in hints and name not in given:
-            given[name] = int(chunk) if taken_apart(hints[name])[0] is int and chunk.isdecimal() else chunk
+            is_number = taken_apart(hints[name])[0] is int and chunk.isdecimal() and len(chunk) < _MOST_DIGITS
+            given[name] = int(chunk) if is_number else chunk  # of more digits `int` raises ValueError
     schema = given.pop("schema", schema_of_type(message_type))
     meant = {KEY_FIELD: given.pop(KEY_FIELD)} if KEY_FIELD in given else {}
     try:

@@ -56,6 +56,10 @@ def meant_for(key: str, payload: bytes) -> bytes:
     return b"".join((head, body, _ending(key)))
 
 
+_MOST_KEY = 512
+"""Characters of a key: those of our topics have fewer."""
+
+
 def check_meant(key: str, payload: bytes, *, must: bool = False) -> None:
     """Raises MisroutedError on a payload that is meant for another key, ProtocolError on one that must name its key
     and does not. A payload that does not parse passes: the decoder says why.
@@ -65,6 +69,8 @@ def check_meant(key: str, payload: bytes, *, must: bool = False) -> None:
     must     the key must be named: in JSON of a message in `SHARED`. Elsewhere it may be left out as long as builds
              of wire version 8, which name none, share a run
     """
+    if len(key) > _MOST_KEY:
+        raise ProtocolError(f"its key has {len(key)} characters, at most {_MOST_KEY}")
     if payload.endswith(_ending(key)) or len(payload) > MAX_PAYLOAD_BYTES:
         return
     try:

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.effort import few
 from support.wire_strategies import BY_TYPE, EXAMPLES, MESSAGES
 
+from swarm.bus.bus import asker_in
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_JSON_BYTES, decode, encode, encode_json, may_be_json, packed_json
 from swarm.wire.messages import Message, schema_of
@@ -166,3 +167,15 @@ def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
 
 def test_a_request_may_be_json_too():
     assert read('{"row": 4, "col": 2}', CostRequest) == CostRequest(row=4, col=2)
+
+
+def test_a_key_with_a_number_of_any_length_is_refused() -> None:
+    """`int` of thousands of digits raises ValueError, which is no refusal."""
+    with pytest.raises(ProtocolError):
+        read("{}", MarkSet, region="9" * 5000, tile="9" * 5000, author="x")
+
+
+@pytest.mark.parametrize("asker", ["*", "**", "x$*", "a b", "é", "", "x" * 200])
+def test_a_key_names_an_asker_or_none(asker: str) -> None:
+    assert asker_in({"asker": asker}) == ""
+    assert asker_in({"asker": "agent.a0"}) == "agent.a0"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from collections import Counter
 from typing import Annotated, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
@@ -120,11 +121,11 @@ def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
 
     Raises TerrainError with one sentence, which names the first feature that cannot be read.
     """
-    number = 0
+    number, data = 0, data.removeprefix(b"\xef\xbb\xbf")
     try:
         if kind.text == "fence":
             return fence_of_waypoints(data.decode("ascii"))
-        document = _document.decode(data.removeprefix(b"\xef\xbb\xbf"))
+        document = _document.decode(data)
         if document.fileType:
             return fence_of_plan(data)
         foreign = "TopoJSON" if document.type == "Topology" else "ArcGIS JSON" if document.geometryType else ""
@@ -150,6 +151,8 @@ def checked_xml(data: bytes, what: str) -> None:
     """
     if b"<OGR" in data or b"<VRT" in data:
         raise TerrainError(f"{what} names other files, which are not read")
+    ends: dict[str | None, tuple[str | None, str | None]] = {}
+    rings: dict[str | None, list[str | None]] = {}
     known: set[tuple[str, str | None]] = set()
     needed: dict[tuple[str, str | None], str] = {}
     try:
@@ -170,6 +173,15 @@ def checked_xml(data: bytes, what: str) -> None:
                     )
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
+            if name == "way":
+                nodes = [inner.get("ref") for inner in element if inner.tag == "nd"]
+                if len(nodes) == 1:
+                    raise TerrainError(f"{what} is damaged: way {element.get('id')} has one node; repair it")
+                if nodes:
+                    ends[element.get("id")] = nodes[0], nodes[-1]
+            if name == "relation" and _is_area(element):
+                ways = [inner.get("ref") for inner in element if inner.get("type") == "way"]
+                rings[element.get("id")] = ways
             if name in ("node", "way"):
                 known.add((name, element.get("id")))
             for inner in element if name in ("way", "relation") else ():
@@ -180,6 +192,10 @@ def checked_xml(data: bytes, what: str) -> None:
                 element.clear()
     except ElementTree.ParseError as error:
         raise TerrainError(f"{what} is damaged: {error}") from error
+    for area, ways in rings.items():
+        met = Counter(end for way in ways for end in ends.get(way, ()))
+        if any(count % 2 for count in met.values()):  # GDAL leaves it out
+            raise TerrainError(f"{what}: relation {area} cannot be used: its ways form no closed ring; repair it")
     for absent in needed.keys() - known:
         user = needed[absent]
         raise TerrainError(
@@ -248,8 +264,8 @@ def fence_of_waypoints(text: str) -> bytes:
         command, extent, place = int(rows[0][3]), rows[0][4], rows[0][8:10]
         if command in (_POLYGON_IN, _POLYGON_OUT):
             count = int(extent)
-            ring = rows[:count]
-            if count < 3 or [row[3:5] for row in ring] != [rows[0][3:5]] * count:
+            ring = rows[: max(count, 0)]
+            if not 3 <= count <= len(rows) or [row[3:5] for row in ring] != [rows[0][3:5]] * count:
                 raise ValueError(f"a fence polygon of {count} corners has not as many")
             found.append(_area([row[8:10] for row in ring], command == _POLYGON_IN))
             del rows[: count - 1]
@@ -257,7 +273,7 @@ def fence_of_waypoints(text: str) -> bytes:
             if not extent > 0:
                 raise ValueError(f"a fence circle has the radius {extent:g}")
             found.append(_disc(place, extent, command == _CIRCLE_IN))
-        elif command < _RETURN and any(place) and rows[0][0] > 0:  # row 0 is where it starts from
+        elif command <= _LAST_NAV and any(place) and rows[0][0] > 0:  # row 0 is where it starts from
             path.append(place[::-1])
         del rows[0]
     if len(path) > 1:
@@ -265,7 +281,8 @@ def fence_of_waypoints(text: str) -> bytes:
     return _collection(found)
 
 
-_RETURN, _POLYGON_IN, _POLYGON_OUT, _CIRCLE_IN, _CIRCLE_OUT = 5000, 5001, 5002, 5003, 5004
+_LAST_NAV = 95
+_POLYGON_IN, _POLYGON_OUT, _CIRCLE_IN, _CIRCLE_OUT = 5001, 5002, 5003, 5004
 """MAVLink's commands of fences; those of routes are below."""
 
 
@@ -275,7 +292,7 @@ def _area(ring: list[list[float]], inside: bool) -> dict[str, Any]:
 
 
 def _disc(centre: list[float], radius_m: float, inside: bool) -> dict[str, Any]:
-    return _fence(Point([centre[1], centre[0]]), inside, radius=radius_m)
+    return _fence(Point([centre[1], centre[0]]), inside, radius=max(round(radius_m, 3), 0.001))
 
 
 def _fence(shape: Geometry, inside: bool, **extent: float) -> dict[str, Any]:

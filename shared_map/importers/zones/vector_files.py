@@ -115,7 +115,7 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
         found = []
         for name in names:
             if kind.driver == "GPKG":
-                _check_table(path, name, what)
+                _check_table(path, source, name, what)
             index = listed[:, 0].tolist().index(name)
             info = pyogrio.read_info(source, layer=index, force_feature_count=True)
             count = int(info["features"])
@@ -270,10 +270,15 @@ def _found(path: Path, what: str) -> tuple[Kind, str | None] | None:
     return kind, name
 
 
-def _check_table(path: Path, layer: str, what: str) -> None:
+def _check_table(path: Path, source: str | bytes, layer: str, what: str) -> None:
     """A layer of a GeoPackage must be a table: a view is a program, which may not end."""
+    zipped = str(source).startswith("/vsizip/")
+    where = ":memory:" if zipped else path.resolve().as_uri() + "?mode=ro"
     try:
-        with contextlib.closing(sqlite3.connect(path.resolve().as_uri() + "?mode=ro", uri=True)) as database:
+        with contextlib.closing(sqlite3.connect(where, uri=True)) as database:
+            if zipped:
+                with zipfile.ZipFile(path) as archive:
+                    database.deserialize(archive.read(str(source).partition("}/")[2]))
             found = database.execute("SELECT type FROM sqlite_master WHERE name = ?", (layer,)).fetchone()
     except sqlite3.Error as error:
         raise TerrainError(f"{what} is damaged: {error}") from error

@@ -7,7 +7,7 @@ import importlib.util
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,7 @@ class Drawing:
     lethal: list[Drawn] = field(default_factory=list)
     kept: list[Drawn] = field(default_factory=list)
     bridges: list[Drawn] = field(default_factory=list)
+    keeps: bool = False
 
 
 def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
@@ -121,7 +122,7 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
     path = Path(zone.file or "")
     layers = open_layers(path, zone.layer, what)
     facts = FileFacts(path.name, ", ".join(layer.name for layer in layers), "")
-    drawing, used = Drawing(facts), 0
+    drawing, used, keeps = Drawing(facts), 0, False
     faults = []
     for layer in layers:
         worth = _Worth(zone, layer, facts)
@@ -129,6 +130,8 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
         facts.crs = placing.crs
         for features in read_features(layer, worth.columns):
             placed = placing.place(features)
+            said = features.columns.get(INCLUSION, np.zeros(0, object))
+            keeps |= worth.closes and bool((said == "yes").any())
             facts.features += len(features.numbers)
             facts.outside += placed.outside
             facts.mended += placed.mended
@@ -149,14 +152,14 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
     if len(faults) == len(layers):
         raise faults[0]
     worth.check_used()
-    return drawing
+    return replace(drawing, keeps=keeps)
 
 
 def closed_shapes(drawing: Drawing, grid: GridSpec) -> list[Drawn]:
     """The shapes of all closed ground: those that close it, and all that lies outside of those that keep in."""
     import shapely
 
-    if not drawing.kept:
+    if not (drawing.kept or drawing.keeps):
         return drawing.lethal
     kept = shapely.union_all([shapely.buffer(each.shape, each.width_cells / 2) for each in drawing.kept])
     around = shapely.difference(shapely.box(-1, -1, grid.cols + 1, grid.rows + 1), kept)
@@ -232,7 +235,8 @@ class _Worth:
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
-                inside = self._zone.kind == "keep_in" or (self._closes and tags.get(INCLUSION) == "yes")
+                said = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
+                inside = self.closes and said.lower() in ("yes", "true", "1")
                 ways[key] = way, bridge, inside
             way, bridge, inside = ways[key]
             if way is not None:
@@ -241,7 +245,7 @@ class _Worth:
                 yield shape, id, way, bridge, inside
 
     @property
-    def _closes(self) -> bool:
+    def closes(self) -> bool:
         return self._zone.kind in ("forbidden", "keep_in")
 
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
@@ -266,7 +270,7 @@ class _Worth:
             return None
         if name:
             self._facts.classes[name] += 1
-        closes = self._closes or (kind == "water" and not name)
+        closes = self.closes or (kind == "water" and not name)
         try:
             own_m = way_classes.width_of(tags)
         except ValueError as error:

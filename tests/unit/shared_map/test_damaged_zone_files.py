@@ -307,6 +307,12 @@ def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:
         ordered |= masks[0] & ~np.any([np.zeros(UTM.shape, np.bool_), *masks[1:]], axis=0)
     clear = shapely.distance(disc.boundary, middles()) > 0.02
     assert (ordered == (~shapely.contains(AREA, middles()) | shapely.contains(disc, middles())))[clear].all()
+    excluded = {"inclusion": False, "polygon": LATLON}
+    path.write_text(plan([excluded]))
+    assert (closed_by(str(path), "keep_in") == closed_by(str(path), "forbidden")).all()
+    beyond = {"inclusion": True, "polygon": [[lat + 0.05, lon] for lat, lon in LATLON]}
+    path.write_text(plan([beyond, excluded]))
+    assert closed_by(str(path), "forbidden").all()  # no cell is within
     path.write_text(waypoints(*((5001, 4, corner) for corner in CORNERS), (5003, 40, MIDDLE)))
     assert (closed_by(str(path), "forbidden") == kept).all()
     drawn = geojson(tmp_path / "b.geojson", [feature(AREA)])

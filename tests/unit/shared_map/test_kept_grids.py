@@ -107,6 +107,7 @@ def test_any_importer_keeps_a_square_metric_grid(
         assert source.grid.north_m == pytest.approx(NORTH, abs=side_m / 100)
 
 
+GRASS = "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\n"
 HEAD = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n"
 
 
@@ -128,6 +129,49 @@ def test_a_grid_as_text_is_read_in_all_its_versions(tmp_path: Path, text: str) -
     source = load(tmp_path / "a.asc")
     np.testing.assert_array_equal(source.elevation_m, np.array([[1.5, 2, np.nan], [4, 5, 6]], np.float32))
     assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
+
+
+def test_a_system_beside_a_text_with_a_mark_of_its_order_counts(tmp_path: Path) -> None:
+    (tmp_path / "a.asc").write_bytes(("\ufeff" + HEAD + "1.5 2 3 4 5 6").encode())
+    (tmp_path / "a.prj").write_text(rasterio.CRS.from_string(UTM).to_wkt())
+    assert load(tmp_path / "a.asc").grid.crs == UTM
+
+
+def test_whole_numbers_of_surfer_have_its_void(tmp_path: Path) -> None:
+    (tmp_path / "a.grd").write_text("DSAA\n3 2\n1000 1060\n2000 2030\n1 6\n1 2 3\n4 5 6")
+    np.testing.assert_array_equal(load(tmp_path / "a.grd").elevation_m, [[4, 5, 6], [1, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD.replace("xllcorner", "xllcenter") + "1 2 3 4 5 6", "its header needs xllcorner and yllcorner"),
+        (
+            "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\nmultiplier: 0.01\n1 2 3\n4 5 6",
+            "a multiplier",
+        ),
+        ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
+    ],
+)
+def test_headers_which_gdal_reads_in_part_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "a.asc").write_text(text)
+    with pytest.raises(TerrainError, match=words):
+        load(tmp_path / "a.asc")
+
+
+def test_a_line_of_tabs_longer_than_a_piece_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shared_map.importers.raster_files._TEXT_PIECE_BYTES", 16)
+    (tmp_path / "a.asc").write_text(HEAD + "\t".join(["1.25"] * 5 + ["123456789.5"]))
+    assert load(tmp_path / "a.asc").elevation_m[0].tolist() == [1.25] * 3
+
+
+def test_a_virtual_raster_names_known_kinds_only(tmp_path: Path) -> None:
+    (tmp_path / "wms.xml").write_text("<GDAL_WMS></GDAL_WMS>")
+    source = '<SimpleSource><SourceFilename relativeToVRT="1">wms.xml</SourceFilename></SimpleSource>'
+    band = f'<VRTRasterBand dataType="Byte" band="1">{source}</VRTRasterBand>'
+    (tmp_path / "a.vrt").write_text(f'<VRTDataset rasterXSize="2" rasterYSize="2">{band}</VRTDataset>')
+    with pytest.raises(TerrainError, match=r"wms\.xml is no raster"):
+        load(tmp_path / "a.vrt")
 
 
 def test_fractions_far_behind_the_beginning_of_a_text_are_kept(tmp_path: Path) -> None:
