@@ -61,8 +61,9 @@ def built(
     match setup.role:
         case "keeper":
             Modules(ZONE_MODULES).wait()
-            store = boundary.external(cast(KeeperStore, outside.store), KEEPER_STORE)
+            # In the order of `shared_map.keeper.main`, in which a recording has them.
             modules: Callable[[], bool] | None = boundary.function("modules of zones", None, bool)
+            store = boundary.external(cast(KeeperStore, outside.store), KEEPER_STORE)
             return KeeperService(setup, terrain, bus, post, store, modules)
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)

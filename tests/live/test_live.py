@@ -136,7 +136,6 @@ def test_a_start_in_the_background_that_is_asked_to_end_leaves_no_run(live: Live
         assert start.stderr.readline(), "the launcher has said something"
         start.send_signal(signal.SIGTERM)
         assert "goes on in the background" not in start.communicate(timeout=60)[1]
-        assert start.returncode != 0
     assert [run["run"] for run in json.loads(swarm("ps", "--json").stdout)] == [live.run_dir.name]
 
 

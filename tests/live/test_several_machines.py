@@ -21,6 +21,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.client import BusError, connect
 from swarm.config.load import load_scenario
 from swarm.grid import GridSpec
+from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import Stats
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
@@ -141,7 +142,9 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
     hands.start("role", "router", str(hands.path), "--listen", endpoint, *tls(certs))
     eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
-    run = msgspec.structs.replace(keeper_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns())
+    run = msgspec.structs.replace(
+        keeper_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns(), wire_version=WIRE_VERSION
+    )
     heard: list[str] = []
 
     def tell(event: Event) -> None:

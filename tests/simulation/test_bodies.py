@@ -51,7 +51,7 @@ def test_no_vehicle_drives_into_a_rover_that_was_reported_in_time_though_message
 
 def test_vehicles_that_do_not_look_at_bodies_drive_into_them_and_the_referee_sees_it(monkeypatch) -> None:
     monkeypatch.setattr(Steering, "closed", lambda self, cell: not math.isfinite(self._pace[cell]))
-    law, counts = driven("open", 0, 5.0, faults=False)
+    law, counts = driven("open", 1, 5.0, faults=False)
     assert law.driven_into
     assert counts["driven_into"] > 0
 
