@@ -8,7 +8,6 @@ from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import crowd
-from swarm.bus.memory_bus import MemoryBus
 
 SECONDS = 12.0
 DELAYS_MS = (0.2, 5.0, 20.0, 100.0)
@@ -28,17 +27,3 @@ def met(seed: int, delay_ms: float) -> tuple[int, int]:
 @pytest.mark.seeds(8)
 def test_no_vehicles_meet_and_none_are_said_to_wherever_processes_are_stopped(seed):
     assert met(seed + 1, DELAYS_MS[seed % len(DELAYS_MS)]) == (0, 0)
-
-
-def test_a_tick_that_receives_what_is_newer_than_its_time_is_said_to_collide(monkeypatch):
-    """The order that was wrong: a clock that is read before the inbox."""
-    collected = MemoryBus.collected
-
-    def late(bus, topic):
-        bus.gather()
-        return collected(bus, topic)
-
-    monkeypatch.setattr(MemoryBus, "collected", late)
-    in_truth, said = met(13, 0.2)
-    assert in_truth == 0
-    assert said > 0
