@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +104,9 @@ def level_ground(elevation_m: Floats) -> LevelGround:
         elevation_m = np.where(known, elevation_m, np.float32(np.nan))
     mask, patches, level = _at_one_scale(np.ascontiguousarray(elevation_m))
     rows, cols = elevation_m.shape
+    bend_m = cache(partial(_bend_m, elevation_m))
     for every, smooth in _SCALES.items():
-        if min(rows, cols) < every * _LEAST_SIDE or _bend_m(elevation_m, every) <= smooth * _bend_m(
-            elevation_m, every // 2
-        ):
+        if min(rows, cols) < every * _LEAST_SIDE or bend_m(every) <= smooth * bend_m(every // 2):
             continue
         first = (every - 1) // 2  # a cell stands for those around it
         coarse, at_scale, _ = _at_one_scale(np.ascontiguousarray(elevation_m[first::every, first::every]))
@@ -135,13 +135,11 @@ def _bend_m(elevation_m: Floats, cells: int) -> float:
 def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], Bools]:
     """Returns (mask of water, (height in m, cells) of each patch of it, mask of large level patches)."""
     step_m = _step_m(elevation_m)
-    least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
-    found = level_patches(elevation_m, _SAME_M, least, step_m)
+    found = _level_with(elevation_m, step_m)
     rounded_m = _rounded_m(found)
     if rounded_m > step_m:
         step_m = rounded_m
-        least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
-        found = level_patches(elevation_m, _SAME_M, least, step_m)
+        found = _level_with(elevation_m, step_m)
     water, unsure = _judged(found, _STILL_M)
     mask: Bools = water[found.labels]
     large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
@@ -153,6 +151,12 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
     if step_m < _ROUGH_M / _BLOCK_CELLS:
         patches += _rough_water(elevation_m, mask)
     return mask, patches, large[found.labels]
+
+
+def _level_with(elevation_m: Floats, step_m: float) -> Patches:
+    """The level patches of heights that are rounded to `step_m`."""
+    least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
+    return level_patches(elevation_m, _SAME_M, least, step_m)
 
 
 def _rounded_m(found: Patches) -> float:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from swarm.errors import ProtocolError
@@ -330,19 +330,14 @@ COST = Topic(
     request=planning.CostRequest, published=False, costly=True,
     ask_bytes=_LONG, answer_bytes=2 * _LONG,
 )  # fmt: skip
-NAMELESS_ROUTE = Topic(
-    "nameless-route", "target/{target}/route", planning.RouteReply,
-    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
-    access(serve="planner:target", ask="agent rover"),
-    request=planning.RouteRequest, published=False, costly=True,
-    ask_bytes=_LONG, answer_bytes=4 * _LONG,
+_NAMELESS = "the same for askers that are not named: people, and earlier versions; they share one turn"
+NAMELESS_ROUTE = replace(
+    ROUTE, name="nameless-route", key="target/{target}/route", what=_NAMELESS,
+    access=access(serve="planner:target", ask="agent rover"),
 )  # fmt: skip
-NAMELESS_COST = Topic(
-    "nameless-cost", "target/{target}/cost", planning.CostReply,
-    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
-    access(serve="planner:target", ask="agent targets monitor rover"),
-    request=planning.CostRequest, published=False, costly=True,
-    ask_bytes=_LONG, answer_bytes=2 * _LONG,
+NAMELESS_COST = replace(
+    COST, name="nameless-cost", key="target/{target}/cost", what=_NAMELESS,
+    access=access(serve="planner:target", ask="agent targets monitor rover"),
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", planning.PlannerStatus, "how a planner is doing", "2 Hz",
@@ -370,11 +365,9 @@ ZONES = Topic(
     request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
     answer_bytes=_FILE,
 )  # fmt: skip
-SHORT_ZONES = Topic(
-    "short-zones", "order/{keeper}/zones", orders.Zones,
-    "the same without a code: on loopback such a zone ends after 10 s, and changes no other", "asked by people",
-    access(serve="keeper:keeper"), request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
-    answer_bytes=_FILE,
+SHORT_ZONES = replace(
+    ZONES, name="short-zones", key="order/{keeper}/zones", trusted=False,
+    what="the same without a code: on loopback such a zone ends after 10 s, and changes no other",
 )  # fmt: skip
 GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders,
