@@ -305,7 +305,10 @@ def plan_grid(
     notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
-        notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
+        mirrored = "! " * (transform.determinant > 0 and transform.a < 0)
+        notes.append(
+            f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, with voids beside"
+        )
     if target == crs and north_up and is_kept(width, height, max(rows, cols), resolution_m):
         check_size(rows, cols, what)
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))

@@ -146,6 +146,9 @@ def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iter
         dataset = files.enter_context(rasterio.open(name, driver=driver))
         _check_size(dataset, what)
         if driver in _TEXT_DRIVERS:
+            if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
+                cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
+                raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
             beside = _system_beside(path, what) if str(name).startswith("/vsisubfile/") else None
             dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), beside, files)
         if dataset.transform.is_identity and dataset.gcps[0]:
@@ -161,7 +164,7 @@ def _system_beside(path: Path, what: str) -> Any:
     if not found.is_file():
         return None
     try:
-        return rasterio.CRS.from_wkt(read_text(found, FileKind.ROS_MAP), morph_from_esri_dialect=True)
+        return rasterio.CRS.from_wkt(read_text(found, FileKind.SYSTEM), morph_from_esri_dialect=True)
     except ValueError as error:
         raise TerrainError(f"{what}: {found} holds no coordinate system") from error
 

@@ -39,6 +39,7 @@ class FileKind(Enum):
     TEXT_GRID = ("terrain", 32 * MAX_CELLS, TerrainError)
     ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)
     IMAGE = ("image", 8 * MAX_CELLS, TerrainError)
+    SYSTEM = ("coordinate system", 1 << 16, TerrainError)
     VIRTUAL_RASTER = ("raster", 4 << 20, TerrainError)
     VECTORS = ("zone", 1 << 30, TerrainError)
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)

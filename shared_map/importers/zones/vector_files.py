@@ -98,6 +98,7 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
     import pyogrio
 
     source, kind = _source(path, what)
+    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # which takes new, negative ids for damage
     with _refused(what):
         listed = pyogrio.list_layers(source)
         known = [str(name) for name, shape in listed if shape is not None]

@@ -147,9 +147,13 @@ def test_whole_numbers_of_surfer_have_its_void(tmp_path: Path) -> None:
     [
         (HEAD.replace("xllcorner", "xllcenter") + "1 2 3 4 5 6", "its header needs xllcorner and yllcorner"),
         (
-            "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\nmultiplier: 0.01\n1 2 3\n4 5 6",
+            GRASS + "multiplier: 0.01\n1 2 3\n4 5 6",
             "a multiplier",
         ),
+        (HEAD.replace("cellsize 50", "cellsize -50") + "1 2 3 4 5 6", "a cell -50 x -50, expected a size above 0"),
+        (HEAD.replace("cellsize 50", "dx 50\ndy 0") + "1 2 3 4 5 6", "a cell 50 x 0, expected"),
+        (GRASS.replace("north: 20", "north: -20") + "1 2 3\n4 5 6", "a cell 10 x -10, expected"),
+        ("DSAA\n3 2\n60 0\n0 30\n1 6\n1 2 3\n4 5 6", "a cell -30 x 30, expected"),
         ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
     ],
 )
