@@ -326,7 +326,12 @@ def plan_grid(
 
 
 def _system(crs: Any) -> str:
-    return "local" if is_local(crs) else str(crs.to_string())
+    """Text of a system in a GridSpec: as short as means the same."""
+    import rasterio
+
+    short = crs.to_proj4().replace("=True", "")
+    is_short = not crs.to_epsg() and not is_local(crs) and rasterio.CRS.from_proj4(short) == crs
+    return "local" if is_local(crs) else short if is_short else str(crs.to_string())
 
 
 def check_size(rows: int, cols: int, what: str) -> None:

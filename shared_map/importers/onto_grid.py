@@ -1,9 +1,8 @@
-"""Rasters and arrays of heights brought onto the square metric grid of a terrain."""
+"""Rasters brought onto the square metric grid of a terrain."""
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -11,20 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.array_files import Floats
-from shared_map.importers.georeference import (
-    bounds_in,
-    crs_name,
-    crs_of,
-    equidistant,
-    is_kept,
-    metres_per_degree,
-    pixel_m,
-)
+from shared_map.importers.georeference import bounds_in, crs_name, crs_of, pixel_m
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS, GridSpec
-
-# --- rasters ------------------------------------------------------------------------------------------------
+from swarm.grid import GridSpec
 
 
 def transform_of(grid: GridSpec, row0: int = 0) -> Any:
@@ -145,109 +133,9 @@ def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> f
     return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
 
 
-# --- arrays, without rasterio: the demo builds its ground in a second ------------------------------------------
-
-
-Steps = tuple[float, float]
-"""Width and height of a cell."""
-
-
-def from_degrees(
-    heights: Floats, step: Steps, west: float, north: float, resolution_m: float | None, what: str
-) -> tuple[Floats, GridSpec, str]:
-    """Degrees put on metres, equidistant at the mean latitude. Else as `from_metres`."""
-    middle = north - step[1] * heights.shape[0] / 2
-    if not (abs(middle) < 85 and abs(west) <= 360):
-        raise TerrainError(f"{what}: its middle is at latitude {middle:g}; degrees must lie between -85 and 85")
-    per_lat, per_lon = metres_per_degree(middle)
-    metric = (step[0] * per_lon, step[1] * per_lat)
-    crs = equidistant(middle, west)
-    return from_metres(heights, metric, 0.0, round(north * per_lat, 3), resolution_m, what, crs)
-
-
-def from_metres(
-    heights: Floats, step: Steps, west: float, north: float, resolution_m: float | None, what: str, crs: str
-) -> tuple[Floats, GridSpec, str]:
-    """Returns heights on a metric grid, the grid, and the notes for people.
-
-    Parameters
-    ----------
-    heights : float32 (rows, cols), m
-    step, west, north
-        The size of a cell, and the outer corner of cell (0, 0), m.
-    resolution_m : float or None
-        Side of a cell of the grid; None keeps that of the heights.
-    what : str
-        Names the file in errors.
-    crs : str
-        Of the grid.
-
-    Raises
-    ------
-    TerrainError
-        If no cell fits, or more than `MAX_CELLS` do.
-    """
-    if is_kept(*step, max(heights.shape), resolution_m):
-        resolution_m, step = step[0], (step[0], step[0])
-    resolution_m = resolution_m or float(f"{math.sqrt(step[0] * step[1]):.4g}")
-    col_step, row_step = resolution_m / step[0], resolution_m / step[1]
-    rows, cols = int(heights.shape[0] / row_step + 1e-6), int(heights.shape[1] / col_step + 1e-6)
-    if rows < 1 or cols < 1:
-        raise TerrainError(f"terrain.resolution_m = {resolution_m:g} is coarser than the whole of {what}")
-    if rows * cols > MAX_CELLS:
-        raise TerrainError(f"{what} would be {rows} x {cols} cells; set a larger terrain.resolution_m")
-    grid = GridSpec(rows, cols, resolution_m, west, north, crs)
-    if col_step == row_step == 1:
-        return heights, grid, f"{rows} x {cols} cells of {resolution_m:g} m"
-    note = f"resampled from {step[1]:.1f} x {step[0]:.1f} m to {resolution_m:g} m"
-    return resample(heights, rows, cols, row_step, col_step), grid, note
-
-
 def nearest(array: NDArray[Any], grid: GridSpec) -> tuple[Any, ...]:
     """An index into an array over the same ground as a grid: the cell nearest to each cell of the grid."""
     rows, cols = array.shape[:2]
     at_row = ((np.arange(grid.rows) + 0.5) * rows / grid.rows).astype(np.intp)
     at_col = ((np.arange(grid.cols) + 0.5) * cols / grid.cols).astype(np.intp)
     return np.ix_(at_row, at_col)
-
-
-def resample(values: Floats, rows: int, cols: int, row_step: float, col_step: float) -> Floats:
-    """Heights on another grid with the same north-west corner.
-
-    Parameters
-    ----------
-    values : float32 (source rows, source cols), m
-        NaN is a void; it spreads to what it touches.
-    rows, cols : int
-        Cells of the result, within the extent of the source.
-    row_step, col_step : float
-        Source cells per cell. From 1.5 on cells are averaged, below that interpolated.
-
-    Returns
-    -------
-    float32 (rows, cols), m
-    """
-    return np.ascontiguousarray(_along_rows(_along_rows(values, rows, row_step).T, cols, col_step).T)
-
-
-def _along_rows(values: Floats, count: int, step: float) -> Floats:
-    if step >= 1.5:
-        return _averaged(values, count, step)
-    at = np.clip((np.arange(count) + 0.5) * step - 0.5, 0, values.shape[0] - 1)
-    low = np.minimum(at.astype(np.intp), max(values.shape[0] - 2, 0))
-    part = (at - low).astype(np.float32)[:, None]
-    high = np.minimum(low + 1, values.shape[0] - 1)
-    between: Floats = values[low] * (np.float32(1) - part) + values[high] * part
-    return between
-
-
-def _averaged(values: Floats, count: int, step: float) -> Floats:
-    """Mean over each cell's extent, by how much of each source cell lies in it."""
-    averaged = np.empty((count, values.shape[1]), np.float32)
-    for n in range(count):
-        start, end = n * step, min((n + 1) * step, float(values.shape[0]))
-        first, last = int(start), max(int(np.ceil(end)), int(start) + 1)
-        weights = np.minimum(np.arange(first, last) + 1, end) - np.maximum(np.arange(first, last), start)
-        weights = np.maximum(weights, 0)
-        averaged[n] = np.tensordot(weights / weights.sum(), values[first:last], axes=1)
-    return averaged

@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
+from shared_map.importers.array_grids import PlainGrid
 from shared_map.importers.cover import cover_meaning
 from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
 from shared_map.importers.cover.land_cover import read_cover
@@ -72,6 +74,35 @@ def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source
         known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
         place = _Place(place.crs, place.transform, (known, *place.notes, *told))
         return _heights(dataset, heights, place, path, config, progress)
+
+
+def read_array(plain: PlainGrid, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    """Heights of a text or an archive, placed as those of a raster.
+
+    Raises TerrainError as `read_raster` does, and if nothing says how large a cell is.
+    """
+    import rasterio
+    from rasterio.transform import from_origin
+
+    assert plain.heights is not None
+    rows, cols = plain.heights.shape
+    step = plain.step if any(plain.step) else (config.resolution_m or 0.0,) * 2
+    if not any(step):
+        raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
+    place = from_origin(plain.west, plain.north, *step)
+    own = rasterio.CRS.from_user_input("EPSG:4326" if plain.degrees else _METRES)
+    notes = list(plain.notes)
+    if path.suffix.lower() != ".npz" and not plain.degrees and config.crs is None:
+        check_metres(step[0], plain.west, f"terrain {path}")
+        if any(plain.step):
+            notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
+    crs = crs_of(own, config.crs, f"terrain {path}")
+    frame = SimpleNamespace(height=rows, width=cols, count=1, dtypes=["float32"], crs=crs, transform=place)
+    frame.scales, frame.offsets, frame.units, frame.nodata = [1.0], [0.0], [""], None
+    source = _heights(frame, plain.heights, _Place(crs, place, tuple(notes)), path, config, progress)
+    if plain.photo is None:
+        return source
+    return replace(source, photo=plain.photo[nearest(plain.photo, source.grid)])
 
 
 def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.onto_grid import from_degrees, from_metres, nearest
 from shared_map.importers.raster_files import is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
@@ -116,20 +115,18 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
     from shared_map.importers.array_grids import read_npz
+    from shared_map.importers.rasters import read_array
     from shared_map.terrain.synthetic.landscape import cover
 
-    plain = read_npz(_jacksboro_path())
-    assert plain.heights is not None
+    path = _jacksboro_path()
     resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
-    elevation_m, grid, note = from_degrees(
-        plain.heights, plain.step, plain.west, plain.north, resolution_m, JACKSBORO_FILE
-    )
-    classes = cover(elevation_m, grid.resolution_m, seed)
-    _, level, told = _looked_at(plain.heights, config)
+    config = msgspec.structs.replace(config, resolution_m=resolution_m, crs=None)
+    source = read_array(read_npz(path), path, config, no_progress)
+    classes = cover(source.elevation_m, source.grid.resolution_m, seed)
     if config.level_is == "water":
-        classes[level[nearest(level, grid)]] = TerrainClass.WATER
+        classes[source.level] = TerrainClass.WATER
     origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
-    return Source(grid, elevation_m, classes, notes=(origin, note, *told))
+    return replace(source, classes=classes, level=None, notes=(origin, *source.notes[1:]))
 
 
 def _jacksboro_path() -> Path:
@@ -165,51 +162,13 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     return read_raster(path, config, progress)
 
 
-def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """Heights in a text or an archive of arrays."""
+def _array(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.importers.array_grids import read_npz
+    from shared_map.importers.rasters import read_array
     from shared_map.importers.xyz_grids import read_text_grid
 
-    suffix = path.suffix.lower()
-    plain = read_npz(path) if suffix == ".npz" else read_text_grid(path)
-    assert plain.heights is not None
-    step, photo = plain.step, plain.photo
-    heights, level, told = _looked_at(plain.heights, config)
-    if step == (0.0, 0.0):
-        if config.resolution_m is None:
-            raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
-        step = (config.resolution_m, config.resolution_m)
-    degrees = plain.degrees or _geographic(config.crs)
-    if suffix != ".npz" and not degrees and config.crs is None:
-        from shared_map.importers.georeference import check_metres
-
-        check_metres(step[0], plain.west, f"terrain {path}")
-    place = (heights, step, plain.west, plain.north, config.resolution_m, str(path))
-    heights, grid, note = from_degrees(*place) if degrees else from_metres(*place, config.crs or "local")
-    if photo is not None and photo.shape[:2] != heights.shape:
-        photo = photo[nearest(photo, grid)]
-    notes = [str(path), *plain.notes, note, *told]
-    if suffix in (".csv", ".xyz") and plain.step != (0.0, 0.0) and grid.crs == "local":
-        notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
-    classes = np.zeros(heights.shape, np.uint8)
-    return Source(grid, heights, classes, photo=photo, level=level[nearest(level, grid)], notes=tuple(notes))
-
-
-def _looked_at(stored: Floats, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
-    """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.importers.level_ground import looked_at, without
-
-    scale = config.height_scale or 1.0
-    voids, level, told = looked_at(stored, config, scale)
-    return without(stored, voids) * np.float32(scale), level, told
-
-
-def _geographic(crs: str | None) -> bool:
-    if crs is None:
-        return False
-    from shared_map.importers.georeference import crs_of
-
-    return bool(crs_of(None, crs, "terrain").is_geographic)
+    plain = read_npz(path) if path.suffix.lower() == ".npz" else read_text_grid(path)
+    return read_array(plain, path, config, progress)
 
 
 def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -246,9 +205,9 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".asc": _raster,
     ".grd": _raster,
     ".zip": _raster,
-    ".npz": _heights,
-    ".csv": _heights,
-    ".xyz": _heights,
+    ".npz": _array,
+    ".csv": _array,
+    ".xyz": _array,
     ".png": _raster,
     ".map": _map,
     ".yaml": _map,

@@ -100,12 +100,11 @@ def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
     from shared_map.importers import level_ground as module
-    from shared_map.importers.sources import _looked_at
 
     monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
     heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50
     heights[20:60, 20:60] = 40
-    _, level, _ = _looked_at(heights, TerrainConfig(source="dem.asc"))
+    _, level, _ = module.looked_at(heights, TerrainConfig(source="dem.asc"))
     assert level.shape == heights.shape
     assert (level != (heights == 40)).mean() < 0.03
 

@@ -42,7 +42,7 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
         (ASC.replace("4 -9999 6", "4 x 6"), "line 8: found 'x'; its header says 2 rows of 3 numbers"),
         (ASC + "7 8 9\n", "line 9: found '7'; its header says 2 rows of 3 numbers"),
         (ASC.replace("ncols 3\n", ""), "is truncated or no raster"),
-        (ASC.replace("cellsize 50", "cellsize 0"), "has pixels without a size"),
+        (ASC.replace("cellsize 50", "cellsize 0"), "a cell 0 x 0, expected a size above 0"),
         (ASC.replace("ncols 3", "ncols 300000").replace("nrows 2", "nrows 300000"), "300000 x 300000"),
         (
             ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
