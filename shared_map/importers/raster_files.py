@@ -13,6 +13,7 @@ import lzma
 import math
 import re
 import stat
+import tomllib
 import warnings
 import zipfile
 import zlib
@@ -30,46 +31,19 @@ from swarm.config.input_files import FileKind, check_bytes, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
-_DRIVERS = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
-    b"<VRTDataset": "VRT",
-    b"\x89PNG": "PNG",
-    b"\xff\xd8\xff": "JPEG",
-    b"\0\0\0\x0cjP  ": "JP2OpenJPEG",
-    b"RIFF": "WEBP",
-    b"BM": "BMP",
-    b"EHFA_HEADER_TAG": "HFA",
-    b"CDF\x01": "netCDF",
-    b"CDF\x02": "netCDF",
-    b"\x89HDF\r\n\x1a\n": "netCDF",
-    b"UHL1": "DTED",
-    b"DSBB": "GSBG",
-    b"DSRB": "GS7BG",
-    b"DSAA": "GSAG",
-    **dict.fromkeys((b"ncols", b"nrows", b"xll", b"yll", b"cellsize", b"dx ", b"dy "), "AAIGrid"),
-    **dict.fromkeys((b"north:", b"south:", b"east:", b"west:", b"rows:", b"cols:"), "GRASSASCIIGrid"),
-}
-"""First bytes, of text in small letters -> GDAL's driver. GDAL knows 150 formats, most of which have not been
-tested against malicious files."""
+_FORMATS = tomllib.loads((Path(__file__).parent / "formats.toml").read_text(encoding="utf-8"))
+_DRIVERS = {first.encode("latin-1"): key for key, row in _FORMATS.items() for first in row.get("begins", ())}
+DRIVERS_BY_ENDING = {ending: key for key, row in _FORMATS.items() for ending in row.get("endings", ())}
+_NAMELESS, _ZIPPED = (
+    {ending: key for ending, key in DRIVERS_BY_ENDING.items() if _FORMATS[key].get(kind)}
+    for kind in ("nameless", "zipped")
+)
 _HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGNORECASE)
 """A line of a word and a value, in the header of a grid as text. Surfer's has lines of numbers."""
 _SURFER_LINES = 5
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
 _HEAD_BYTES = 16
-_DRIVERS_BY_ENDING = {
-    ".hgt": "SRTMHGT",
-    ".bil": "EHdr",
-    ".flt": "EHdr",
-    ".dem": "USGSDEM",
-    ".asc": "AAIGrid",
-}
-"""Endings of formats without a beginning of their own; a header lies beside most of these files."""
-_IN_ARCHIVES = (".tif", ".tiff", ".img", ".hgt", ".bil", ".flt", ".dem")
-_TEXT_DRIVERS = ("AAIGrid", "GRASSASCIIGrid", "GSAG")
 AS_TEXT = "AS_TEXT"
 """Tag of grids as text: few of these files say in which coordinate system they are."""
 BAD_ARCHIVE = (
@@ -83,7 +57,6 @@ READ_ROWS = 512
 """Rows that are read at once."""
 _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
 _MOST_TIMES, _DEEPEST = 32, 4
-_BY_ROWS = ("GTiff", "SRTMHGT", "VRT", "EHdr", "ENVI", "HFA")
 _MAX_PIXELS = 16 * MAX_CELLS
 """Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
@@ -97,7 +70,7 @@ def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
     if not path.is_file():  # a pipe would wait for ever
         return False
-    if path.suffix.lower() in (*_DRIVERS_BY_ENDING, ".zip"):
+    if path.suffix.lower() in (*_NAMELESS, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:
         return _magic_driver(file.read(_HEAD_BYTES)) is not None
@@ -145,7 +118,7 @@ def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iter
     with contextlib.ExitStack() as files:
         dataset = files.enter_context(rasterio.open(name, driver=driver))
         _check_size(dataset, what)
-        if driver in _TEXT_DRIVERS:
+        if "text" in _FORMATS[driver]:
             if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
                 cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
                 raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
@@ -279,7 +252,7 @@ def _check_size(dataset: Any, what: str) -> None:
             " makes such a file"
         )
     rows, cols = dataset.height, dataset.width
-    most = _MAX_PIXELS if dataset.driver in _BY_ROWS else MAX_CELLS
+    most = _MAX_PIXELS if "by_rows" in _FORMATS[dataset.driver] else MAX_CELLS
     if rows * cols > most:
         raise TerrainError(f"{what} has {rows} x {cols} pixels; at most {most} are read: crop it")
     if dataset.count > _MAX_BANDS:
@@ -331,7 +304,7 @@ def _magic_driver(head: bytes) -> str | None:
 
 
 def _driver(head: bytes, ending: str, what: str) -> str:
-    found = _magic_driver(head) or _DRIVERS_BY_ENDING.get(ending)
+    found = _magic_driver(head) or _NAMELESS.get(ending)
     if found is None:
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
         raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
@@ -402,10 +375,10 @@ def _in_archive(path: Path, what: str) -> tuple[str, str]:
     try:
         with zipfile.ZipFile(path) as archive:
             files = [each for each in archive.infolist() if not each.is_dir()]
-            named = [each for each in files if Path(each.filename).suffix.lower() in _IN_ARCHIVES]
+            named = [each for each in files if Path(each.filename).suffix.lower() in _ZIPPED]
             if len(named) != 1:
                 raise TerrainError(
-                    f"{what} {path} holds {len(named)} rasters ({', '.join(_IN_ARCHIVES)}), expected one: unpack it"
+                    f"{what} {path} holds {len(named)} rasters ({', '.join(_ZIPPED)}), expected one: unpack it"
                 )
             (member,) = named
             if member.file_size > FileKind.IMAGE.most_bytes:

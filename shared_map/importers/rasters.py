@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,18 +33,8 @@ from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
 
-_UNITS_M = {
-    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
-    **dict.fromkeys(("us survey foot", "us survey feet", "survey foot", "survey feet", "us foot"), 1200 / 3937),
-    **dict.fromkeys(("us feet", "us ft", "ftus", "ft us", "foot us", "usft"), 1200 / 3937),
-    **dict.fromkeys(("fathom", "fathoms"), 1.8288),
-    **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
-    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
-    **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
-    **dict.fromkeys(("km", "kilometre", "kilometer"), 1000.0),
-    **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
-}
-"""Names of height units in files, in metres. Written as `_plain_unit` leaves it."""
+UNITS_M = tomllib.loads((Path(__file__).parent / "units.toml").read_text(encoding="utf-8"))
+"""Names of units in files, as `_scale_of` leaves them -> metres."""
 _METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
 """Coordinate system of an image without a place."""
 _HALF_WORLD_M = math.pi * 6_378_137.0
@@ -322,11 +313,11 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     text = str(dataset.units[0] or "").lower()
     # [m], US_survey_foot and ft (US) without their brackets and signs.
     unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())
-    unit_m = _UNITS_M.get(unit, 1.0)
+    unit_m = UNITS_M.get(unit, 1.0)
     if unit_m != 1.0:
         factor, offset = factor * unit_m, offset * unit_m
         notes.append(f"heights are in {unit}, put into metres")
-    elif unit not in _UNITS_M and config.height_scale is None:
+    elif unit and unit not in UNITS_M and config.height_scale is None:
         notes.append(f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale")
     elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
         name, metres = crs.linear_units_factor

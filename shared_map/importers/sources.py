@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import is_raster
+from shared_map.importers.raster_files import DRIVERS_BY_ENDING, is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -192,26 +192,9 @@ def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
-    ".tif": _raster,
-    ".tiff": _raster,
-    ".hgt": _raster,
-    ".vrt": _raster,
-    ".img": _raster,
-    ".bil": _raster,
-    ".flt": _raster,
-    ".dem": _raster,
-    ".nc": _raster,
-    ".dt2": _raster,
-    ".asc": _raster,
-    ".grd": _raster,
-    ".zip": _raster,
-    ".npz": _array,
-    ".csv": _array,
-    ".xyz": _array,
-    ".png": _raster,
-    ".map": _map,
-    ".yaml": _map,
-    ".yml": _map,
+    **dict.fromkeys((*DRIVERS_BY_ENDING, ".zip"), _raster),
+    **dict.fromkeys((".npz", ".csv", ".xyz"), _array),
+    **dict.fromkeys((".map", ".yaml", ".yml"), _map),
 }
 """Ending -> reader. A new kind of file is a row here; a raster of any other name is known by how it begins."""
 FILE_KINDS = ", ".join(_READERS)

@@ -283,7 +283,7 @@ def kept_key(scenario: Scenario) -> str | None:
     rooms = (here, here.parent / "importers")
     code = source_digest(here.parent, *sorted(each.parent for room in rooms for each in room.rglob("__init__.py")))
     # One of them brings the elevation of "jacksboro".
-    libraries = " ".join(map(version, ("scipy", "matplotlib")))
+    libraries = " ".join(map(version, ("scipy", "matplotlib", "rasterio")))
     payload = msgspec.json.encode([code, libraries, scenario.seed, terrain, cost], order="sorted")
     return hashlib.blake2b(payload, digest_size=16).hexdigest()
 
