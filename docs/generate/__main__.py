@@ -45,9 +45,9 @@ def command_line() -> str:
     """Returns the page of the command `swarm`; an option which commands share is explained once."""
     commands = [(words, _about(each), _rows(each)) for words, each in _commands("swarm", cli.command())]
     times = Counter(row for _, _, rows in commands for row in rows)
-    usual = {row[0]: row for row, _ in reversed(times.most_common())}
-    shared = sorted(row for row in usual.values() if times[row] > 1)
-    return filled("cli", commands=commands, shared=shared, swarm=SWARM)
+    first = {f"{about}{rows}": words for words, about, rows in reversed(commands)}
+    shared = sorted(row for row in times if times[row] > 1)
+    return filled("cli", commands=commands, first=first, shared=shared, swarm=SWARM)
 
 
 def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:

@@ -51,8 +51,9 @@ def json_document() -> str:
 
 
 def _granted(grants: tuple[Grant, ...]) -> str:
-    text = ", ".join(grant.role + (f" ({', '.join(grant.own)})" if grant.own else "") for grant in grants)
-    return text.replace(_EVERY_OWN, "every member (role, id)").replace(_EVERY, "every member")
+    """The roles of a cell without operators, of which the page says once what they may do."""
+    named = (f"{of.role} ({', '.join(of.own)})" if of.own else of.role for of in grants if of.role != OPERATOR)
+    return ", ".join(named).replace(_EVERY_OWN, "every member (role, id)").replace(_EVERY, "every member")
 
 
 def _how(topic: Topic) -> str:

@@ -76,9 +76,8 @@ def plan(
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
     An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
-    standbys, run on machines of their own. A second plan
-    into the same folder keeps certificates that neither end soon nor are revoked, and removes archives of machines
-    that it does not have.
+    standbys, run on machines of their own. A second plan into the same folder renews certificates that end soon,
+    and removes archives of other machines.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
@@ -243,14 +242,8 @@ def certs(
     swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
 
     makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
-    allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
-
-    swarm role router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
-
-    swarm role agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
-
-    Copy ca.pem and the two files of a name to the machine where it runs. ca.key stays here: its holder can admit
-    any process. Existing certificates are kept while more than a third of their time is left.
+    allows. docs/operate/access.md says which files go where. ca.key stays here: its holder can admit any process.
+    Existing certificates are kept while more than a third of their time is left.
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.

@@ -135,8 +135,7 @@ def export(
     """Export a run for a GIS, a spreadsheet or Foxglove.
 
     Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
-    their certified gaps, and marks as areas of equal kind and pace. GeoJSON and the columns lat and lon of CSV are
-    in WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
+    their certified gaps, and marks as areas of equal kind and pace. docs/gis/routes.md has their coordinates.
 
     swarm runs export LAST
 

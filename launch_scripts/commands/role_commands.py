@@ -43,7 +43,7 @@ class Place(Tls):
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="A .toml file or a built-in name: the same for all of a run.",
+            help="For roles, the same for all of a run: a .toml file or a built-in name.",
             autocompletion=complete.scenarios,
         ),
     ] = "jacksboro"

@@ -38,7 +38,7 @@ class Where(Tls):
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
     run        The run to ask, where several run here: its name, or its folder.
-    runs       Look in this folder only; if not given, all of your runs on this machine are found.
+    runs       To find a swarm: only the runs in this folder; if not given, all of yours here.
     """
 
     panel: ClassVar[str | None] = NETWORK

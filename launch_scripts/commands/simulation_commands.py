@@ -203,9 +203,8 @@ def run(
 ) -> int:
     """Run a study: scenarios x settings x seeds, on many processes or machines.
 
-    Writes results.parquet, summary.md and pictures into `--out`. Results are kept as they come: a second start,
-    also with other seeds or settings, runs only the missing trials. Exit code 1 if a law broke in any trial, or if
-    a trial has no result. It needs the extra "sweep" (Dask, pyarrow).
+    Results are kept as they come: a second start, also with other seeds or settings, runs only the missing trials.
+    Exit code 1 if a law broke in any trial, or if a trial has no result. It needs the extra "sweep".
 
     swarm study run study.toml
 

@@ -336,17 +336,9 @@ def classify(
 
     swarm terrain classify dem.tif photo.tif --labels labels.toml --picture classes.png
 
-    Without --labels it uses rules. With labels the classes are learnt from them,
-    and two tables show the predictions for the labelled cells: by the rules,
-    and by a model that was trained without the polygon of the cell.
-    A file of labels, in metres east and south of the north-west corner:
-
-    [\\[labels]]
-    class = "water"        # forest, rock, grass, soil, road, built, snow
-    polygon_m = [[4300, 1750], [4900, 1700], [4600, 2400]]
-    [\\[labels]]
-    class = "forest"
-    points_m = [[4700, 4200], [5300, 2900]]
+    Without --labels it uses rules. With labels the classes are learnt from them, and two tables show the
+    predictions for the labelled cells: by the rules, and by a model that was trained without the polygon of the
+    cell. docs/gis/cover.md has the form of a file of labels.
 
     elevation  The elevation file.
     photo      The colour photo.

@@ -71,7 +71,7 @@ class Route(Bounded, frozen=True, kw_only=True):
     lower_bound_s  proven: no route from cell to neighbouring cell is quicker on the map as the tree knows it
     length_m       length of the way given
     remaining_s    cost-to-go after it, 0 at the target
-    legs           uint32: of each straight segment of a pulled route, over how many of the steps it goes, from
+    legs           of each straight segment of a pulled route, over how many of the steps it goes, from
                    the middle of one cell to that of another. The steps are along the cells that it crosses, and
                    may themselves be driven. Costs and bound are of the route that was pulled. Empty: it was not
     """
@@ -249,12 +249,11 @@ _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf
 class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     """Many routes as columns, with the fields of `Route`. The numbers of those whose status is OK are finite.
 
-    statuses    uint8    RouteStatus, as its index
-    starts      int64    cell, -2^31 ... 2^32 - 1
-    steps       uint32   number of steps given
+    statuses    RouteStatus, as its index
+    starts      cells
+    steps       number of steps given
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
-    cost_s, lower_bound_s, length_m, remaining_s  float64
-    legs        uint32   of all routes, one after the other; empty if none is pulled
+    legs        of all routes, one after the other; empty if none is pulled
     """
 
     statuses: Annotated[bytes, Meta(max_length=100_001), Column("<u1", least=0, most=len(STATUSES) - 1)]

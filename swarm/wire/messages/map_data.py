@@ -147,11 +147,11 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     tile       of a grid of N tiles: 0 ... N - 1 for all vehicles; N tells what its author has learned; tile
                n (N + 1) + t is tile t for the n-th of the scenario's classes alone
 
-    cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing
-    kinds      uint8   MarkKind
-    paces      float32 s/m for PACE, ignored otherwise
-    stamps_ns  int64   hybrid logical time of each statement
-    untils_ns  int64   when each statement ends by itself, FOREVER if it does not; empty if none does
+    cells      indices inside the tile, row-major over 32 x 32, strictly increasing
+    kinds      MarkKind
+    paces      s/m for PACE, ignored otherwise
+    stamps_ns  hybrid logical time of each statement
+    untils_ns  when each statement ends by itself, FOREVER if it does not; empty if none does
 
     A set is checked when it is decoded (`check`), not when it is made: the statements of many sets are checked at
     once, by the rules of `swarm.wire.messages.map_data`.
@@ -186,13 +186,10 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
     """Many sets of one author and group, as one reply carries them: columns over the sets, then the statements of
     all sets, one set after the other.
 
-    tiles      uint32  of each set; none twice
-    epochs     uint64
-    seqs       uint64
-    counts     uint16  statements of each set
-    ending     uint8   1 where a set has `untils_ns`
-    cells      uint16, kinds uint8, paces float32, stamps_ns int64: as in MarkSet
-    untils_ns  int64   of the statements of the sets that have them
+    tiles      of each set; none twice
+    counts     statements of each set
+    ending     1 where a set has `untils_ns`
+    untils_ns  of the statements of the sets that have them
     """
 
     author: Id

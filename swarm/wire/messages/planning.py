@@ -117,7 +117,7 @@ class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-reques
 
 
 class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
-    """cost_to_go_s  float32 per asked cell, inf where there is no way or the cell is outside. Else as in
+    """A planner's answer: `cost_to_go_s` per asked cell, inf where there is no way or the cell is outside. Else as
     `RouteReply`."""
 
     target: Id
@@ -143,7 +143,7 @@ class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
 
     side_m  of the square blocks of ground that it tells of
     cells   near the middle of each block, the likeliest blocks first
-    shares  float32, probability of each
+    shares  probability of each
     """
 
     target: Id

@@ -57,12 +57,10 @@ _Place = Annotated[bytes, Column("<f4", per="ids", least=-1e9, most=1e9)]
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     """The vehicles of one agent process inside one region, at one instant. The newest replaces the older.
 
-    cells        uint32
-    east_m       float32  from the grid's west border; south_m from its north border
-    south_m      float32
-    heading_rad  float32  clockwise from north
-    states       uint8    VehicleState
-    targets      uint8    index into target_ids, NO_TARGET for none
+    east_m       from the grid's west border; south_m from its north border
+    heading_rad  clockwise from north
+    states       VehicleState
+    targets      index into target_ids, NO_TARGET (255) for none
     """
 
     author: Id
@@ -88,7 +86,7 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
 class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
     """The vehicles of one agent process that chase one target. The newest replaces the older.
 
-    cells  uint32, one that each vehicle may stand on or enter, where a new route for it may begin
+    cells  one that each vehicle may stand on or enter, where a new route for it may begin
     """
 
     target: Id
@@ -107,8 +105,8 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
     """Costs from the vehicles of one agent to each target, for the other agents of their group. The newest replaces
     the older.
 
-    costs_s  float32 per vehicle and target, the targets of one vehicle side by side; inf where there is no way
-    targets  uint8   the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
+    costs_s  per vehicle and target, the targets of one vehicle side by side; inf where there is no way
+    targets  the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
     """
 
     author: Id

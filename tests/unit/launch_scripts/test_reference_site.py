@@ -63,6 +63,12 @@ def test_a_page_of_the_python_api_stands_for_every_room(site):
             assert f'id="{module}"' in page
 
 
+def test_programs_stand_on_the_pages_that_include_them(site):
+    for page, program in (("join", "vehicle"), ("tracker", "target")):
+        about = (ROOT / "docs" / "examples" / f"{program}.py").read_text(encoding="utf-8").split('"""')[1]
+        assert about in (site / "vehicle" / f"{page}.html").read_text(encoding="utf-8")
+
+
 def test_a_browser_loads_nothing_from_other_hosts(site):
     for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
