@@ -424,9 +424,7 @@ class MemoryBus:
         if not self.closed:
             self._put(topic, *topic.value(fields), payload, in_json)
 
-    def _put(
-        self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes, in_json: bool = False
-    ) -> None:
+    def _put(self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes, in_json: bool = False) -> None:
         self.sent(payload)
         code = code_of(self.authenticator, topic, key, payload)
         sample = _Sample(topic, named, key, payload, code, in_json, checked_by=self.authenticator)

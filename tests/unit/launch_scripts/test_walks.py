@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -83,7 +84,8 @@ def test_no_target_takes_a_step_that_is_too_steep_and_none_outruns_the_climb(wal
             continue
         assert climb.allows(before, one.towards)
         level_s = where.length_m(before, one.towards) * where.pace_s_per_m.item(one.towards)
-        one.advance(where, level_s * climb.of_step(before, one.towards) * 1.0001, lambda at=before - 34: np.array([at]))
+        elapsed_s = level_s * climb.of_step(before, one.towards) * 1.0001
+        one.advance(where, elapsed_s, partial(np.array, [before - 34]))
         assert one.cell != before
         downhill += heights.flat[one.cell] < heights.flat[before]
     assert walk == "evade" or downhill > 0
