@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,27 +88,28 @@ class GapStatistics:
         self._counters.count("broken_certificates", many)
 
     def _held(self, tree: TargetTree, followers: Sequence[Follower], pace: NDArray[np.float32]) -> None:
-        rests = [(follower.cell, self._rest(follower, pace)) for follower in followers]
-        known = [(cell, *rest) for cell, rest in rests if rest is not None]
-        if not known:
+        starts, rests = list[int](), list[list[int]]()
+        for follower in followers:
+            route = follower.cells(self._grid)
+            if follower.cell in route:  # else it has left the route, or has none
+                starts.append(follower.cell)
+                rests.append(route[route.index(follower.cell) :])
+        if not starts:
             return
-        cells, driven, ends = (list(each) for each in zip(*known, strict=True))
-        whole = np.array(driven, np.float64) + tree.cost_to_go_at(ends).astype(np.float64)
-        self._counters.observe_all("held_gap_excess", _ratios(whole, tree.cost_to_go_at(cells)) - 1.0)
-
-    def _rest(self, follower: Follower, pace: NDArray[np.float32]) -> tuple[float, int] | None:
-        """(cost, last cell) of the rest of a follower's route; None if it has left the route or has none."""
-        route = follower.cells(self._grid)
-        if follower.cell not in route:
-            return None
-        cells = np.array(route[route.index(follower.cell) :], np.int64)
-        rows, cols = np.divmod(cells, self._grid.cols)
-        diagonal = (np.diff(rows) != 0) & (np.diff(cols) != 0)
+        cells = np.fromiter(chain.from_iterable(rests), np.int64)
+        of = np.repeat(np.arange(len(rests)), [len(rest) for rest in rests])
+        steps = np.flatnonzero(of[1:] == of[:-1])
+        tails, heads = cells[steps], cells[steps + 1]
+        rows, cols = np.divmod(heads, self._grid.cols)
+        diagonal = (tails // self._grid.cols != rows) & (tails % self._grid.cols != cols)
         metres = np.where(diagonal, self._diagonal_m, self._straight_m)
-        paces = pace[rows[1:], cols[1:]].astype(np.float64)
+        paces = pace[rows, cols].astype(np.float64)
         if self._climb is not None:
-            paces *= self._climb.along(cells[:-1], cells[1:])
-        return float(((paces + self._length_weight) * metres).sum()), int(cells[-1])
+            paces *= self._climb.along(tails, heads)
+        driven = np.zeros(len(rests))
+        np.add.at(driven, of[steps], (paces + self._length_weight) * metres)
+        whole = driven + tree.cost_to_go_at([rest[-1] for rest in rests]).astype(np.float64)
+        self._counters.observe_all("held_gap_excess", _ratios(whole, tree.cost_to_go_at(starts)) - 1.0)
 
 
 def _some(followers: Followers) -> list[Follower]:

@@ -22,11 +22,14 @@ from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
 from swarm.wire.messages.map_data import PACE_MOST, MarkKind, MarkSet
 
-MAX_WINDOWS = 32
-"""Dirty windows are merged into fewer beyond this."""
-_MANY_BOXES = 8 * MAX_WINDOWS
+MAX_WINDOWS = 512
+"""Dirty windows are merged into one beyond this: more than ten thousand vehicles find in the time of two ticks. One
+box around all their finds is the whole map, and makes each reader look at every cell, route and vehicle."""
+_MANY_BOXES = 2 * MAX_WINDOWS
 """Above this number of boxes around changed cells one box around all of them is kept: merging is quadratic in their
 number."""
+_FEW_PAIRS = 512
+"""Up to this number of pairs of boxes a list is faster than arrays."""
 
 
 class CostSnapshot(NamedTuple):
@@ -148,8 +151,8 @@ class CostMap:
         return self._dirty
 
     def take_dirty(self) -> list[Window]:
-        """Windows which cover every cell whose pace changed since the last call, 32 at most; none touches
-        another."""
+        """Windows which cover every cell whose pace changed since the last call, `MAX_WINDOWS` at most; none
+        touches another."""
         windows, self._dirty = self._dirty, []
         return windows
 
@@ -242,10 +245,11 @@ def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Win
 
     others  windows of which none touch each other
     """
-    apart = list(others)
-    for window in windows:
-        if window.empty:
-            continue
+    apart, fresh = list(others), [window for window in windows if not window.empty]
+    if len(fresh) * (len(fresh) + len(apart)) > _FEW_PAIRS:
+        apart = _merged_as_arrays([*apart, *fresh])
+        fresh = []
+    for window in fresh:
         while True:
             row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
             touching = [  # `touches`, without a call for each
@@ -262,3 +266,19 @@ def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Win
             whole = whole.union(window)
         return [whole]
     return apart
+
+
+def _merged_as_arrays(windows: Sequence[Window]) -> list[Window]:
+    """The same for many windows."""
+    boxes = np.array([(each.row0, each.col0, -each.row1, -each.col1) for each in windows], np.int64)
+    while True:
+        row0, col0, row1, col1 = boxes.T * np.array([[1], [1], [-1], [-1]])
+        reach = (row0[:, None] <= row1) & (col0[:, None] <= col1)
+        first = (reach & reach.T).argmax(1)  # the first that each touches, which may be itself
+        while (first[first] != first).any():
+            first = first[first]
+        order = np.argsort(first, kind="stable")
+        starts = np.flatnonzero(np.diff(first[order], prepend=-1))
+        if len(starts) == len(boxes):
+            return [Window(*each) for each in np.stack((row0, col0, row1, col1), 1).tolist()]
+        boxes = np.minimum.reduceat(boxes[order], starts, axis=0)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
@@ -130,6 +131,9 @@ class Agent:
         self.seen_lethal: set[int] = set()
         """Cells in zones over which no way out leads, as vehicles have seen."""
         self._driven_ns: int | None = None
+        self._bounds: list[tuple[int, int, int, int]] = []
+        """Bounds of the vehicles' routes, and these as an array, a cell wider on each side."""
+        self._route_boxes: NDArray[np.int64] = np.empty((0, 4), np.int64)
 
     # --- what operators order ---------------------------------------------------------------------------------
 
@@ -255,9 +259,10 @@ class Agent:
         rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
         places = np.stack((rows - sight, east - sight, rows + sight, east + sight), 1)
         # A cell wider on each side: a diagonal step ends where a cell beside it is closed.
-        routes = np.array([vehicle.route.bounds(cols) for vehicle in vehicles], np.int64)
-        routes += np.array((-1, -1, 1, 1))
-        on_route, in_sight = meet(np.concatenate((routes, places)), changed).reshape(2, -1)
+        bounds = [vehicle.route.bounds(cols) for vehicle in vehicles]
+        if bounds != self._bounds:  # most calls of a tick find the routes as they were
+            self._bounds, self._route_boxes = bounds, np.array(bounds, np.int64) + np.array((-1, -1, 1, 1))
+        on_route, in_sight = meet(np.concatenate((self._route_boxes, places)), changed).reshape(2, -1)
         for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
@@ -342,11 +347,11 @@ class Agent:
         pose = self._poses.get(target)
         if pose is None:
             return False
-        grid = self._map.grid
-        return (
-            math.dist(grid.row_col(cell), grid.row_col(pose.cell)) * grid.resolution_m
-            <= self._config.capture_range_m
-        )
+        cols, resolution_m = self._map.grid.cols, self._map.grid.resolution_m
+        south, range_m = cell // cols - pose.cell // cols, self._config.capture_range_m
+        if abs(south) * resolution_m > range_m:  # nearly always: asked of each vehicle in each tick
+            return False
+        return math.hypot(south, cell % cols - pose.cell % cols) * resolution_m <= range_m
 
     def _check_reach(self, vehicle: Vehicle) -> None:
         near = self._in_reach(vehicle.target, vehicle.cell)

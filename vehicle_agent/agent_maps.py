@@ -62,16 +62,16 @@ def meet(boxes: NDArray[np.int64], windows: Sequence[Window]) -> NDArray[np.bool
     boxes  int64 (n, 4): the smallest row and column of each, and the greatest; one whose greatest are smaller meets
            none
     """
-    met = np.zeros(len(boxes), np.bool_)
-    if not len(boxes):
-        return met
+    if not len(boxes) or not windows:
+        return np.zeros(len(boxes), np.bool_)
     row0, col0, row1, col1 = np.ascontiguousarray(boxes.T)
     north, west, south, east = int(row0.min()), int(col0.min()), int(row1.max()), int(col1.max())
-    for window in windows:
-        if window.row1 <= north or window.col1 <= west or window.row0 > south or window.col0 > east:
-            continue  # far from all of them, as half of the windows are that concern an agent
-        rows = (row0 < window.row1) & (row1 >= window.row0)
-        met |= rows & (col0 < window.col1) & (col1 >= window.col0)
+    near = [
+        (each.row0, each.col0, each.row1, each.col1) for each in windows
+        if each.row1 > north and each.col1 > west and each.row0 <= south and each.col0 <= east
+    ]  # fmt: skip
+    top, left, bottom, right = np.array(near, np.int64).reshape(-1, 4).T[:, :, None]
+    met: NDArray[np.bool_] = ((row0 < bottom) & (row1 >= top) & (col0 < right) & (col1 >= left)).any(0)
     met &= row0 <= row1
     return met
 

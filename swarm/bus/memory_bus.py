@@ -413,18 +413,21 @@ class MemoryBus:
         """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        self.publish_bytes(topic, meant_for(topic.value(fields)[1], encode(message)), fields)
+        if not self.closed:
+            named, key = topic.value(fields)
+            self._put(topic, named, key, meant_for(key, encode(message)))
 
     def publish_bytes(
         self, topic: Topic, payload: bytes, fields: Mapping[str, str | int], *, in_json: bool = False
     ) -> None:
         """Puts any payload at all: tests send garbage with it, and JSON."""
-        if self.closed:
-            return
+        if not self.closed:
+            self._put(topic, *topic.value(fields), payload, in_json)
+
+    def _put(self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes, in_json: bool = False) -> None:
         self.sent(payload)
-        named, key = topic.value(fields)
         code = code_of(self.authenticator, topic, key, payload)
-        sample = _Sample(topic, named, key, payload, code, in_json)
+        sample = _Sample(topic, named, key, payload, code, in_json, checked_by=self.authenticator)
         network = self.network
         arrivals: dict[int, list[Declaration]] = {}
         for subscription in network.subscriptions[self.namespace, topic.name].find(named):
@@ -678,7 +681,7 @@ _UNPARSED = ProtocolError("not parsed yet")
 class _Sample:
     """One put, parsed and checked once: when the first subscription is reached. All share the result.
 
-    checked_by  the authenticator that accepted its code; None before, and for a bus without codes
+    checked_by  the authenticator that made or accepted its code; None for a bus without codes
     parsed      whether it was parsed
     parses      its event, or why the payload is no message of the topic, or is meant for another key
     fits        the same, or why its fields say that it is of another sender than the key

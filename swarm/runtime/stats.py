@@ -53,6 +53,10 @@ _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
 
 
+_FEW = 8
+"""Up to this number of values a loop is faster than arrays."""
+
+
 class Histogram:
     """Positive values in logarithmic buckets 4 % wide: merged by adding, quantiles within 2 %.
 
@@ -73,6 +77,10 @@ class Histogram:
     def add_all(self, values: NDArray[np.float64]) -> None:
         """Like `add` for each value, the positive ones first and in order: the order of buckets reaches the
         wire."""
+        if values.size <= _FEW:
+            for value in sorted(values.tolist(), key=lambda value: (value <= 0, value)):
+                self.add(value)
+            return
         values = values[np.isfinite(values)]
         positive = values[values > 0]
         found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Sequence
+from itertools import chain
 
 import msgspec
 import numpy as np
@@ -298,9 +299,10 @@ class Places:
 
     def __init__(self, grid: GridSpec, vehicles: Iterable[Vehicle]) -> None:
         self.vehicles = list(vehicles)
-        rows = [(*each.motion.place_m(), each.motion.heading_rad, each.motion.cell) for each in self.vehicles]
-        columns: NDArray[np.float64] = np.array(rows, np.float64).reshape(-1, 4).T
-        self.east_m, self.south_m, self.heading_rad = columns[:3]
-        self.cells: NDArray[np.int64] = columns[3].astype(np.int64)
+        motions = [vehicle.motion for vehicle in self.vehicles]
+        places = chain.from_iterable([motion.place_m() for motion in motions])
+        self.east_m, self.south_m = np.fromiter(places, np.float64, 2 * len(motions)).reshape(-1, 2).T
+        self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
+        self.cells: NDArray[np.int64] = np.array([motion.cell for motion in motions], np.int64)
         row, col = np.divmod(self.cells, grid.cols)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS

@@ -119,8 +119,10 @@ class Motion:
 
     def place_m(self) -> tuple[float, float]:
         """(east, south) in metres from the north-west corner of the grid."""
-        (row0, col0), (row1, col1), share = self.stretch()
-        row, col = row0 + share * (row1 - row0), col0 + share * (col1 - col0)
+        row, col = self._at
+        if self.length_m:
+            (row, col), (row1, col1), share = self.stretch()
+            row, col = row + share * (row1 - row), col + share * (col1 - col)
         return (col + 0.5) * self._grid.resolution_m, (row + 0.5) * self._grid.resolution_m
 
 

@@ -10,9 +10,8 @@ not count."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Container, Iterator, Mapping
+from collections.abc import Collection, Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body, Fleet
 from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
 
-On = TypeVar("On")
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""
 _REMEMBER_NS = 5 * NS_PER_S
@@ -124,14 +122,6 @@ def _is_new(encounters: Encounters, pair: tuple[str, str], until_ns: int) -> boo
     return last_ns is None or until_ns - last_ns > _APART_NS
 
 
-def _forget(at: dict[int, list[On]], is_over: Callable[[On], bool]) -> None:
-    """Drops expired entries from the lists of all cells, and cells without any."""
-    for cell in list(at):
-        at[cell] = [each for each in at[cell] if not is_over(each)]
-        if not at[cell]:
-            del at[cell]
-
-
 class Referee:
     """Turns reports into broken laws. Repeated and late reports change nothing.
 
@@ -149,6 +139,8 @@ class Referee:
         self._vehicles: dict[str, Stay] = {}
         """Vehicle -> where it is: its newest stay, which ends with its newest report."""
         self._stays: dict[int, list[Stay]] = {}
+        self._left: list[Stay] = []
+        """Stays of vehicles that have gone on since."""
         self._encounters: Encounters = {}
         self._swept_ns = 0
         self._bodies = BodyReferee(grid)
@@ -199,6 +191,8 @@ class Referee:
     def _enter(self, entered: Stay, fleet: Fleet, broken: list[Broken]) -> None:
         """A vehicle comes onto a cell."""
         self._stays.setdefault(entered.cell, []).append(entered)
+        if (left := self._vehicles.get(entered.vehicle)) is not None:
+            self._left.append(left)
         self._vehicles[entered.vehicle] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
         if not truth.item(entered.cell) < math.inf:
@@ -219,11 +213,13 @@ class Referee:
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
         self._swept_ns = now_ns
-        vehicles = self._vehicles
-        _forget(
-            self._stays,
-            lambda stay: now_ns - stay.end_ns > _REMEMBER_NS and vehicles[stay.vehicle] is not stay,
-        )
+        ended = [stay for stay in self._left if now_ns - stay.end_ns > _REMEMBER_NS]
+        for stay in ended:
+            self._stays[stay.cell].remove(stay)
+            if not self._stays[stay.cell]:
+                del self._stays[stay.cell]
+        if ended:
+            self._left = [stay for stay in self._left if now_ns - stay.end_ns <= _REMEMBER_NS]
 
 
 IN_TIME_NS = NS_PER_S // 5
@@ -317,7 +313,11 @@ class BodyReferee:
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""
         self._swept_ns = now_ns
-        _forget(self._covers, lambda cover: now_ns - cover.end_ns > _REMEMBER_NS)
+        for cell, covers in list(self._covers.items()):
+            lasting = [cover for cover in covers if now_ns - cover.end_ns <= _REMEMBER_NS]
+            self._covers[cell] = lasting
+            if not lasting:
+                del self._covers[cell]
         for key in [key for key, record in self._records.items() if now_ns - record.until_ns > _REMEMBER_NS]:
             del self._records[key]
         for pair in [pair for pair, met_ns in self._met.items() if now_ns - met_ns > 2 * _REMEMBER_NS]:

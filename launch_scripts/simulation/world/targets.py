@@ -281,7 +281,6 @@ class TargetWorld:
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * time_scale
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
-        vehicles = self._referee.cells
         self._budget.ways = _WAYS_PER_TICK
         actions: list[Action] = [*self._rovers.tick(time_scale, now_ns)]
         for id, target in self._targets.items():
@@ -289,7 +288,7 @@ class TargetWorld:
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, vehicles)
+                target.walker.advance(self._terrain, elapsed_s, lambda: self._referee.cells)
             target.placed = True
             pose = self._pose(id, target, now_ns)
             self._refer(pose, now_ns)

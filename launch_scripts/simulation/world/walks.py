@@ -42,6 +42,9 @@ _STEPS_PER_TICK = 1000
 """Bounds the time of a tick for a quick target on small cells, or after a long pause. The remainder of the tick is
 lost."""
 
+_BY_PLACE = sorted(zip(STEP_ROW, STEP_COL, strict=True))
+"""(rows to the south, columns to the east) of each step, in order of the cells to which they lead."""
+
 
 class TrueTerrain:
     """True pace of every cell, and the steps that are possible.
@@ -139,21 +142,28 @@ class TrueTerrain:
         from scipy.sparse import csr_array
 
         pace = self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
+        rows, cols = pace.shape
         padded = np.pad(pace.astype(np.float64), 1, constant_values=np.inf)
-        row, col = np.divmod(np.arange(pace.size), pace.shape[1])
+        cost = np.empty((rows, cols, len(_BY_PLACE)))
+        for n, (south, east) in enumerate(_BY_PLACE):
+            ahead = padded[1 + south : 1 + south + rows, 1 + east : 1 + east + cols]
+            # The cells beside the corner of a straight step are the two cells that it connects.
+            beside = padded[1 + south : 1 + south + rows, 1:-1], padded[1:-1, 1 + east : 1 + east + cols]
+            np.multiply(ahead, np.hypot(south, east), out=cost[:, :, n])
+            cost[:, :, n][np.isinf(np.maximum(*beside)) | np.isinf(pace)] = np.inf
+        possible = np.isfinite(cost)
+        tail, way = np.divmod(np.flatnonzero(possible), len(_BY_PLACE))
+        south, east = np.array(_BY_PLACE).T
+        head = tail + south[way] * cols + east[way]
+        cost = cost[possible]
+        row, col = np.divmod(np.arange(pace.size), cols)
         cells = (row + window.row0) * self.grid.cols + col + window.col0
-        d_row, d_col = np.array(STEP_ROW)[:, None], np.array(STEP_COL)[:, None]
-        ahead = padded[row + 1 + d_row, col + 1 + d_col]
-        # The cells beside the corner of a straight step are the two cells that it connects.
-        beside = np.maximum(padded[row + 1 + d_row, col + 1], padded[row + 1, col + 1 + d_col])
-        own = padded[row + 1, col + 1]
-        way, tail = np.nonzero(np.isfinite(np.maximum(np.maximum(ahead, beside), own)))
-        head = tail + np.array(STEP_ROW)[way] * pace.shape[1] + np.array(STEP_COL)[way]
-        cost = ahead[way, tail] * np.hypot(STEP_ROW, STEP_COL)[way]
         if self.climb is not None:
             cost *= self.climb.along(cells[tail], cells[head])
             tail, head, cost = (each[np.isfinite(cost)] for each in (tail, head, cost))
-        return cells, csr_array((cost, (tail, head)), shape=(pace.size, pace.size))
+        # Edges in order of tail and head are a sparse matrix as it is, without sorting.
+        begins = np.searchsorted(tail, np.arange(pace.size + 1))
+        return cells, csr_array((cost, head, begins), shape=(pace.size, pace.size))
 
 
 @dataclass
@@ -329,13 +339,13 @@ class Walker:
         self.towards = None
         self.progress_s = 0.0
 
-    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: NDArray[np.int64]) -> None:
-        """Moves on for some seconds. `vehicles` are the cells that an evader keeps away from."""
+    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: Callable[[], NDArray[np.int64]]) -> None:
+        """Moves on for some seconds. `vehicles` returns the cells that an evader keeps away from."""
         if not math.isfinite(self.slowness):
             return
         for _ in range(_STEPS_PER_TICK):
             if self.towards is None:
-                self.towards = self.walk.choose(self.cell, vehicles)
+                self.towards = self.walk.choose(self.cell, vehicles())
                 if self.towards is None:
                     return
             step_s = self._step_s(terrain)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shared_map.cost_map import CostMap, cluster, merged
+from shared_map.cost_map import MAX_WINDOWS, CostMap, cluster, merged
 from shared_map.terrain.layers import inflate, inflation_halves, spread
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.errors import OutsideGridError
@@ -113,10 +115,28 @@ def test_a_mark_outside_the_grid_is_a_bug_and_raises() -> None:
         CostMap(terrain()).apply(*marks((ROWS * COLS, MarkKind.LETHAL, 0.0)))
 
 
-def test_many_windows_become_one() -> None:
-    far = [Window(0, 10 * n, 1, 10 * n + 1) for n in range(50)]
-    assert merged(far) == [Window(0, 0, 1, 491)]
+def test_windows_beyond_the_most_become_one_and_up_to_it_stay_apart() -> None:
+    far = [Window(0, 10 * n, 1, 10 * n + 1) for n in range(MAX_WINDOWS + 1)]
+    assert set(merged(far[1:])) == set(far[1:])
+    assert merged(far) == [Window(0, 0, 1, 10 * MAX_WINDOWS + 1)]
     assert cluster(np.zeros(0, np.int64), 5) == []
+
+
+a_window = st.builds(
+    lambda row, col, rows, cols: Window(row, col, row + rows, col + cols),
+    *(st.integers(0, 120), st.integers(0, 120), st.integers(0, 5), st.integers(0, 5)),
+)
+
+
+@settings(deadline=None)
+@given(old=st.lists(a_window, max_size=30), new=st.lists(a_window, max_size=60))
+def test_merged_windows_are_the_least_that_cover_all_and_do_not_touch(old: list[Window], new: list[Window]) -> None:
+    others = merged(old)
+    slow = [window for window in [*others, *new] if not window.empty]
+    while pair := next(((a, b) for n, a in enumerate(slow) for b in slow[:n] if a.touches(b)), None):
+        slow = [each for each in slow if each not in pair] + [pair[0].union(pair[1])]
+    found = merged(new, others)
+    assert sorted(map(astuple, found)) == sorted(map(astuple, slow))
 
 
 def test_a_vehicle_that_fits_its_cell_inflates_nothing() -> None:
