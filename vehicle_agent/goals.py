@@ -45,8 +45,8 @@ def is_over(goals: VehicleGoals) -> bool:
 
 
 def arrival_cells(goal: int, vehicles: int, steps: Callable[[int], Iterable[int]]) -> frozenset[int]:
-    """The cells on which vehicles that share a place reach it: those within the least number of steps from it that are
-    as many as the vehicles, or all that can be reached.
+    """The cells on which vehicles that share a place reach it: those within the least number of steps from it that
+    are as many as the vehicles, or all that can be reached.
 
     steps  cells to which one may drive from a cell
     """

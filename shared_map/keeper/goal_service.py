@@ -1,4 +1,4 @@
-"""The keeper's book of goals: where vehicles are sent. An acknowledged order is on its disk, and told to the agent."""
+"""The keeper's book of goals: an acknowledged order that sends a vehicle is on its disk, and told to the agent."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Goals of vehicles: every place is reached in its order and none is skipped, whatever is lost, repeated or restarted;
-vehicles which share a place have room around it."""
+"""Goals of vehicles: every place is reached in its order and none is skipped, whatever is lost, repeated or
+restarted; vehicles which share a place have room around it."""
 
 from __future__ import annotations
 
@@ -92,14 +92,14 @@ def test_places_are_reached_in_order_and_the_last_order_counts_whatever_is_lost_
         history.chance.choices(moves, weights)[0]()
     history.settle()
     assert list(history.keepers[0]) == list(history.keepers[1]) == list(history.agent.book)
-    for name, given in history.given.items():
+    for name, last in history.given.items():
         held = history.agent.book.get(name)
         assert held is not None
         assert (held.stamp_ns, held.cells, held.then, held.off) == (
-            given.stamp_ns, given.cells, given.then, given.off,
+            last.stamp_ns, last.cells, last.then, last.off,
         )  # fmt: skip
-        # Every place that counts as reached was. What a life has not told before it ends is repeated; none is skipped.
-        visited = set(history.visits.get((name, given.stamp_ns), ()))
+        # Every place that counts as reached was. Where a life ends before it tells, some are repeated, none skipped.
+        visited = set(history.visits.get((name, last.stamp_ns), ()))
         assert visited == set(range(len(visited)))
         assert held.done <= len(visited)
 
