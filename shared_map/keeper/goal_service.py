@@ -12,7 +12,9 @@ from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
+from swarm.config.agents import agent_of, plan_agents
+from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
 from swarm.errors import ConfigError, StoreError
 from swarm.places import cell_of
 from swarm.runtime.order_book import MOST_SENT, GoalBook, fault_of_vehicle
@@ -35,6 +37,7 @@ class KeptGoals:
     def __init__(
         self,
         id: str,
+        scenario: Scenario,
         terrain: Terrain,
         store: KeeperStore,
         bus: Bus,
@@ -44,6 +47,8 @@ class KeptGoals:
         self.book = GoalBook()
         self._id, self._terrain, self._store, self._bus, self._post = id, terrain, store, bus, post
         self._vehicles = vehicles
+        self._on_ground = {plan.id for plan in plan_agents(scenario) if plan.group.vehicle_class == GROUND}
+        """Agents whose vehicles find the terrain's own lethal cells lethal."""
         self._unsaved: list[VehicleGoals] = []
         """News of other keepers and agents that is not on our disk yet."""
         self._due_ns = 0
@@ -117,6 +122,8 @@ class KeptGoals:
             return f"vehicle {vehicle}: {MOST_SENT} vehicles have been sent already, which is the limit"
         try:
             cells = [cell_of(place, MapFrame(grid), "place") for place in given.places]
+            if (fault := self._fault_of(given, cells)) is not None:
+                return f"vehicle {vehicle}: {fault}"
             goals = VehicleGoals(
                 name=vehicle, stamp_ns=self.book.stamp_after(vehicle, now_ns), off=given.off, cells=cells,
                 then=given.then,
@@ -128,6 +135,16 @@ class KeptGoals:
             return str(error)
         self.book.merge([goals], now_ns)
         return goals
+
+    def _fault_of(self, given: SendVehicle, cells: Sequence[int]) -> str | None:
+        """Reason why the vehicle cannot go to these cells. Planners know what is lethal for other classes."""
+        if given.then == "repeat" and len(set(cells)) < 2:
+            return "to repeat, expected two different places or more"
+        if agent_of(given.vehicle) not in self._on_ground:
+            return None
+        pace = self._terrain.pace_s_per_m.reshape(-1)
+        lethal = next((cell for cell in cells if not float(pace[cell]) < float("inf")), None)
+        return None if lethal is None else f"place {list(divmod(lethal, self._terrain.grid.cols))} is lethal"
 
 
 def shared_by(all: Iterable[VehicleGoals], ours: Iterable[VehicleGoals]) -> list[tuple[int, int]]:

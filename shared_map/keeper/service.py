@@ -89,7 +89,7 @@ class KeeperService:
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
-        self._goals = KeptGoals(setup.id, terrain, store, bus, post, self._orders.vehicles_with)
+        self._goals = KeptGoals(setup.id, setup.scenario, terrain, store, bus, post, self._orders.vehicles_with)
         self._stats: dict[tuple[str, str], Stats] = {}
         """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
         self._stats_size = 0
