@@ -54,7 +54,7 @@ class Orders:
         return self._operator.send(_checked(SendVehicle, vehicle=vehicle, places=list(places), then=then))[1]
 
     def recall(self, vehicle: str) -> Acknowledged:
-        """Lets it chase targets again."""
+        """Returns it to the chase of targets."""
         return self._operator.send(_checked(SendVehicle, vehicle=vehicle, off=True))[1]
 
     def goals(self) -> list[VehicleGoals]:

@@ -187,7 +187,7 @@ class Incoming:
         return Input(self._node, self._settings.set_pose_of(id), SET_POSE.type_name, 10.0, take)
 
     def _take_goals_of(self, vehicles: Mapping[str, str]) -> None:
-        """Lets ROS send these vehicles to places.
+        """Takes goals of these vehicles from ROS.
 
         vehicles  name in ROS -> vehicle
         """
