@@ -63,8 +63,8 @@ class OrderClient:
         self._obeys = obeys
         self._waiting: deque[Asked] = deque()
         self._asks = 0
-        self._asking = 0
-        """Number of open questions for books."""
+        self._asking: set[str] = set()
+        """Books of which an answer is waited for."""
         self._ask_due_ns = 0
 
     @property
@@ -98,7 +98,7 @@ class OrderClient:
                     event.answer(Orders(role=self._obeyed.role, id=self._obeyed.id, orders=list(self.book)))
                 event.end()
             case AskEnded(tag=tag, failure=failure) if tag in (_TAG, _GOALS):
-                self._asking -= 1
+                self._asking.discard(tag)
                 if self._asks >= (_ASKS_OF_NOBODY if failure is None else _ASKS):
                     self._missing.discard(tag)
             case Asked(request=Obey()):
@@ -143,7 +143,7 @@ class OrderClient:
     def _ask(self, now_ns: int) -> None:
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS
         self._asks += 1
-        self._asking = len(self._missing)
+        self._asking = set(self._missing)
         if _GOALS in self._missing:
             self._bus.ask(GOALS, Nothing(), self._post, tag=_GOALS, timeout_s=_ASK_S, agent=self._obeyed.id)
         if _TAG not in self._missing:
