@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 
@@ -17,15 +17,17 @@ from swarm.config.scenario import Scenario
 from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
+from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle
+from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
+from vehicle_agent.goals import GoalQueues
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
@@ -112,6 +114,11 @@ class Agent:
             pulled=self._pulled,
             measures=scenario.map.learning,
         )
+        self.goals = GoalQueues(lambda cell: self._steering.steps(cell) if cell < grid.cells else ())
+        self._goals_taken = -1
+        """Version of the goals by which the vehicles go."""
+        self._look_due_ns = 0
+        self._places_planned = False
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str | None, TargetPose] = {}
@@ -145,10 +152,57 @@ class Agent:
         self.targets = list(targets)
         self.assignment.targets = self.targets
         for vehicle in self.vehicles.values():
-            if vehicle.target is not None and vehicle.target not in self.targets:
+            if vehicle.target is not None and vehicle.goal is None and vehicle.target not in self.targets:
                 vehicle.release()
                 self._driver.stop_soon(vehicle)
         self.assignment.ask_soon(now_ns)
+
+    def follow_goals(self, shared: Mapping[int, int], places_planned: bool, now_ns: int) -> None:
+        """Sends vehicles where the book of `goals` says, and recalls them. Called in each tick.
+
+        shared          as in `GoalQueues`
+        places_planned  whether a process plans routes to places
+        """
+        goals = self.goals
+        if shared != goals.shared or now_ns >= self._look_due_ns:
+            self._look_due_ns = now_ns + NS_PER_S
+            goals.shared = shared
+            goals.look_again()
+        if places_planned != self._places_planned:
+            self._places_planned = places_planned
+            for vehicle in self.vehicles.values():
+                if vehicle.goal is not None:
+                    vehicle.regain_planner(now_ns) if places_planned else vehicle.lose_planner(now_ns)
+        if not self.goals_taken:
+            self._goals_taken = goals.book.version
+            for vehicle in self.vehicles.values():
+                self._send(vehicle, now_ns)
+
+    @property
+    def goals_taken(self) -> bool:
+        """True if the vehicles go by the book of goals as it is."""
+        return self._goals_taken == self.goals.book.version
+
+    def goal_states(self, left: Collection[str]) -> list[GoalState]:
+        """The state of each vehicle that was sent somewhere.
+
+        left  vehicles that have left the map
+        """
+        return self.goals.states(self.vehicles, left, self.stopped, self._steering.waiting_ns)
+
+    def _send(self, vehicle: Vehicle, now_ns: int) -> None:
+        cell = self.goals.cell(vehicle.id)
+        name = None if cell is None else goal_name(cell)
+        if name == vehicle.target or (name is None and vehicle.goal is None):
+            return
+        vehicle.release()
+        self._driver.stop_soon(vehicle)
+        if name is None:
+            self.assignment.ask_soon(now_ns)
+            return
+        vehicle.assign(name, now_ns)
+        if not self._places_planned:
+            vehicle.lose_planner(now_ns)
 
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
         """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
@@ -164,6 +218,7 @@ class Agent:
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
             self._driver.entered[cell] = None
             self._unassigned = True
+            self._goals_taken = -1
 
     def is_open(self, cell: int) -> bool:
         """Returns True if a vehicle may enter the map on a cell: it is not lethal, and no body closes it, as far as
@@ -302,6 +357,8 @@ class Agent:
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
+            if vehicle.in_reach and vehicle.goal is not None and vehicle.motion.at_rest:
+                self.goals.reached(vehicle.id, now_ns)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
@@ -340,10 +397,14 @@ class Agent:
         return actions
 
     def _target_cell(self, target: str | None) -> int | None:
+        if (goal := goal_of(target)) is not None:
+            return goal
         pose = self._poses.get(target)
         return None if pose is None else pose.cell
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
+        if (goal := goal_of(target)) is not None:
+            return self.goals.is_at(goal, cell)
         pose = self._poses.get(target)
         if pose is None:
             return False
@@ -400,7 +461,7 @@ class Agent:
         before, self._planners = self._planners, dict(alive)
         for vehicle in self.vehicles.values():
             target = vehicle.target
-            if target is None:
+            if target is None or vehicle.goal is not None:
                 continue
             if target not in alive and not vehicle.planner_gone:
                 vehicle.lose_planner(now_ns)
@@ -454,6 +515,7 @@ class Agent:
             return []
         if route.status is not RouteStatus.OK and not searching:
             if not pushed:
+                self.goals.refused[vehicle.id] = route.status
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
         if searching and target not in self._unseen and target in self.lost(now_ns):

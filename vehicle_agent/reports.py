@@ -97,7 +97,7 @@ class FleetReport:
     def _report(self, region: int, places: Places, inside: Sequence[int], now_ns: int) -> Fleet:
         vehicles = [places.vehicles[index] for index in inside]
         at = np.array(inside, np.intp)
-        named = [vehicle.target for vehicle in vehicles]
+        named = [vehicle.target if vehicle.goal is None else None for vehicle in vehicles]
         first = [*islice(dict.fromkeys(target for target in named if target is not None), NO_TARGET)]
         targets: dict[str | None, int] = {target: number for number, target in enumerate(first)}
         return Fleet(

@@ -23,7 +23,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages import Message
-from swarm.wire.messages.orders import Obey
+from swarm.wire.messages.orders import GoalState, GoalStates, Obey
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -41,6 +41,7 @@ from swarm.wire.topics import (
     COST,
     FLEET,
     FOLLOWED,
+    GOAL_STATES,
     LEAVE,
     POSE,
     PUSHED_ROUTE,
@@ -73,6 +74,8 @@ _GAUGES = [
     (int(VehicleState.LOST), "lost"),
 ]
 """State of a vehicle -> the gauge that counts vehicles in it."""
+_GOALS_APART_NS = NS_PER_S // 2
+"""Least time between two messages about goals."""
 _COUNTED_FROM_0 = ("reroute_requests", "routes_received", "marks", "blocked_ticks")
 
 M = TypeVar("M", bound=Message)
@@ -104,8 +107,10 @@ class AgentService:
         self.counters = self._member.counters
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
-        self._obedience = OrderClient(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
         self._obeyed_version = 0
+        self._goals_told: tuple[list[GoalState], int] = [], 0
+        """The states of goals that were published last, and when."""
         self._roster = Roster()
         self._planners_changed = False
         """True if a planner has come or gone, or a target, since the agent was told of them."""
@@ -141,6 +146,7 @@ class AgentService:
     def start(self, now_ns: int) -> None:
         bus, post, id = self._bus, self._post, self._setup.id
         bus.watch_alive(post, role="planner")
+        bus.watch_alive(post, role="places")
         self._right_of_way.start(now_ns)  # peers send a query as soon as they see this token
         self._member.join()
         self._sync.start(now_ns)
@@ -228,7 +234,10 @@ class AgentService:
         for region, fleet in parts.fleet.reports(columns, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         paths = agent.holdings.paths
-        chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
+        self._tell_goals(now_ns)
+        chasing = [
+            (id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items() if vehicle.goal is None
+        ]
         for chasers in parts.chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
@@ -271,12 +280,32 @@ class AgentService:
                 book.setting("time_scale", scenario.time_scale),
                 book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
             )
+        agent.follow_goals(orders.shared, bool(self._roster.alive("places")), now_ns)
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:
+        if order.goals:
+            return self.agent.goals_taken
         if order.subject is not None:
             return self._obeyed_version == self._obedience.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns)
+
+    def _tell_goals(self, now_ns: int) -> None:
+        """Publishes how far vehicles are with their goals, and raises alarms about those which are blocked."""
+        agent, since_ns = self.agent, now_ns - self._goals_told[1]
+        if not len(agent.goals.book) or since_ns < _GOALS_APART_NS:
+            return
+        states = agent.goal_states(self._removed)
+        if states == self._goals_told[0] and since_ns < NS_PER_S:
+            return
+        self._goals_told = states, now_ns
+        self._bus.publish(
+            GOAL_STATES, GoalStates(agent=self._setup.id, stamp_ns=now_ns, states=states), agent=self._setup.id
+        )
+        blocked = {each.name: each for each in states if each.state == "blocked"}
+        for name, each in blocked.items():
+            self._member.alarms.begin("goal-blocked", name, f"{name} waits: {each.reason}", now_ns, each.cell)
+        self._member.alarms.last_of("goal-blocked", blocked, now_ns)
 
     def _place(self, vehicles: Sequence[str]) -> None:
         """These have found their places."""

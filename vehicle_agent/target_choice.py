@@ -197,18 +197,21 @@ class Assignment:
         self._reassign_ns = int(reassign_s * NS_PER_S)
 
     def due(self, now_ns: int) -> bool:
-        return now_ns >= self._due_ns and self._open is None
+        return now_ns >= self._due_ns and self._open is None and bool(self._choosing())
 
     def ask(self, request: int, now_ns: int) -> AskCosts:
         """The request to send now, under this number."""
         self._costs_s = {}
-        self._open = AskCosts(
-            request, tuple(self._vehicles), tuple(vehicle.cell for vehicle in self._vehicles.values())
-        )
+        vehicles = self._choosing()
+        self._open = AskCosts(request, tuple(vehicles), tuple(vehicle.cell for vehicle in vehicles.values()))
         first = self._due_ns == 0
         self._due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
         self._asked_ns = now_ns
         return self._open
+
+    def _choosing(self) -> dict[str, Vehicle]:
+        """The vehicles that chase targets: none that was sent to a place."""
+        return {id: vehicle for id, vehicle in self._vehicles.items() if vehicle.goal is None}
 
     def ask_soon(self, now_ns: int) -> None:
         """A target has a planner again, so that costs are not what they were, or vehicles are new."""
@@ -246,9 +249,10 @@ class Assignment:
         stuck = not self._costs_s
         if self._group is not None:
             self._group.expire(now_ns - _LEASE_PERIODS * self._reassign_ns)
-        shares = self._share_out(asked, empty, standing)
+        vehicles = self._choosing()
+        shares = self._share_out(asked, vehicles, empty, standing)
         for index, id in enumerate(asked.vehicles):
-            vehicle = self._vehicles.get(id)
+            vehicle = vehicles.get(id)
             if vehicle is None:
                 continue
             costs_s = {target: float(column[index]) for target, column in self._costs_s.items()}
@@ -265,20 +269,26 @@ class Assignment:
         if self._group is None:
             return None
         # Input of the others: the costs of vehicles that may chase any target.
-        may = [n for n, id in enumerate(asked.vehicles) if id in self._vehicles and id not in standing]
+        may = [n for n, id in enumerate(asked.vehicles) if id in vehicles and id not in standing]
         told_s = {
             target: column[may]
             for target, column in self._costs_s.items()
             if target in self.targets and target not in empty
         }
         ids = [asked.vehicles[n] for n in may]
-        return self._group.tell(ids, told_s, [self._vehicles[id].target for id in ids], now_ns)
+        return self._group.tell(ids, told_s, [vehicles[id].target for id in ids], now_ns)
 
-    def _share_out(self, asked: AskCosts, empty: Collection[str], standing: Collection[str]) -> dict[str, str]:
+    def _share_out(
+        self,
+        asked: AskCosts,
+        vehicles: Mapping[str, Vehicle],
+        empty: Collection[str],
+        standing: Collection[str],
+    ) -> dict[str, str]:
         """The target of each vehicle that has a choice, so that not all go for the same."""
         targets = [target for target in self.targets if target in self._costs_s and target not in empty]
         # A vehicle whose planner is silent keeps to it, or is informed that there is no data.
-        held = {id: self._vehicles[id].target for id in asked.vehicles if id in self._vehicles}
+        held = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
         now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
         if self._group is not None:

@@ -147,16 +147,17 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
     import msgspec
 
     from swarm.runtime.operator import Operator
-    from swarm.runtime.order_book import OrderBook
+    from swarm.runtime.order_book import OrderBook, described
 
     with where.operators_bus() as (bus, _):
-        book = Operator(bus).orders()
+        operator = Operator(bus)
+        book, sent = operator.orders(), operator.goals().goals
     if as_json:
-        typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
+        typer.echo(json.dumps([msgspec.to_builtins(order) for order in (*book.orders, *sent)], indent=2))
         return
     known = OrderBook()
     known.merge(book.orders, time.time_ns())
-    for ordered in known.standing or ["no orders"]:
+    for ordered in [*known.standing, *(described(goals) for goals in sent if not goals.off)] or ["no orders"]:
         typer.echo(ordered)
 
 
@@ -206,7 +207,7 @@ def remove(id: Id, where: Where, as_json: AsJson = False) -> int:
 def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> int:
     """Gives orders, one after the other, and prints who obeys. Returns 1 if a process has not replied.
 
-    orders  fields of `GiveOrder` each
+    orders  fields of `GiveOrder`, or those with a `vehicle` of `SendVehicle`
     at      the place that they are about, if any: becomes their `cell`
     """
     import msgspec
@@ -215,28 +216,35 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
     from swarm.runtime.operator import Operator
-    from swarm.wire.messages.orders import GiveOrder
+    from swarm.wire.messages.orders import GiveOrder, SendVehicle
 
     # The cell is known once the swarm has said where its terrain lies; all else is checked before it is asked.
     place = None if at is None else read_place(at, "--at")
-    made = [checked(GiveOrder, fields if place is None else {**fields, "cell": 0}) for fields in orders]
+    made = [
+        checked(SendVehicle, fields) if "vehicle" in fields
+        else checked(GiveOrder, fields if place is None else {**fields, "cell": 0})
+        for fields in orders
+    ]  # fmt: skip
     silent = 0
     printed: list[dict[str, Any]] = []
     with where.operators_bus() as (bus, _):
         for order in made:
             said: dict[str, Any] = {}
-            if place is not None:
+            if isinstance(order, GiveOrder) and place is not None:
                 frame = frame_of_run(bus, where)
                 cell = cell_of(place, frame, "--at")
                 order = msgspec.structs.replace(order, cell=cell)
                 said = {"at": fields_of(frame, cell)}
             with progress("waiting until all processes obey"):
-                given, acknowledged = Operator(bus).give(order)
+                operator = Operator(bus)
+                given, acknowledged = (
+                    operator.send(order) if isinstance(order, SendVehicle) else operator.give(order)
+                )
             told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
             printed.append({"given": msgspec.to_builtins(given), **told, **said})
             silent |= bool(acknowledged.silent)
             if not as_json:
-                if place is not None:
+                if isinstance(order, GiveOrder) and place is not None:
                     typer.echo(f"{order.subject} {order.name} is put at {written(frame, cell)}")
                 print_obeyed(acknowledged)
     if as_json:

@@ -33,6 +33,7 @@ from shared_map.terrain.map_frame import MapFrame
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError
 from swarm.places import extent_of, fields_of, written
+from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
 """Alarms of `status` and of `top`, whose table has to fit a terminal."""
+_SHOWN_GOALS = 24
+"""Vehicles that were sent to places, of `status`."""
 _LISTEN_S, _TOP_LISTEN_S, _MOST_S = 1.5, 2.2, 4.0
 """A picture is drawn after so long, and that of `top`, whose rates need two of the figures that each process tells
 once a second; later while a process that has answered has not said how it is."""
@@ -140,9 +143,22 @@ def print_status(status: Status, console: Console) -> None:
             say(f"{id} {'was' if planner.tracker_lost else 'is'} at {written(frame, cell)}")
     for ordered in state.orders:
         say(f"ordered: {ordered}", "yellow")
+    for goal in state.goals[:_SHOWN_GOALS]:
+        say(f"{goal.name}: {_progress(goal, frame)}", "yellow" if goal.state == "blocked" else None)
+    if (more := len(state.goals) - _SHOWN_GOALS) > 0:
+        say(f"and {more} more vehicles that were sent to places")
     for info in status.strangers:
         whose = f"answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}, wire version {info.wire_version}"
         say(f"stranger {info.role}-{info.id} {whose}", "yellow")
+
+
+def _progress(goal: GoalState, frame: MapFrame | None) -> str:
+    """Progress of a vehicle that was sent somewhere, in words."""
+    place = "" if goal.cell is None else f" to cell {goal.cell}"
+    if frame is not None and goal.cell is not None and goal.cell < frame.grid.cells:
+        place = f" to {written(frame, goal.cell)}"
+    why = f" ({goal.reason})" if goal.reason else ""
+    return f"{goal.state}{place}{why}, {goal.done} reached"
 
 
 def _wire_versions(status: Status) -> str | None:
@@ -210,6 +226,7 @@ def status_fields(status: Status) -> dict[str, Any]:
         "planners": [planner_fields(planner) for _, planner in sorted(latest.status.items())],
         "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(latest).items()},
         "orders": list(status.state.orders),
+        "goals": [msgspec.to_builtins(goal) for goal in status.state.goals],
         "silent": status.silent,
         "strangers": [f"{info.role}-{info.id}" for info in status.strangers],
     }

@@ -1,4 +1,4 @@
-"""`swarm order vehicle`: vehicles join a running swarm, leave it, stop and go."""
+"""`swarm order vehicle`: vehicles join a running swarm, leave it, stop, go, and are sent to places."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from swarm.grid import GridSpec
 from swarm.places import read_place
 from swarm.right_of_way.guest_session import say_gone
 from swarm.runtime.operator import replies_to
+from swarm.wire.messages.orders import Then
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE
 
@@ -32,7 +33,7 @@ _WITHIN_S = 5.0
 _AGAIN_S, _ANSWERS_S = 0.2, 1.0
 """Waits between two questions, and for the answer to one. An agent takes several ticks of 0.1 s to give cells back,
 and one that is silent for a second is asked five times within `_WITHIN_S`."""
-app = family_app("Let vehicles join a running swarm and leave it; stop vehicles, and let them go again.")
+app = family_app("Send vehicles to places, stop them, let them join a running swarm and leave it.")
 Vehicles = Annotated[
     list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.", autocompletion=complete.vehicle_ids)
 ]
@@ -54,6 +55,40 @@ def start(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
     swarm order vehicle start a0-03
     """
     return give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
+
+
+@command(app, context_settings={"ignore_unknown_options": True})  # a latitude below 0 is no option
+def send(
+    id: Annotated[str, typer.Argument(metavar="ID", autocompletion=complete.vehicle_ids)],
+    places: Annotated[list[str], typer.Argument(metavar="PLACE...")],
+    where: Where,
+    then: Then = "hold",
+    as_json: AsJson = False,
+) -> int:
+    """Send a vehicle to a place, or to one place after the other. It chases no target meanwhile.
+
+    The newest order counts. `swarm order ls` and `swarm status` show how far it is.
+
+    swarm order vehicle send a0-03 46.81,9.84
+
+    swarm order vehicle send a0-03 cell:40,200 cell:80,20 --then repeat
+
+    id      The vehicle, such as a0-03.
+    places  LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL; up to 64.
+    then    After the last: hold there, chase targets again, or repeat from the first.
+    """
+    for place in places:
+        read_place(place, "PLACE")
+    return give(where, as_json, {"vehicle": id, "places": places, "then": then})
+
+
+@command(app)
+def recall(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
+    """Recall vehicles that were sent somewhere: they chase targets again.
+
+    swarm order vehicle recall a0-03
+    """
+    return give(where, as_json, *({"vehicle": id, "off": True} for id in ids))
 
 
 @command(app)

@@ -254,7 +254,7 @@ def _sizes(level: Level) -> dict[Any, Any]:
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-level.trail_s),
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
-    px = {"vehicles": level.radius_px, "targets/balls": 8.5}
+    px = {"vehicles": level.radius_px, "targets/balls": 8.5, "goals/flags": 6.0}
     radii = {f"/world/{entity}": rr.Points3D.from_fields(radii=[screen(radius)]) for entity, radius in px.items()}
     trails = {f"/world/trails/{whose}": rrb.VisibleTimeRanges([trail]) for whose in ("vehicles", "targets")}
     return {**radii, **trails}

@@ -112,6 +112,7 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("states", "of these", each, "States of the vehicles."),
     Fact("classes", "classes", each, "The vehicles by class."),
     Fact("following", "assigned", count, "Vehicles that have a target."),
+    Fact("sent", "sent to places", each, "Vehicles that were sent to places, by the state of their goals."),
     Fact("captures", "captures", count, "How often targets were caught."),
     Fact("marks", "marks", count, "Cells that vehicles found other than the map said."),
     Fact(
@@ -193,7 +194,7 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("processes_well", "restarts", "messages_now_per_s"),
 )
 """Lines in which the facts of a run are set."""
-IF_ANY = ("learned",)
+IF_ANY = ("learned", "sent")
 """Facts that have a line of their own, where there is anything to say."""
 MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
 """Facts that are shown only where they are not 0."""

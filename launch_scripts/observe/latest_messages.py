@@ -27,7 +27,7 @@ from swarm.runtime.stats import ENDED
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
-from swarm.wire.messages.orders import Orders
+from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Beat, RunInfo, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
@@ -210,6 +210,7 @@ class LatestState(Counts):
         self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
         self.loads = ProcessLoads()
+        self._goals: dict[str, GoalState] = {}
         self._trackings = Trackings(grid)
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._vehicles: VehicleColumns | None = None
@@ -260,6 +261,9 @@ class LatestState(Counts):
                 marks = self._marks.get((message.author, message.tile))
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
                     self._marks[message.author, message.tile] = message
+            case GoalStates(states=states):
+                for each in states:
+                    _remember(self._goals, each.name, each)
             case Orders():
                 self.book.merge(message.orders, now_ns)
         return message
@@ -410,6 +414,10 @@ class LatestState(Counts):
     def tells_of_vehicles(self, agent: str) -> bool:
         """Returns True if the agent has published its vehicles."""
         return agent in self._fleet_told_ns
+
+    def goals(self) -> list[GoalState]:
+        """Progress of the vehicles that were sent to places, without those that were recalled."""
+        return [self._goals[id] for id in sorted(self._goals) if self._goals[id].state != "canceled"]
 
     def groups(self) -> dict[str, str]:
         """Vehicle -> its group."""

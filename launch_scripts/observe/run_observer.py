@@ -26,14 +26,35 @@ from swarm.runtime.membership import NO_RUN
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, ORDERS, POSE, RUN, STATS, STATUS, Topic
+from swarm.wire.topics import (
+    FLEET,
+    FOLLOWED,
+    GOAL_STATES,
+    LEAD,
+    MARKS,
+    NOTE,
+    ORDERS,
+    POSE,
+    RUN,
+    STATS,
+    STATUS,
+    Topic,
+)
 from swarm.wire.versions import are_neighbours
 
 TRACK_S = 0.5
 """Places are sampled so often."""
 ROUTES_S = 2.0
 """The newest route that a vehicle begins within this time is kept."""
-HEARD: Mapping[Topic, float] = {STATS: 0.0, STATUS: 0.0, POSE: 0.0, LEAD: 0.5, ORDERS: 0.5, FLEET: 0.4}
+HEARD: Mapping[Topic, float] = {
+    STATS: 0.0,
+    STATUS: 0.0,
+    POSE: 0.0,
+    LEAD: 0.5,
+    ORDERS: 0.5,
+    GOAL_STATES: 0.5,
+    FLEET: 0.4,
+}
 """The topics of a `LatestState`, and how often the newest of each key is taken, in seconds; 0 for all that comes.
 Places are sampled every 0.5 s, and each sample must find newer ones: else all vehicles seem to stand at times."""
 RECORDED: Mapping[Topic, float] = {**HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S}

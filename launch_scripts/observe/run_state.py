@@ -16,6 +16,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
+from swarm.wire.messages.orders import GoalState
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ class RunState:
     crew            role -> (alive, expected)
     learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
                     whose prior does not stand
+    goals           progress of the vehicles that were sent to places
     beside          processes that are alive and not needed: routers, monitors, agents of guests
     messages_per_s  that all processes send now
     """
@@ -101,12 +103,18 @@ class RunState:
     learned: dict[str, float]
     alarms: tuple[Alarm, ...]
     orders: tuple[str, ...]
+    goals: tuple[GoalState, ...]
     grid: GridSpec
 
     @property
     def driven(self) -> tuple[int, int]:
         """Vehicles that an agent drives, and all of the run."""
         return self.vehicles, max(self.vehicles_planned, self.vehicles)
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """Vehicles that were sent to places, by the state of their goals."""
+        return dict(Counter(goal.state for goal in self.goals))
 
     @property
     def well(self) -> tuple[int, int]:
@@ -160,6 +168,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         learned=_learned(latest),
         alarms=alarms_of(latest, targets, now_ns),
         orders=tuple(map(plain, latest.book.standing)),
+        goals=tuple(latest.goals()),
         grid=latest.grid,
         **{name: latest.total(name) for name in _TOTALS},
     )

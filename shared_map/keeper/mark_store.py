@@ -18,7 +18,7 @@ from swarm.grid import GridSpec
 from swarm.recording.external_calls import ExternalCalls
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
-from swarm.wire.messages.orders import Order
+from swarm.wire.messages.orders import Order, VehicleGoals
 from swarm.wire.messages.planning import Sighted
 
 BATCH_BYTES = 1 << 19
@@ -34,6 +34,8 @@ _FOLDED = Table("folded", {**_SET, "since_ns": "INTEGER"}, 2)
 """Marks dropped by compaction; the name stays, as older stores have it."""
 _ORDERS = Table("orders", {"subject": "TEXT", "name": "TEXT", "stamp_ns": "INTEGER", "body": "BLOB"}, 2)
 _SIGHTINGS = Table("sightings", {"target": "TEXT", "stamp_ns": "INTEGER", "sighted": "BLOB"}, 1)
+_GOALS = "goals."
+"""In `meta`, before the vehicle."""
 _NUMBER = ("epoch", "seq")
 _CLASSES_USED = """
 SELECT DISTINCT tile / (:tiles + 1) FROM (
@@ -193,6 +195,19 @@ class KeeperStore(SealedDatabase):
             rows = self._rows(_ORDERS, "ORDER BY subject, name")
             return [msgspec.json.decode(body, type=Order) for *_, body in rows]
 
+    def save_goals(self, goals: Iterable[VehicleGoals]) -> None:
+        """Commits the newest goals of vehicles. They are rows of `meta`, as older builds know no other table."""
+        rows = [(f"{_GOALS}{each.name}", msgspec.json.encode(each).decode()) for each in goals]
+        if rows:
+            with self._writing():
+                self._put(META, *rows)
+
+    def goals(self) -> list[VehicleGoals]:
+        """The newest goals of each vehicle."""
+        with self._reading("goals: "):
+            rows = self._rows(META, "WHERE key GLOB ? ORDER BY key", f"{_GOALS}*")
+            return [msgspec.json.decode(body, type=VehicleGoals) for _, body in rows]
+
     def __enter__(self) -> KeeperStore:
         return self
 
@@ -219,6 +234,8 @@ KEEPER_STORE = ExternalCalls(
         "save_sightings": None,
         "save_orders": None,
         "orders": list[Order],
+        "save_goals": None,
+        "goals": list[VehicleGoals],
     },
     facts={"path": Path},
 )

@@ -16,7 +16,7 @@ from swarm.liveness import Peer
 from swarm.places import cell_of
 from swarm.runtime.order_book import FreshOrders, OrderBook, judged
 from swarm.wire.messages import Nothing
-from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
+from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, ORDERS
 
 _PUBLISH_NS = NS_PER_S
@@ -101,7 +101,7 @@ class KeptOrders:
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
         match asked.request:
-            case (GiveOrder() | ZoneOrder()) as order if (
+            case (GiveOrder() | ZoneOrder() | SendVehicle()) as order if (
                 order.changes and self._fresh is not None and asked.topic.trusted
             ):
                 return self._fresh.fault(order.stamp_ns, now_ns)
@@ -118,15 +118,17 @@ class KeptOrders:
             return  # the alarm about marks covers it, which fare no better; meanwhile askers ask others, too
         self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
 
+    def vehicles_with(self, asked: str) -> list[str]:
+        """All vehicles of the scenario, and one that was asked for if its agent has been added."""
+        vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
+        return [*vehicles, asked] if agent_of(asked) in self._added else vehicles
+
     def _take(self, given: GiveOrder, now_ns: int) -> Order | str:
         try:
             given = self._placed(given)
         except ConfigError as error:
             return f"{given.subject} {given.name}: {error}"
-        vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
-        if agent_of(given.name) in self._added:
-            vehicles.append(given.name)
-        order = judged(given, self.book, self._scenario, vehicles, now_ns)
+        order = judged(given, self.book, self._scenario, self.vehicles_with(given.name), now_ns)
         if isinstance(order, str):
             return order
         if order.cell is not None:

@@ -10,6 +10,7 @@ import msgspec
 
 from shared_map.keeper.base_map import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
+from shared_map.keeper.goal_service import KeptGoals
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import SHORT_S, fault_of_short, free_name, rows_of, zone_sets, zones_of
@@ -29,7 +30,7 @@ from swarm.runtime.order_book import described
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import figures
 from swarm.wire.messages.map_data import MarkSet
-from swarm.wire.messages.orders import Order, ZoneOrder, Zones
+from swarm.wire.messages.orders import Order, VehicleGoals, ZoneOrder, Zones
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import SHORT_ZONES, SIGHTED, STATS, ZONES
@@ -88,6 +89,7 @@ class KeeperService:
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
+        self._goals = KeptGoals(setup.id, setup.scenario, terrain, store, bus, post, self._orders.vehicles_with)
         self._stats: dict[tuple[str, str], Stats] = {}
         """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
         self._stats_size = 0
@@ -137,6 +139,7 @@ class KeeperService:
         self._bus.serve(ZONES, self._post, keeper=self._id)
         self._bus.serve(SHORT_ZONES, self._post, keeper=self._id)
         self._orders.start(now_ns)
+        self._goals.start(now_ns)
         self._bus.subscribe(STATS, self._post)
         self._bus.serve(STATS, self._post)
         self._roster.appeared(self._member.peer)
@@ -167,9 +170,9 @@ class KeeperService:
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return
-        ordered = self._orders.take_order_event(event, now_ns)
+        ordered = self._orders.take_order_event(event, now_ns) or self._goals.take_goal_event(event, now_ns)
         if ordered is not False:
-            if isinstance(ordered, Order):
+            if isinstance(ordered, Order | VehicleGoals):
                 self._member.note(now_ns, "order", described(ordered))
             elif isinstance(ordered, str):
                 self.counters.count("orders_refused")
@@ -189,6 +192,7 @@ class KeeperService:
             self._save_sightings(now_ns)
         self._sync.tick(now_ns)
         self._orders.tick(now_ns)
+        self._goals.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]

@@ -12,7 +12,7 @@ from swarm.errors import ConfigError
 from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.codec import field_fault
 from swarm.wire.messages import Message
-from swarm.wire.messages.orders import GiveOrder, Order, Zone, ZoneOrder
+from swarm.wire.messages.orders import GiveOrder, Order, SendVehicle, Then, VehicleGoals, Zone, ZoneOrder
 from swarm.wire.versions import schema_of_type
 
 M = TypeVar("M", bound=Message)
@@ -44,6 +44,22 @@ class Orders:
     def go(self, vehicle: str) -> Acknowledged:
         """Resumes it."""
         return self._give(subject="vehicle", name=vehicle, off=True)
+
+    def send(self, vehicle: str, places: Sequence[str], *, then: Then = "hold") -> Acknowledged:
+        """Sends a vehicle of the swarm to places, one after the other, instead of an earlier order.
+
+        places  as commands have them: "46.81,9.84", "xy:X,Y" or "cell:ROW,COL"
+        then    after the last: "hold" there, "chase" targets again, or "repeat" from the first
+        """
+        return self._operator.send(_checked(SendVehicle, vehicle=vehicle, places=list(places), then=then))[1]
+
+    def recall(self, vehicle: str) -> Acknowledged:
+        """Returns it to the chase of targets."""
+        return self._operator.send(_checked(SendVehicle, vehicle=vehicle, off=True))[1]
+
+    def goals(self) -> list[VehicleGoals]:
+        """The places to which vehicles were sent."""
+        return list(self._operator.goals().goals)
 
     def chase(self, group: str, targets: Sequence[str] | None) -> Acknowledged:
         """States which targets the vehicles of a group may chase; None: those of the scenario."""

@@ -14,14 +14,26 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
+from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.liveness import Roster, job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.map_data import DIGEST_ROW_BYTES
-from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
+from swarm.wire.messages.orders import (
+    GiveOrder,
+    Goals,
+    Obey,
+    Obeyed,
+    Order,
+    Orders,
+    SendVehicle,
+    VehicleGoals,
+    ZoneOrder,
+    Zones,
+)
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
+from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, SEND_VEHICLE, ZONES, Topic
 
 _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
@@ -109,6 +121,28 @@ class Operator:
             members = [each for each in members if (each.role, job_of(each.id)) != ("planner", given.name)]
         return given, self._obeyed(obey, members, began_s)
 
+    def goals(self) -> Goals:
+        """Returns where vehicles are sent. Raises BusError without a keeper."""
+        reply = self._order(SEND_VEHICLE, SendVehicle(), self._keeper())
+        assert isinstance(reply, Goals)
+        return reply
+
+    def send(self, order: SendVehicle) -> tuple[VehicleGoals, Acknowledged]:
+        """Sends a vehicle to places, or recalls it; waits until its agent obeys.
+
+        Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
+        """
+        members = self._members()
+        keeper, began_s = self._keeper(members), time.monotonic()
+        reply = self._order(SEND_VEHICLE, replace(order, stamp_ns=time.time_ns()), keeper)
+        assert isinstance(reply, Goals)
+        given = reply.given
+        assert given is not None
+        obey = Obey(subject="vehicle", name=given.name, stamp_ns=given.stamp_ns, goals=True)
+        agent = agent_of(given.name)
+        hosts = [each for each in members if (each.role, each.id) == ("agent", agent)]
+        return given, self._obeyed(obey, hosts, began_s, role="agent", id=agent)
+
     # --- asking ---------------------------------------------------------------------------------------------
 
     def _members(self) -> list[RunInfo]:
@@ -140,13 +174,13 @@ class Operator:
             raise ConfigError(failure)
         raise BusError(f"keeper {keeper} does not answer: it is not known whether the order counts; give it again")
 
-    def _obeyed(self, order: Obey, members: list[RunInfo], began_s: float) -> Acknowledged:
+    def _obeyed(self, order: Obey, members: list[RunInfo], began_s: float, **whom: str) -> Acknowledged:
         roles = _OBEY_ZONES if order.subject is None else _OBEY_ORDERS
         concerned = {f"{each.role}-{each.id}" for each in members if each.role in roles}
         inbox = Inbox()
         deadline_s = time.monotonic() + self._patience_s + 1.0
         obeyed: dict[str, float] = {}
-        self._bus.ask(OBEYED, order, inbox.post, tag="obey", timeout_s=self._patience_s)
+        self._bus.ask(OBEYED, order, inbox.post, tag="obey", timeout_s=self._patience_s, **whom)
         while time.monotonic() < deadline_s:
             match inbox.take(0.1):
                 case Replied(message=Obeyed() as who):

@@ -7,18 +7,22 @@ order that was taken back stays in the book as such, or an old one that comes la
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from typing import Any, Generic, Protocol, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
-from swarm.wire.messages.orders import GiveOrder, Order, Subject
+from swarm.wire.messages.orders import GiveOrder, Order, Subject, VehicleGoals
 
 MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
 """An order with a timestamp further ahead of the reader's clock is refused, because no operator could revoke it."""
 MOST_ORDERS = 1999
 """Beside a pause, for which there is always room."""
+MOST_SENT = 4096
+"""Vehicles with goals of their own, recalled ones included."""
 
 FRESH_NS = 60 * NS_PER_S
 """An authenticated order counts for so long before and after its timestamp: a copy of it must not count again."""
@@ -26,51 +30,105 @@ FRESH_NS = 60 * NS_PER_S
 Key = tuple[Subject, str]
 
 
-class OrderBook:
-    """The orders that a process knows.
+class Entry(Protocol):
+    """The newest word of an operator about one thing."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def off(self) -> bool: ...
+
+
+E = TypeVar("E", bound=Entry)
+K = TypeVar("K", bound=Hashable)
+
+
+class Register(Generic[K, E]):
+    """The newest entry about each thing.
+
+    key   what an entry is about
+    rank  of two entries about one thing that of the higher rank counts
+    full  whether there is no room for another thing, beside this number of things
 
     version  grows with every change
     """
 
-    def __init__(self) -> None:
+    def __init__(self, key: Callable[[E], K], rank: Callable[[E], Any], full: Callable[[E, int], bool]) -> None:
         self.version = 0
-        self._orders: dict[Key, Order] = {}
+        self._entries: dict[K, E] = {}
+        self._key, self._rank, self._full = key, rank, full
 
-    def __iter__(self) -> Iterator[Order]:
-        return iter([self._orders[key] for key in sorted(self._orders)])
+    def __iter__(self) -> Iterator[E]:
+        return iter([self._entries[key] for key in sorted(self._entries)])  # type: ignore[type-var]
 
     def __len__(self) -> int:
-        return len(self._orders)
+        return len(self._entries)
 
-    def merge(self, orders: Iterable[Order], now_ns: int) -> list[Order]:
-        """Takes in orders; returns those that were news."""
+    def merge(self, entries: Iterable[E], now_ns: int) -> list[E]:
+        """Takes in entries; returns those that were news."""
         news = []
-        for order in orders:
-            key: Key = (order.subject, order.name)
-            held = self._orders.get(key)
-            full = held is None and order.subject != "pause" and len(self._orders) >= MOST_ORDERS
-            if order.stamp_ns > now_ns + MAX_AHEAD_NS or full:
+        for entry in entries:
+            key = self._key(entry)
+            held = self._entries.get(key)
+            full = held is None and self._full(entry, len(self._entries))
+            if entry.stamp_ns > now_ns + MAX_AHEAD_NS or full:
                 continue
-            if held is None or _rank(order) > _rank(held):
-                self._orders[key] = order
-                news.append(order)
+            if held is None or self._rank(entry) > self._rank(held):
+                self._entries[key] = entry
+                news.append(entry)
         self.version += bool(news)
         return news
 
+    def get(self, key: K) -> E | None:
+        """The entry about a thing, in force or taken back."""
+        return self._entries.get(key)
+
+    def in_force(self, key: K) -> E | None:
+        """The entry that stands about a thing; None if there is none, or it was taken back."""
+        entry = self._entries.get(key)
+        return None if entry is None or entry.off else entry
+
+    def has(self, key: K, stamp_ns: int) -> bool:
+        """Returns True if an entry of this timestamp about a thing, or a later one, is held."""
+        entry = self._entries.get(key)
+        return entry is not None and entry.stamp_ns >= stamp_ns
+
+    def stamp_after(self, key: K, now_ns: int) -> int:
+        """The stamp of a new entry about a thing: the time, or if the last one is from later, just after it."""
+        held = self._entries.get(key)
+        return now_ns if held is None else max(now_ns, held.stamp_ns + 1)
+
+
+class GoalBook(Register[str, VehicleGoals]):
+    """The goals of vehicles, by vehicle. Of one order the copy counts that has more places reached."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            lambda goals: goals.name,
+            lambda goals: (goals.stamp_ns, msgspec.json.encode(replace(goals, done=0)), goals.done),
+            lambda goals, held: held >= MOST_SENT,
+        )
+
+
+class OrderBook(Register[Key, Order]):
+    """The orders that a process knows."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            lambda order: (order.subject, order.name),
+            lambda order: (order.stamp_ns, msgspec.json.encode(order)),
+            lambda order, held: order.subject != "pause" and held >= MOST_ORDERS,
+        )
+
     def about(self, subject: Subject, name: str = "") -> Order | None:
         """The order that stands about a subject; None if there is none, or it was taken back."""
-        order = self._orders.get((subject, name))
-        return None if order is None or order.off else order
+        return self.in_force((subject, name))
 
     def knows(self, subject: Subject, name: str, stamp_ns: int) -> bool:
         """Returns True if an order of this timestamp about the subject, or a later one, is in the book."""
-        order = self._orders.get((subject, name))
-        return order is not None and order.stamp_ns >= stamp_ns
-
-    def next_stamp_ns(self, subject: Subject, name: str, now_ns: int) -> int:
-        """The stamp of a new order about a subject: the time, or if the last one is from later, just after it."""
-        held = self._orders.get((subject, name))
-        return now_ns if held is None else max(now_ns, held.stamp_ns + 1)
+        return self.has((subject, name), stamp_ns)
 
     @property
     def standing(self) -> list[str]:
@@ -86,7 +144,7 @@ class OrderBook:
 
     def stopped(self, vehicle: str) -> bool:
         """Returns True if a vehicle is ordered to stop."""
-        return bool(self._orders) and (self.paused or self.about("vehicle", vehicle) is not None)
+        return bool(self._entries) and (self.paused or self.about("vehicle", vehicle) is not None)
 
     def setting(self, name: str, usual: float) -> float:
         """A setting that may change while the swarm runs; `usual` is the scenario's."""
@@ -153,8 +211,12 @@ _OFF = {
 }  # fmt: skip
 
 
-def described(order: Order) -> str:
+def described(order: Order | VehicleGoals) -> str:
     """An order in words."""
+    if isinstance(order, VehicleGoals):
+        count = len(order.cells)
+        then = f"goes to {count} {'place' if count == 1 else 'places'}, then {order.then}; {order.done} reached"
+        return f"vehicle {order.name} {'is recalled' if order.off else then}"
     words: Iterable[object] = (
         order.subject,
         order.name,
@@ -163,10 +225,6 @@ def described(order: Order) -> str:
         *([f"{order.value:g}"] if order.value is not None else []),
     )
     return " ".join(str(word) for word in words if word)
-
-
-def _rank(order: Order) -> tuple[int, bytes]:
-    return order.stamp_ns, msgspec.json.encode(order)
 
 
 # --- what may be ordered ------------------------------------------------------------------------------------------
@@ -201,7 +259,7 @@ def judged(
     return Order(
         subject=given.subject,
         name=given.name,
-        stamp_ns=book.next_stamp_ns(given.subject, given.name, now_ns),
+        stamp_ns=book.stamp_after((given.subject, given.name), now_ns),
         off=given.off,
         targets=[] if given.off else given.targets,
         value=None if given.off else given.value,
@@ -217,8 +275,13 @@ def _of_pause(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: I
 
 
 def _of_vehicle(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
+    return fault_of_vehicle(given.name, vehicles)
+
+
+def fault_of_vehicle(vehicle: str, vehicles: Iterable[str]) -> str | None:
+    """Reason why no order can be about a vehicle; None if there is none."""
     known = set(vehicles)
-    return None if given.name in known else f"vehicle {given.name!r}: there is none{_such_as(known)}"
+    return None if vehicle in known else f"vehicle {vehicle!r}: there is none{_such_as(known)}"
 
 
 def _of_group(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:

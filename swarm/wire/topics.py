@@ -388,6 +388,25 @@ OBEYED = Topic(
     request=orders.Obey, published=False, priority=Priority.INTERACTIVE,
     ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
+SEND_VEHICLE = Topic(
+    "send-vehicle", "order/{keeper}/send", orders.Goals,
+    "sends a vehicle to places, recalls it, and lists what is sent where", "asked by people",
+    access(serve="keeper:keeper"), request=orders.SendVehicle, published=False, trusted=True,
+    priority=Priority.INTERACTIVE, answer_bytes=_FILE,
+)  # fmt: skip
+GOALS = Topic(
+    "goals", "goals/{id}/{agent}", orders.Goals,
+    "where an agent's vehicles are sent, as a keeper has it on its disk",
+    "1 Hz for agents with goals, and on change",
+    access(put="keeper:id", serve="keeper:id", ask="agent:agent keeper", hear="agent:agent keeper"),
+    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+    put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
+)  # fmt: skip
+GOAL_STATES = Topic(
+    "goal-states", "reached/{agent}", orders.GoalStates, "how far an agent's vehicles are with their goals",
+    "1 Hz for agents with goals, and on change", access(put="agent:agent", hear="keeper monitor"), trusted=True,
+    put_bytes=_LONG,
+)  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", processes.Stats,
     "what a process has counted; keepers answer with the last words of processes that are gone", "1 Hz",
@@ -406,7 +425,7 @@ TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
     LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES, SHORT_ZONES,
-    GIVE_ORDER, ORDERS, OBEYED, STATS, NOTE,
+    GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

@@ -22,10 +22,23 @@ from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.orders import GoalStates
 from swarm.wire.messages.planning import Believed, PlannerStatus, Sighted, TargetPose
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Body, Fleet, Followed
-from swarm.wire.topics import BELIEVED, BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
+from swarm.wire.topics import (
+    BELIEVED,
+    BODY,
+    FLEET,
+    FOLLOWED,
+    GOAL_STATES,
+    MARKS,
+    NOTE,
+    POSE,
+    SIGHTED,
+    STATS,
+    STATUS,
+)
 
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
@@ -113,6 +126,8 @@ def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
             bus.publish(SIGHTED, message, target=message.target, author=message.author)
         case Believed():
             bus.publish(BELIEVED, message, target=message.target)
+        case GoalStates():
+            bus.publish(GOAL_STATES, message, agent=message.agent)
         case Body():
             bus.publish(BODY, message, id=message.id)
         case MarkSet():

@@ -24,6 +24,20 @@ PREFETCH_CELLS = 8
 """The next part of a partial route is requested when so few cells are left."""
 
 
+_GOAL = "place:"
+"""Before a cell, in the name of a place as a target; no id of a target has a colon."""
+
+
+def goal_name(cell: int) -> str:
+    """The name of a place that a vehicle goes for like a target, which has no tracker and stays."""
+    return f"{_GOAL}{cell}"
+
+
+def goal_of(target: str | None) -> int | None:
+    """The cell of a place that a vehicle goes for like a target; None of a target."""
+    return int(target.removeprefix(_GOAL)) if target is not None and target.startswith(_GOAL) else None
+
+
 class Reason(enum.Enum):
     """Reason why a vehicle requests a route. The last three are re-route requests: its own route does not lead it
     on."""
@@ -86,7 +100,8 @@ class Follow(msgspec.Struct, frozen=True):
 class Vehicle:
     """State of one vehicle. Its agent drives it along `route` through `motion`, and tells it what happens.
 
-    target        the target that it goes for, None before the first assignment
+    target        the target, or the name of the place, that it goes for; None before the first assignment
+    goal          the cell of that place; None of a target
     in_reach      whether that target is within capture range
     tracked       whether that target has a tracker that lives; else it was in reach, and may be anywhere
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
@@ -98,6 +113,7 @@ class Vehicle:
         self.id = id
         self.state = VehicleState.IDLE
         self.target: str | None = None
+        self.goal: int | None = None
         self.motion = Motion(grid, cell)
         self.route = Follower()
         self.in_reach = False
@@ -125,7 +141,7 @@ class Vehicle:
             return
         self.asked = None
         if target != self.target:
-            self.target = target
+            self.target, self.goal = target, goal_of(target)
             self.in_reach = self.planner_gone = self.searching = False
         if self.state is VehicleState.IDLE:
             self.state = VehicleState.WAITING
@@ -133,7 +149,7 @@ class Vehicle:
 
     def release(self) -> None:
         """Goes for no target any more, until another is assigned."""
-        self.target = self.asked = self._need = None
+        self.target = self.goal = self.asked = self._need = None
         self.in_reach = self.planner_gone = self.searching = False
         self.route.drop()
         self.state = VehicleState.IDLE

@@ -96,11 +96,14 @@ ROBOT_TABLE: tuple[TopicRow, ...] = (
              "A route to a place or a target."),
 )  # fmt: skip
 """For each robot, where the settings let it in."""
+VEHICLE_GOAL = TopicRow("vehicle_goal", "/{vehicle}/goal_pose", _POSE, Qos.DEFAULT, _IN, 1.0,
+                        "Sends a vehicle of the swarm to a place, where it stays.")  # fmt: skip
 ORDER_TABLE: tuple[TopicRow, ...] = (
     TopicRow("pause", "/swarm/pause", _TRIGGER, Qos.DEFAULT, _SERVICE, None,
              "Stops all vehicles of the swarm; answers when they obey."),
     TopicRow("hold", "/swarm/hold", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "The same."),
     TopicRow("resume", "/swarm/resume", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "Lets them go on."),
+    VEHICLE_GOAL,
 )  # fmt: skip
 SET_POSE = TopicRow("set_pose", "/targets/{target}/set_pose", _POSE, Qos.DEFAULT, _IN, 10.0,
                     "Moves an external target.")  # fmt: skip

@@ -29,6 +29,7 @@ from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import column
 from swarm.wire.messages import Message
+from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.vehicles import Body, Fleet, Followed
 from vehicle_agent.bodies import Bodies
@@ -50,8 +51,8 @@ _FAINT, _FULL = 40, 235
 _CIRCLE_POINTS = 33
 _SMALLEST = 0.45
 """Radius below which nothing is drawn, as a share of `TerrainMesh.scale_m`: a rover of 2 m is seen on 10 km."""
-_PIN, _LABEL, _ALARM = 2.2, 5.4, 4.6
-"""Heights of pins, of their labels, and of alarms over the ground, in `TerrainMesh.scale_m`."""
+_PIN, _LABEL, _ALARM, _FLAG = 2.2, 5.4, 4.6, 1.8
+"""Heights of pins, of their labels, of alarms and of flags over the ground, in `TerrainMesh.scale_m`."""
 
 
 Place = tuple[float, float]
@@ -94,13 +95,15 @@ class MoversView:
     def begin(self) -> None:
         """Logs styles, and starts all drawings from scratch."""
         self._vehicles.begin()
+        self._pen.style("world/goals/poles", 1.4)
+        self._pen.style("world/goals/ways", 0.6)
         self._pen.style("world/trails/targets", 1.6 * self._level.line_px)
         self._pen.style("world/targets/poles", 2.2)
         self._pen.style("world/targets/sighted", 1.2, styles.SIGHTED_COLOUR)
         self._pen.style("world/alarms/poles", 1.8, ALARM_COLOUR)
         balls = rr.Points3D.from_fields(radii=[screen(5.0)], colors=[ALARM_COLOUR], show_labels=True)
         self._pen.log("world/alarms/marks", balls, static=True)
-        for entity in ("world/targets/names", "world/targets/sighted/names"):
+        for entity in ("world/targets/names", "world/targets/sighted/names", "world/goals/names"):
             self._pen.label_style(entity)
         self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
@@ -154,6 +157,7 @@ class MoversView:
         if self._limit.due("pins", now_ns, slower):
             places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._targets}
             self._draw_targets(places_m, observed.lost(now_ns), now_ns)
+            self._draw_goals(observed.goals(), observed.vehicles())
         if self._limit.due("beliefs", now_ns):
             self._draw_beliefs(now_ns)
         self._bodies.tick(now_ns)
@@ -180,6 +184,26 @@ class MoversView:
             trails, drawn = self._trails.advance(ids, feet(self._mesh, tops))
             if drawn.any():
                 self._pen.trail("world/trails/targets", trails, colours[drawn])
+
+    def _draw_goals(self, goals: Sequence[GoalState], vehicles: VehicleColumns) -> None:
+        """Draws a flag at each place to which a vehicle was sent, and a line from the vehicle to it."""
+        grid, row = self._mesh.grid, {id: n for n, id in enumerate(vehicles.ids)}
+        ways = [(each, row[each.name], each.cell) for each in goals if each.name in row and each.cell is not None]
+        ways = [way for way in ways if way[2] < grid.cells]
+        middles = [grid.row_col(cell) for _, _, cell in ways]
+        places_m = [((col + 0.5) * grid.resolution_m, (row + 0.5) * grid.resolution_m) for row, col in middles]
+        tops = self._pen.placed(places_m, _FLAG)
+        hues = [ALARM_COLOUR if each.state == "blocked" else styles.FLAG_COLOUR for each, _, _ in ways]
+        colours: Bytes = np.array(hues, np.uint8).reshape(-1, 3)
+        told = [f"{each.name}: {each.state}" for each, _, _ in ways]
+        self._pen.points("world/goals/flags", {"goal": told}, positions=tops, colors=colours)
+        self._pen.lines("world/goals/poles", poles(self._mesh, tops), colours)
+        starts = self._pen.placed(
+            [(float(vehicles.east_m[n]), float(vehicles.south_m[n])) for _, n, _ in ways], 0.2
+        )
+        ends = feet(self._mesh, tops)
+        self._pen.lines("world/goals/ways", even(np.stack([starts, ends], axis=1)), colours)
+        self._draw_labels("world/goals/names", tops, 1.0, [each.name for each, _, _ in ways])
 
     def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
         """Draws as many labels as can be read, at this height (`scale_m`) above their positions."""

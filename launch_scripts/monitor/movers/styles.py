@@ -36,6 +36,7 @@ SIGHTED_COLOUR: Colour = (255, 255, 255)
 SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
 ALARM_COLOUR: Colour = (255, 64, 48)
+FLAG_COLOUR: Colour = (110, 220, 120)
 FOLLOWED_ENTITY = "world/followed"
 """The vehicle or target that the camera follows: an entity whose origin moves."""
 HINT = "point at a vehicle or target to read who it is"
@@ -134,6 +135,7 @@ class Looks:
             Look("ball", BODY_COLOUR, "body to keep off"),
             Look("line", self.route(target), "route, trail"),
             Look("ball", ALARM_COLOUR, "alarm on a pole"),
+            Look("ball", FLAG_COLOUR, "place of an order"),
         ]
 
 

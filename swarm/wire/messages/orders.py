@@ -11,6 +11,8 @@ from swarm.errors import ConfigError
 from swarm.places import read_place
 from swarm.wire.fields import (
     IDS,
+    LARGE,
+    SMALL,
     Bounded,
     Cell,
     CellIndex,
@@ -20,6 +22,7 @@ from swarm.wire.fields import (
     Incarnation,
     Metres,
     StampNs,
+    VehicleId,
     Word,
     check_id,
 )
@@ -226,11 +229,123 @@ class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):
     given: Order | None = None
 
 
+MOST_GOALS = 64
+"""Places of one vehicle."""
+Then = Literal["hold", "chase", "repeat"]
+
+
+class VehicleGoals(Bounded, frozen=True, kw_only=True):
+    """The places to which a vehicle was sent last.
+
+    name      of the vehicle
+    stamp_ns  of two orders about one vehicle the later counts
+    off       recalled: it chases targets
+    cells     the places, in order
+    then      what it does after the last: hold there, chase targets, or begin again
+    done      how many it has reached, laps included
+    """
+
+    name: VehicleId
+    stamp_ns: StampNs
+    off: bool = False
+    cells: Annotated[list[CellIndex], Meta(max_length=MOST_GOALS)] = []
+    then: Then = "hold"
+    done: Count = 0
+
+    def relate(self) -> None:
+        if self.off == bool(self.cells):
+            raise ValueError("cells are missing, or stand in a recall")
+
+
+class SendVehicle(Message, frozen=True, kw_only=True, tag=schema_of("send-vehicle")):
+    """Asks a keeper to send a vehicle to places, one after the other. It replaces the places of an earlier order.
+
+    vehicle   "" only asks for the goals of all vehicles
+    places    as "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
+    then      what the vehicle does after the last: hold there, chase targets, or begin again
+    off       recall: it chases targets again
+    stamp_ns  when it was given, as in `GiveOrder`
+    """
+
+    vehicle: Annotated[str, Meta(max_length=64)] = ""
+    places: Annotated[list[PlaceText], Meta(max_length=MOST_GOALS)] = []
+    then: Then = "hold"
+    off: bool = False
+    stamp_ns: StampNs = 0
+
+    @property
+    def changes(self) -> bool:
+        """True if it asks for more than the goals in force."""
+        return bool(self.vehicle)
+
+    def relate(self) -> None:
+        if self.vehicle:
+            check_id("vehicle", self.vehicle)
+        if bool(self.places) != (self.changes and not self.off):
+            raise ValueError("places is empty: where is the vehicle to go?" if not self.off else "places with off")
+        for place in self.places:
+            _check_place("places", place)
+
+
+class Goals(Message, frozen=True, kw_only=True, tag=schema_of("goals")):
+    """The goals of an agent's vehicles that a keeper has on its disk.
+
+    id      of the keeper
+    agent   whose vehicles they are, where one agent's are told
+    shared  cell -> how many vehicles of all agents were sent there, of cells with more than one
+    given   the order that this answers, if it answers one
+    """
+
+    id: Id
+    agent: Id | None = None
+    goals: Annotated[list[VehicleGoals], IDS]
+    shared: Annotated[list[tuple[CellIndex, Count]], LARGE] = []
+    given: VehicleGoals | None = None
+
+
+GoalStateName = Literal["queued", "underway", "delayed", "blocked", "standby", "completed", "canceled", "failed"]
+
+
+class GoalState(Bounded, frozen=True, kw_only=True):
+    """Progress of a vehicle along the places of one order. The states are those of tasks in Open-RMF.
+
+    name      of the vehicle
+    stamp_ns  of the order
+    done      how many places it has reached, laps included
+    state     queued: it waits for a route; underway; delayed: it waits for right of way; blocked: there is no way,
+              or no planner; standby: an operator stopped it; completed: it has reached the last; canceled: it was
+              recalled; failed: it has left the map
+    cell      where it goes or holds; None if it chases targets
+    reason    why it is blocked
+    """
+
+    name: VehicleId
+    stamp_ns: StampNs
+    done: Count
+    state: GoalStateName
+    cell: CellIndex | None = None
+    reason: Word = ""
+
+
+class GoalStates(Message, frozen=True, kw_only=True, tag=schema_of("goal-states")):
+    """The states of all vehicles of an agent that were sent somewhere."""
+
+    agent: Id
+    stamp_ns: StampNs
+    states: Annotated[list[GoalState], SMALL]
+
+    def relate(self) -> None:
+        strange = next((each.name for each in self.states if not each.name.startswith(f"{self.agent}-")), None)
+        if strange is not None:
+            raise ValueError(f"vehicle {strange!r} is none of agent {self.agent}")
+
+
 class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     """Asks a process to answer as soon as it obeys: what it does and plans from then on goes by the order.
 
     author, sets             a zone: its author, and its sets as rows of a digest
     subject, name, stamp_ns  any other order
+    goals                    the order is about the goals of the vehicle of that name
     """
 
     author: Word = ""
@@ -238,6 +353,7 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     subject: Subject | None = None
     name: _Name = ""
     stamp_ns: StampNs = 0
+    goals: bool = False
 
     def relate(self) -> None:
         if self.author or self.sets:

@@ -40,6 +40,7 @@ from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
 from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
+from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Body, Followed
@@ -179,6 +180,10 @@ def test_the_camera_follows_a_vehicle_or_a_target(
     assert len(set(led)) > 2, "it moves"
 
 
+def sent(state: GoalState) -> GoalStates:
+    return GoalStates(agent="a0", stamp_ns=1, states=[state])
+
+
 SEEN = Sighted(
     author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
     cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
@@ -187,6 +192,7 @@ BODY = Body(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, 
 BELIEVED = Believed(
     target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
 )
+SENT = GoalState(name="a0-00", stamp_ns=1, done=0, state="underway", cell=9)
 DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]]] = {
     "a sighting ends": ([(NS_PER_S // 2, SEEN)], "targets/sighted", "strips", [0, 1, 0]),
     "a body moves, and its lease ends": (
@@ -199,6 +205,13 @@ DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]
             (3 * NS_PER_S, BELIEVED),
         ],
         "searched", "positions", [0, 2, 0, 2, 0],
+    ),
+    "a vehicle is sent somewhere, and recalled": (
+        [
+            (NS_PER_S // 4, fleet(1.0, ("a0-00", 3))), (NS_PER_S // 2, sent(SENT)),
+            (2 * NS_PER_S, sent(msgspec.structs.replace(SENT, state="canceled", cell=None))),
+        ],
+        "goals/flags", "positions", [0, 1, 0],
     ),
 }  # fmt: skip
 """The message, the entity and its component, and the number of instances in each of its rows."""

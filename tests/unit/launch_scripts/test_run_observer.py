@@ -17,6 +17,7 @@ from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import FLEET, RUN, STATS
 
@@ -130,6 +131,18 @@ def printed(status: Status) -> str:
     print_status(status, console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return text
+
+
+def test_vehicles_that_were_sent_somewhere_are_shown_with_their_state_and_those_recalled_are_not() -> None:
+    status = told_by(a0=9)
+    shown = GoalState(name="a0-01", stamp_ns=1, done=2, state="blocked", cell=7, reason="no way leads there")
+    recalled = GoalState(name="a0-02", stamp_ns=1, done=0, state="canceled")
+    status.latest.heard(GoalStates(agent="a0", stamp_ns=1, states=[shown, recalled]), 0)
+    text = printed(status)
+    assert "a0-01: blocked to cell:1,2 (xy:225,-135) (no way leads there), 2 reached" in text
+    assert "sent to places 1 blocked" in text
+    assert "a0-02" not in text
+    assert [each["name"] for each in status_fields(status)["goals"]] == ["a0-01"]
 
 
 def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:

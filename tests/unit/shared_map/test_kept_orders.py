@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.orders import GiveOrder, Order, Orders
-from swarm.wire.topics import GIVE_ORDER
+from swarm.wire.messages.orders import GiveOrder, Goals, GoalState, GoalStates, Order, Orders, SendVehicle
+from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, GOALS, SEND_VEHICLE
 
+SCENARIO = "[[targets]]\ncount = 2\n[[groups]]\nvehicles = 2"
 PACE = np.ones((20, 30), np.float32)
 PACE[3, 4] = np.inf
 
@@ -27,11 +29,10 @@ PACE[3, 4] = np.inf
 class BookWorld(SwarmModel):
     """Keepers, and a person who gives orders."""
 
-    def __init__(self, grid: GridSpec | None = None) -> None:
-        scenario = parse_scenario("[[targets]]\ncount = 2\n[[groups]]\nvehicles = 2")
+    def __init__(self, grid: GridSpec | None = None, scenario: str = SCENARIO) -> None:
         terrain = terrain_of_pace(PACE)
         terrain = terrain if grid is None else dataclasses.replace(terrain, grid=grid)
-        super().__init__(terrain=terrain, scenario=scenario)
+        super().__init__(terrain=terrain, scenario=parse_scenario(scenario))
         self.person = self.bus("person")
 
     def give(self, keeper: str = "k", **fields: Any) -> list[Order] | str | None:
@@ -124,3 +125,89 @@ def test_a_target_is_put_at_a_place(place: str) -> None:
     for wrong in ({"at": "there"}, {"at": "1,1", "cell": 3}, {}):
         with pytest.raises(ValueError, match=r"at is 'there'|give either cell|or at"):
             GiveOrder(subject="target", name="x", **wrong).relate()
+
+
+# --- goals of vehicles --------------------------------------------------------------------------------------------
+
+
+def send(world: BookWorld, keeper: str = "k", **fields: Any) -> Goals | str | None:
+    """The reply of the keeper, or its refusal."""
+    heard: list[Event] = []
+    order = SendVehicle(**fields, stamp_ns=world.now_ns)
+    world.person.ask(SEND_VEHICLE, order, heard.append, tag="s", keeper=keeper)
+    world.run(0.2)
+    for event in heard:
+        if isinstance(event, Replied):
+            assert isinstance(event.message, Goals)
+            return event.message
+    (ended,) = (event for event in heard if isinstance(event, AskEnded))
+    return ended.failure
+
+
+def test_acknowledged_goals_are_on_the_disk_and_so_is_what_the_vehicle_has_reached(tmp_path: Path) -> None:
+    world = BookWorld()
+    path = tmp_path / "map.sqlite"
+    with KeeperStore(path) as store:
+        world.keeper("k", store)
+        given = send(world, vehicle="a0-00", places=["cell:5,6", "cell:7,8"], then="chase")
+        assert isinstance(given, Goals)
+        assert given.given is not None
+        world.kill("k.1")
+    with KeeperStore(path) as store:
+        assert store.goals() == [given.given]
+        world.keeper("k", store, 2)
+        agent = world.bus("agent")
+        done = GoalState(name="a0-00", stamp_ns=given.given.stamp_ns, done=1, state="underway")
+        old = replace(done, stamp_ns=done.stamp_ns - 1, done=2)
+        agent.publish(GOAL_STATES, GoalStates(agent="a0", stamp_ns=1, states=[done, old]), agent="a0")
+        world.run(1.5)
+        world.kill("k.2")
+    with KeeperStore(path) as store:
+        assert store.goals() == [replace(given.given, done=1)]
+        assert [divmod(cell, 30) for cell in given.given.cells] == [(5, 6), (7, 8)]
+
+
+def test_an_agent_hears_its_own_goals_alone_and_keepers_share_all() -> None:
+    world = BookWorld(scenario="[[targets]]\n[[groups]]\nvehicles = 4\n[vehicles]\nper_agent = 2")
+    stores = [KeeperStore(":memory:"), KeeperStore(":memory:")]
+    world.keeper("k", stores[0])
+    heard: list[Event] = []
+    world.bus("agent").subscribe(GOALS, heard.append, agent="a0")
+    send(world, vehicle="a0-00", places=["cell:5,6"])
+    send(world, vehicle="a1-00", places=["cell:5,6", "cell:9,9"])
+    world.keeper("l", stores[1])
+    send(world, "l", vehicle="a1-01", places=["cell:9,9"])
+    world.run(2.5)
+    assert stores[0].goals() == stores[1].goals()
+    assert [goals.name for goals in stores[0].goals()] == ["a0-00", "a1-00", "a1-01"]
+    told = heard[-1]
+    assert isinstance(told, Heard)
+    assert isinstance(told.message, Goals)
+    assert [goals.name for goals in told.message.goals] == ["a0-00"]
+    assert told.message.shared == [(5 * 30 + 6, 2)]  # of all agents, as the vehicles need room there
+    send(world, "l", vehicle="a1-00", off=True)
+    world.run(1.5)
+    assert stores[0].goals() == stores[1].goals()
+    told = heard[-1]
+    assert isinstance(told, Heard)
+    assert isinstance(told.message, Goals)
+    assert told.message.shared == []
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ({"vehicle": "a9-00", "places": ["cell:5,6"]}, "vehicle 'a9-00': there is none"),
+        ({"vehicle": "a0-00", "places": ["cell:50,6"]}, "outside the terrain"),
+        ({"vehicle": "a0-00", "places": ["cell:3,4"]}, "[3, 4] is lethal"),
+        ({"vehicle": "a0-00", "places": ["cell:5,6", "cell:5,6"], "then": "repeat"}, "two different places"),
+    ],
+)
+def test_an_impossible_goal_is_refused_in_a_sentence(order: dict[str, Any], words: str) -> None:
+    world = BookWorld()
+    store = KeeperStore(":memory:")
+    world.keeper("k", store)
+    refused = send(world, **order)
+    assert isinstance(refused, str)
+    assert words in refused
+    assert store.goals() == []

@@ -16,7 +16,7 @@ from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
-from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, ZONE
+from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, VEHICLE_GOAL, ZONE
 from swarm.client import Swarm
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
@@ -76,6 +76,8 @@ class Incoming:
         """Names in ROS of vehicles that agents of the swarm have. A vehicle published by another gateway looks like
         a robot, and would be a body at the position of the vehicle itself."""
         self._taken_due_ns = 0
+        self._sendable: set[str] = set()
+        """Names in ROS of vehicles whose goals are taken from there."""
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
         self._inputs = [
@@ -110,9 +112,12 @@ class Incoming:
 
         now_ns  by time.monotonic_ns
         """
-        if self._robots and now_ns >= self._taken_due_ns:
+        if (self._robots or self._settings.orders) and now_ns >= self._taken_due_ns:
             self._taken_due_ns = now_ns + _LOOK_NS
-            self._taken = frozenset(ros_name(id) for id in self._vehicles() if agent_of(id) != id)
+            taken = {ros_name(id): id for id in self._vehicles() if agent_of(id) != id}
+            self._taken = frozenset(taken)
+            if self._settings.orders:
+                self._take_goals_of(taken)
         for _ in range(len(self._news)):
             self._hear(*self._news.popleft())
         for robot in self._robots.values():
@@ -180,6 +185,25 @@ class Incoming:
             target.at(place.x_m, place.y_m)
 
         return Input(self._node, self._settings.set_pose_of(id), SET_POSE.type_name, 10.0, take)
+
+    def _take_goals_of(self, vehicles: Mapping[str, str]) -> None:
+        """Takes goals of these vehicles from ROS.
+
+        vehicles  name in ROS -> vehicle
+        """
+        for name in vehicles.keys() - self._sendable:
+            self._sendable.add(name)
+            self._inputs.append(self._goal_input(name, vehicles[name]))
+
+    def _goal_input(self, name: str, vehicle: str) -> Input:
+        orders = self._swarm.orders()
+
+        def take(message: Any, _: int) -> None:
+            place = self._reader.pose(message.header, message.pose)
+            orders.send(vehicle, [f"xy:{place.x_m},{place.y_m}"])
+
+        topic = VEHICLE_GOAL.topic.format(vehicle=name)
+        return Input(self._node, topic, VEHICLE_GOAL.type_name, 1.0, take, queue=self._orders)
 
     def _zone_input(self, zone: ZoneSettings) -> Input:
         """A polygon whose corners are those of the last is not ordered again, unless the zone ends by itself."""

@@ -1,0 +1,153 @@
+"""Goals of an agent's vehicles: the places to which operators sent them, one after the other.
+
+`VehicleGoals.done` is the whole progress of a vehicle. It grows by one when the vehicle is at rest at its place.
+The agent tells it, and keepers store it: a later life of the agent goes on where this one ended. Pure.
+
+A place that many vehicles share is reached within the fewest steps that give each vehicle a cell. Else all but one
+would push for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from msgspec.structs import replace
+
+from swarm.runtime.order_book import MOST_SENT, GoalBook
+from swarm.wire.messages.orders import GoalState, GoalStateName, VehicleGoals
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.route_columns import RouteStatus
+from vehicle_agent.driving.driven_vehicle import Vehicle
+
+NO_PLANNER = "no process plans routes to places"
+REASONS: Mapping[str, str] = {
+    RouteStatus.UNREACHABLE: "no way leads there",
+    RouteStatus.LETHAL_START: "the vehicle is on a lethal cell",
+    RouteStatus.OUTSIDE: "the vehicle is outside the map",
+    RouteStatus.NO_TARGET: "the place is lethal",
+}
+"""Status of a route -> why a vehicle is blocked."""
+
+
+def next_cell(goals: VehicleGoals | None) -> int | None:
+    """The place to which a vehicle goes now or which it holds; None if it chases targets."""
+    if goals is None or goals.off:
+        return None
+    count = len(goals.cells)
+    if goals.then == "repeat" or goals.done < count:
+        return goals.cells[goals.done % count]
+    return goals.cells[-1] if goals.then == "hold" else None
+
+
+def is_over(goals: VehicleGoals) -> bool:
+    """Returns True if a vehicle has reached its last place."""
+    return not goals.off and goals.then != "repeat" and goals.done >= len(goals.cells)
+
+
+def arrival_cells(goal: int, vehicles: int, steps: Callable[[int], Iterable[int]]) -> frozenset[int]:
+    """The cells on which vehicles that share a place reach it: those within the least number of steps from it that
+    are as many as the vehicles, or all that can be reached.
+
+    steps  cells to which one may drive from a cell
+    """
+    found, edge = {goal}, [goal]
+    while edge and len(found) < vehicles:
+        edge = [*dict.fromkeys(cell for tail in edge for cell in steps(tail) if cell not in found)]
+        found.update(edge)
+    return frozenset(found)
+
+
+class GoalQueues:
+    """Goals of the vehicles of one agent.
+
+    steps    cells to which a vehicle may drive from a cell
+
+    book     where they are sent; the owner merges what keepers tell
+    shared   cell -> how many vehicles of all agents were sent there, where it is more than one
+    refused  vehicle -> the status with which its last question for a route was refused
+    """
+
+    def __init__(self, steps: Callable[[int], Iterable[int]]) -> None:
+        self.book = GoalBook()
+        self.shared: Mapping[int, int] = {}
+        self.refused: dict[str, str] = {}
+        self._steps = steps
+        self._arrivals: dict[int, frozenset[int]] = {}
+
+    def look_again(self) -> None:
+        """The ground, bodies or shared places may have changed."""
+        self._arrivals.clear()
+
+    def cell(self, vehicle: str) -> int | None:
+        """The place to which a vehicle goes or which it holds; None if it chases targets."""
+        return next_cell(self.book.get(vehicle))
+
+    def is_at(self, goal: int, cell: int) -> bool:
+        """Returns True if a vehicle that rests on a cell has reached a place."""
+        if goal not in self.shared:
+            return goal == cell
+        if goal not in self._arrivals:
+            vehicles = min(self.shared[goal], MOST_SENT)  # whatever is told, the work is bounded
+            self._arrivals[goal] = arrival_cells(goal, vehicles, self._steps)
+        return cell in self._arrivals[goal]
+
+    def reached(self, vehicle: str, now_ns: int) -> bool:
+        """A vehicle is at rest at its place. Returns True if that is news."""
+        goals = self.book.in_force(vehicle)
+        if goals is None or is_over(goals):
+            return False
+        return bool(self.book.merge([replace(goals, done=goals.done + 1)], now_ns))
+
+    def states(
+        self,
+        vehicles: Mapping[str, Vehicle],
+        left: Iterable[str],
+        stopped: Callable[[str], bool],
+        waiting: Iterable[str],
+    ) -> list[GoalState]:
+        """The state of each vehicle that was sent somewhere.
+
+        vehicles  those on the map
+        left      those that have left it
+        stopped   whether an operator lets a vehicle stand
+        waiting   those that wait for right of way
+        """
+        gone, waits = frozenset(left), frozenset(waiting)
+        return [
+            self._state(goals, vehicles.get(goals.name), goals.name in gone, stopped, goals.name in waits)
+            for goals in self.book
+        ]
+
+    def _state(
+        self,
+        goals: VehicleGoals,
+        vehicle: Vehicle | None,
+        left: bool,
+        stopped: Callable[[str], bool],
+        waits: bool,
+    ) -> GoalState:
+        state: GoalStateName = "underway"
+        reason = ""
+        if goals.off:
+            state = "canceled"
+        elif is_over(goals):
+            state = "completed"
+        elif left:
+            state = "failed"
+        elif vehicle is None:
+            state = "queued"
+        elif stopped(vehicle.id):
+            state = "standby"
+        elif vehicle.state is VehicleState.STRANDED:
+            state, refused = "blocked", self.refused.get(vehicle.id, "")
+            reason = REASONS.get(refused, refused)
+        elif vehicle.planner_gone and not vehicle.route.left:
+            state, reason = "blocked", NO_PLANNER
+        elif waits:
+            state = "delayed"
+        elif vehicle.state is VehicleState.WAITING:
+            state = "queued"
+        return GoalState(
+            name=goals.name, stamp_ns=goals.stamp_ns, done=goals.done, state=state, cell=next_cell(goals),
+            reason=reason,
+        )  # fmt: skip
