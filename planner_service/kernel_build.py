@@ -26,6 +26,7 @@ from typing import Any
 from planner_service.kernels import (
     cell_costs,
     costs_from_parents,
+    crops,
     lower_bounds,
     parents,
     partition,
@@ -90,6 +91,9 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
+GOALS = crops.walk_by_costs, queue_dial.resume, crops.stays_exact
+"""Beside those of `FIRST`, for `GoalTrees`."""
+
 PULL = pull_routes.pull_routes
 """Only for planners that pull their routes."""
 
@@ -130,7 +134,9 @@ def needed_kernels(scenario: Scenario) -> NeededKernels:
 
 def all_kernels() -> list[Kernel]:
     """Returns the kernels of planners on any map, each once: those needed more often come first."""
-    return [*chain(*_once(*(_of_kind(part, kind) for part in (FIRST, LATER, [PULL]) for kind in (False, True))))]
+    return [
+        *chain(*_once(*(_of_kind(part, kind) for part in (FIRST, LATER, GOALS, [PULL]) for kind in (False, True))))
+    ]
 
 
 def _once(*parts: Sequence[Kernel]) -> list[tuple[Kernel, ...]]:

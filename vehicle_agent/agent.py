@@ -18,7 +18,7 @@ from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.orders import GoalState
-from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
+from swarm.wire.messages.planning import PlaceRouteReply, PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
@@ -27,7 +27,7 @@ from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.goals import GoalQueues
+from vehicle_agent.goals import REASONS, GoalQueues
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
@@ -470,7 +470,7 @@ class Agent:
         if any(target not in before for target in alive):
             self.assignment.ask_soon(now_ns)
 
-    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[Follow]:
+    def routes_given(self, request: int, reply: RouteReply | PlaceRouteReply, now_ns: int) -> list[Follow]:
         """A planner's answer to `AskRoutes`; returns the routes that vehicles have begun."""
         asked = self._route_requests.pop(request, None)
         if asked is None:
@@ -479,6 +479,7 @@ class Agent:
         pose = self._poses.get(asked.target)
         stale = (
             pose is not None
+            and isinstance(reply, RouteReply)
             and reply.target_cell is not None
             and 0 <= reply.target_cell < self._map.grid.cells
             and self._map.grid.distance_cells(pose.cell, reply.target_cell) > _STALE_CELLS
@@ -491,6 +492,8 @@ class Agent:
                 vehicle.no_answer(now_ns)
             else:
                 begun += self._take(vehicle, asked.target, route, now_ns, pushed=False)
+                if isinstance(reply, PlaceRouteReply) and reply.status in REASONS:
+                    self.goals.refused[id] = reply.status
         return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:

@@ -24,9 +24,10 @@ REASONS: Mapping[str, str] = {
     RouteStatus.UNREACHABLE: "no way leads there",
     RouteStatus.LETHAL_START: "the vehicle is on a lethal cell",
     RouteStatus.OUTSIDE: "the vehicle is outside the map",
-    RouteStatus.NO_TARGET: "the place is lethal",
+    "lethal_goal": "the place is lethal",
+    "outside_goal": "the place is outside the map",
 }
-"""Status of a route -> why a vehicle is blocked."""
+"""Status of a route, or of all to a place -> why a vehicle is blocked."""
 
 
 def next_cell(goals: VehicleGoals | None) -> int | None:

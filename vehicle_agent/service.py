@@ -27,6 +27,8 @@ from swarm.wire.messages.orders import GoalState, GoalStates, Obey
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
+    PlaceRouteReply,
+    PlaceRouteRequest,
     PushedRoute,
     RouteReply,
     RouteRequest,
@@ -43,6 +45,7 @@ from swarm.wire.topics import (
     FOLLOWED,
     GOAL_STATES,
     LEAVE,
+    PLACE_ROUTE,
     POSE,
     PUSHED_ROUTE,
     ROUTE,
@@ -53,7 +56,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.assemble import AgentParts
-from vehicle_agent.driving.driven_vehicle import Follow, Places
+from vehicle_agent.driving.driven_vehicle import Follow, Places, goal_of
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts
 
@@ -63,6 +66,8 @@ _ANSWER_S = 2.0
 """A planner's answer is waited for so long, or for several round trips where the link is slow."""
 _TRIPS = 3.0
 _LONGEST_ANSWER_S = 8.0
+_PLACE = "place"
+"""The target of a route to a place, for those who watch."""
 _ROUTES, _COSTS = "route-", "cost-"
 """Tags of what we ask, each with a number."""
 
@@ -177,7 +182,7 @@ class AgentService:
                 event.end()
             case Heard(message=Sighted() as sighted):
                 self._on_sighted(sighted, now_ns)
-            case Replied(message=RouteReply() as reply, took_s=took_s):
+            case Replied(message=(RouteReply() | PlaceRouteReply()) as reply, took_s=took_s):
                 self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
                 self._on_routes(event, reply, now_ns)
             case Replied(tag=tag, message=CostReply() as reply, took_s=took_s):
@@ -429,7 +434,7 @@ class AgentService:
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
             self.agent.set_planners(planners, now_ns)
 
-    def _on_routes(self, replied: Replied, reply: RouteReply, now_ns: int) -> None:
+    def _on_routes(self, replied: Replied, reply: RouteReply | PlaceRouteReply, now_ns: int) -> None:
         self.counters.observe("route_query_ms", replied.took_s * 1e3)
         self.counters.count("routes_received", len(reply.routes))
         self._publish_followed(self.agent.routes_given(_number(replied.tag), reply, now_ns))
@@ -448,6 +453,17 @@ class AgentService:
         """Asks planners what the core wants to know."""
         for action in actions:
             match action:
+                case AskRoutes(request, target, vehicles, cells) if (to := goal_of(target)) is not None:
+                    place = PlaceRouteRequest(
+                        to=to,
+                        cells=list(cells),
+                        vehicles=list(vehicles),
+                        max_cells=self._setup.scenario.vehicles.route_cells,
+                        vehicle_class=self._class,
+                    )
+                    self._member.ask_by_name(
+                        PLACE_ROUTE, place, tag=f"{_ROUTES}{request}", timeout_s=self._answer_s
+                    )
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
                     self.counters.count("reroute_requests", reroutes)
                     asking = RouteRequest(
@@ -470,15 +486,17 @@ class AgentService:
             elif 0 < route.lower_bound_s < math.inf:
                 excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
                 self.counters.observe("followed_gap_excess", excess)
-                self.counters.observe_by(GAPS_TO, route.target, excess)
+                if goal_of(route.target) is None:
+                    self.counters.observe_by(GAPS_TO, route.target, excess)
                 self.counters.observe_by(GAPS_OF, route.vehicle, excess)
             else:
                 self.counters.count("followed_unproven")
-                self.counters.count_by(UNPROVEN_TO, route.target)
+                if goal_of(route.target) is None:
+                    self.counters.count_by(UNPROVEN_TO, route.target)
                 self.counters.count_by(UNPROVEN_OF, route.vehicle)
             followed = Followed(
                 vehicle=route.vehicle,
-                target=route.target,
+                target=_PLACE if goal_of(route.target) is not None else route.target,
                 start=route.cells[0],
                 directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,

@@ -5,10 +5,15 @@ All neighbours of a cell are offered the same exit key per kind of step (see `la
 order of their exit keys, so that the first offer to a cell is its least, and its cost is final at first touch: no
 key is ever decreased. Octile steps make two keys per cell, straight and diagonal. Parents follow from the costs.
 
+Therefore a growth can stop behind any bucket, and go on from there later: cells with a cost are exact, and no other
+cell costs less than the next bucket begins with. Between two calls the cost of a lethal cell is WALL.
+
 Arrays, beside those of `layout`:
-    touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
+    touched  uint32  (size + 1,)     padded cells that have a cost, in the order of the buckets they got it from
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `queue_chunks`; `make_scratch` says how large
+    state    int64   (4,)            the last bucket served; entries that wait in the queue; how many of `touched`
+                                     were put into it; how many there are. `begin` writes it, growths change it
 
 The form of the loops was measured, and small changes cost much. Cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -26,6 +31,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import (
+    BOX,
     BUCKETS,
     GRID,
     INF,
@@ -34,6 +40,10 @@ from planner_service.kernels.layout import (
     SQRT2,
     TOO_FINE,
     WALL,
+    Buckets,
+    Floats,
+    Longs,
+    PaddedGrid,
 )
 from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 
@@ -41,6 +51,8 @@ _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
+WHOLE = -1
+"""As the most cells of a growth: all of them, from a new root."""
 AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
 (docs/design/bucket-queues.md)."""
@@ -175,62 +187,138 @@ def offer_around(cell_cost, cost, s, corners, batch, n, touched):
     return count
 
 
-@kernel(f"({GRID}, f4[::1], i8, {BUCKETS}, {_SCRATCH})")
-def grow_by_buckets(grid, cost, root, buckets, scratch):
-    """Costs to `root`, a padded, passable cell. `cost` is written whole.
+@helper
+def _file(grid, cost, buckets, scratch, first, count, least):
+    """Puts `count` cells of `touched`, from the place `first` on, into the queue. Returns as how many entries."""
+    width, circle = buckets
+    touched, batch, queue = scratch
+    cells = touched[first:]
+    length = np.uint64(circle)
+    mask = length - _ONE
+    inverse = _ONE32 / np.float32(width)
+    _choose(grid[0], cost, _ONE32, inverse, least, cells, count, batch)
+    put(queue, cells, count, batch, mask, _ZERO)
+    if grid[3] != RULE_OCTILE:
+        return count
+    _choose(grid[0], cost, SQRT2, inverse, least, cells, count, batch)
+    put(queue, cells, count, batch, mask, length)
+    return count + count
+
+
+def begin(cost: Floats, root: int, scratch: Scratch, state: Longs) -> None:
+    """Begins a growth from a padded, passable root, on costs of inf and WALL."""
+    cost[root] = 0.0
+    scratch[0][0] = root
+    state[:] = 0, 0, 0, 1
+
+
+@kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8)")
+def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
+    """Costs to a root. Goes on from `state`, which `begin` or `resume` left, or an earlier call.
 
     buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
              circular queue, a power of two; count * width exceeds the costliest step by two widths
     scratch  as `make_scratch` returns it
-    Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
+    askers   padded cells, passable ones: it stops behind the bucket from which the last of them got its cost
+    most     it stops as well once this many more cells have a cost. WHOLE: it stops for nothing, and begins with
+             the root askers[0]. All of `cost` is written, inf on lethal cells
+    Returns the last bucket, or TOO_FINE. No cost exceeds (last + 1) * width. While cells wait, by `state`, a cell
+    without a cost costs that at least.
 
     With octile steps a cell waits twice, under its straight exit key in the first `count` buckets and under its
     diagonal one in as many behind them.
     """
     cell_cost, _, stride, rule, corners = grid
     touched, batch, queue = scratch
-    width, circle = buckets
-    empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    _, circle = buckets
     head, tail = queue[3], queue[4]
     s = np.uint64(stride)
     length = np.uint64(circle)
     mask = length - _ONE
     second = length if rule == RULE_OCTILE else _ZERO
-    inverse = _ONE32 / np.float32(width)
 
-    open_costs(cell_cost, cost)
-    cost[np.uint64(root)] = _ZERO32
-    touched[0] = root
-    count = _ONE
-    current = np.int32(0)
-    waiting = _ZERO
+    if most == WHOLE:
+        open_costs(cell_cost, cost)
+        cost[np.uint64(askers[0])] = _ZERO32
+        touched[0] = askers[0]
+        state[0], state[1], state[2], state[3] = 0, 0, 0, 1
+    if state[2] == 0:
+        empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    current = np.int32(state[0])
+    waiting, filed, total = np.uint64(state[1]), np.uint64(state[2]), np.uint64(state[3])
+    limit = total + np.uint64(max(most, 0))
+    asker = 0
     while True:
         # Cells touched from the last bucket join the queue: their cost is final.
-        waiting += count
         following = np.int32(current + 1)
-        _choose(cell_cost, cost, _ONE32, inverse, following, touched, count, batch)
-        put(queue, touched, count, batch, mask, _ZERO)
-        if rule == RULE_OCTILE:
-            waiting += count
-            _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
-            put(queue, touched, count, batch, mask, length)
-        if waiting == _ZERO:
-            close_costs(cost)
-            return current
-        if current > 1 << 20:
-            return TOO_FINE
+        waiting += _file(grid, cost, buckets, scratch, filed, total - filed, following)
+        filed = total
+        if most != WHOLE:
+            while asker < askers.size and cost[np.uint64(askers[asker])] < INF:
+                asker += 1
+            if asker == askers.size or total >= limit:
+                break
+        if waiting == _ZERO or current > 1 << 20:
+            break
         current = following
         b = np.uint64(current) & mask
         while head[b] == tail[b] and head[b + second] == tail[b + second]:
             current = np.int32(current + 1)
             b = np.uint64(current) & mask
+        fresh = touched[total:]
         n = take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
-            count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
+            count = offer_around(cell_cost, cost, s, corners, batch, n, fresh)
         else:
-            count = offer_straight(cell_cost, cost, s, batch, n, touched)
+            count = offer_straight(cell_cost, cost, s, batch, n, fresh)
         if rule == RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
+            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, fresh, count)
+        total += count
+    state[0], state[1], state[2], state[3] = current, waiting, filed, total
+    if most == WHOLE:
+        close_costs(cost)
+    return current if current <= 1 << 20 or waiting == _ZERO else TOO_FINE
+
+
+def grow_whole(grid: PaddedGrid, cost: Floats, root: int, buckets: Buckets, scratch: Scratch) -> int:
+    """Costs to a padded, passable root, everywhere. Returns the last bucket, or TOO_FINE."""
+    root_only = np.array((root,))
+    return int(grow_by_buckets(grid, cost, buckets, scratch, np.empty(4, np.int64), root_only, WHOLE))
+
+
+@kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], {BOX}, f4[:, ::1], i8)")
+def resume(grid, cost, buckets, scratch, state, box, crop, first):
+    """Goes back to a tree that was cut out (see `crops`): to its costs in buckets below `first`, which are exact on
+    the map as it is. Dearer cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
+    cell_cost, _, stride, rule, _ = grid
+    width, circle = buckets
+    touched, batch, queue = scratch
+    row0, col0, row1, col1 = box
+    inverse = _ONE32 / np.float32(width)
+    length = np.uint64(circle)
+    mask = length - _ONE
+    empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    total = _ZERO
+    waiting = _ZERO
+    for row in range(row0, row1):
+        for col in range(col0, col1):
+            c = crop[row - row0, col - col0]
+            v = np.uint64(row * stride + col)
+            if not (c >= _ZERO32 and c < INF and cell_cost[v] < INF) or np.int32(c * inverse) >= first:
+                continue
+            cost[v] = c
+            touched[total] = v
+            one = touched[total:]
+            total += _ONE
+            batch[0] = np.int32((c + cell_cost[v]) * inverse)
+            if batch[0] >= first:
+                put(queue, one, _ONE, batch, mask, _ZERO)
+                waiting += _ONE
+            batch[0] = np.int32((c + cell_cost[v] * SQRT2) * inverse)
+            if rule == RULE_OCTILE and batch[0] >= first:
+                put(queue, one, _ONE, batch, mask, length)
+                waiting += _ONE
+    state[0], state[1], state[2], state[3] = first - 1, waiting, total, total

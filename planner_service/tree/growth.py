@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MOST_BUCKETS = 1 << 8
 """Buckets are as narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
-_NARROW = 0.98
+NARROW = 0.98
 """Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 FINE = float(1 << 20)
 """While no cost exceeds this number of lowest cell costs, float32 distinguishes any cell's cost from its
@@ -76,14 +76,14 @@ def grow_tree(
 def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kept: KeptScratch) -> float:
     """Costs where entering a cell costs the same from everywhere. Returns a bound, s, that none exceeds."""
     size, rule, (lowest, highest, dearest) = padded[0].size, padded[3], bounds
-    width = float(np.float32(lowest * _NARROW))
+    width = float(np.float32(lowest * NARROW))
     needed = highest * dearest / width + 3
     if needed <= MOST_BUCKETS:
         count = 1 << max(2, math.ceil(math.log2(needed)))
         if (size, count) not in kept:
             kept.clear()
             kept[size, count] = queue_dial.make_scratch(size, rule, count)
-        last = int(queue_dial.grow_by_buckets(padded, cost, root, (width, count), kept[size, count]))
+        last = queue_dial.grow_whole(padded, cost, root, (width, count), kept[size, count])
         if last != TOO_FINE:
             return (last + 1) * width
     if (size, 0) not in kept:

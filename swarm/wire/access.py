@@ -20,7 +20,7 @@ from swarm.errors import ProtocolError
 if TYPE_CHECKING:
     from swarm.wire.topics import Topic
 
-MEMBERS = "keeper planner agent targets tracker rover monitor"
+MEMBERS = "keeper planner places agent targets tracker rover monitor"
 """The roles of the processes of a run. Two are external: a `tracker` publishes the pose of one real target, a
 `rover` where one vehicle is that no agent drives."""
 OPERATOR = "operator"

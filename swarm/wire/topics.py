@@ -174,7 +174,7 @@ def _chunk(value: str | int) -> str:
     return chunk
 
 
-_REPLICAS = "agent keeper planner monitor"
+_REPLICAS = "agent keeper planner places monitor"
 """Roles which hold a replica of the map."""
 
 OBEYING = "agent planner targets keeper"
@@ -324,6 +324,13 @@ ROUTE = Topic(
     request=planning.RouteRequest, published=False, costly=True,
     ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
+PLACE_ROUTE = Topic(
+    "place-route", "place/{places}/route/{asker}", planning.PlaceRouteReply, "routes from cells to a place",
+    "asked",
+    access(serve="places:places", ask="agent:asker rover:asker"),
+    request=planning.PlaceRouteRequest, published=False, costly=True,
+    ask_bytes=_LONG, answer_bytes=4 * _LONG,
+)  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
     access(serve="planner:target", ask="agent:asker targets:asker monitor:asker rover:asker"),
@@ -423,7 +430,7 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
-    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES, SHORT_ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip

@@ -57,7 +57,7 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
         root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
         narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
-        assert queue_dial.grow_by_buckets(ground.padded, narrow, root, (width, 4096), scratch) > 0
+        assert queue_dial.grow_whole(ground.padded, narrow, root, (width, 4096), scratch) > 0
         room = queue_wide.make_scratch(ground.size, ground.rule)
         reach = queue_wide.grow_by_wide_buckets(ground.padded, wide, root, width, room)
         np.testing.assert_array_equal(wide, narrow)
@@ -110,7 +110,9 @@ _SMALL = """
 import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
+from planner_service.goal_trees import GoalTrees
 from planner_service.pulled_routes import Puller
+from planner_service.tree.cost_grid import CostGrid
 from support.kernel_oracle import random_grids
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
@@ -125,6 +127,13 @@ for strategy in ("full", "variable_range", "auto", "multi_resolution"):
         play.check()
     routes = play.tree.routes(np.arange(play.grid.cells))
     Puller(pace, 1.0, play.config).pull_batch(routes)
+cells, costs = np.flatnonzero(np.isfinite(pace)), CostGrid(play.grid, play.config)
+costs.load(pace)
+trees = GoalTrees(costs, 3000)
+for turn in range(12):
+    trees.ask(int(cells[turn % 2]), int(cells[-turn - 1]), 10)
+    pace.flat[cells[4 * turn + 9]] = np.inf if turn % 3 else 2.0
+    trees.changed(costs.apply(pace, [play.grid.window]))
 print("fine")
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -87,6 +87,39 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     vehicle_class: Id = GROUND
     lethal_target: Cell | None = None
     nearest_cell: Cell | None = None
+
+    def check(self) -> None:
+        self.routes.check_bounds()
+
+
+class PlaceRouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("place-route-request")):
+    """Asks for routes from cells to a place. Else as in `RouteRequest`.
+
+    to  the cell of the place
+    """
+
+    to: Cell
+    cells: Annotated[list[Cell], LARGE] = []
+    vehicles: Annotated[list[VehicleId], SMALL] = []
+    max_cells: Count = 0
+    vehicle_class: Id = GROUND
+
+
+class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-route")):
+    """Routes to a place, each with a proven lower bound.
+
+    incarnation  of the process that plans
+    map_version  number of changes of its replica
+    status       "lethal_goal", "outside_goal": there is no route; "growing": some are not known yet, and their
+                 status is NO_TARGET: ask again
+    """
+
+    to_cell: Cell
+    incarnation: Incarnation
+    map_version: Count
+    routes: Routes
+    status: Literal["ok", "growing", "lethal_goal", "outside_goal"] = "ok"
+    vehicle_class: Id = GROUND
 
     def check(self) -> None:
         self.routes.check_bounds()

@@ -1,0 +1,108 @@
+"""Trees that were cut out of a growth which has stopped: what the map's changes leave of them, and their routes.
+
+Arrays, beside those of `layout`:
+    box   (row0, col0, row1, col1), padded rows and columns; row1 and col1 lie outside
+    crop  float32 (rows, cols)  exact costs of the box; inf or less where a cell has none
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import BOX, GRID, INF, RULE_FOUR, RULE_OCTILE, step_length
+
+_DETOUR = 0.4142135
+"""Least that a diagonal octile step costs beyond a straight one, in straight ones."""
+
+
+@helper
+def _cost_in(crop, box, row, col):
+    """A padded cell's cost; inf outside the box, and where it has none."""
+    row0, col0, row1, col1 = box
+    if row < row0 or row >= row1 or col < col0 or col >= col1:
+        return INF
+    c = crop[row - row0, col - col0]
+    return c if c >= 0 else INF
+
+
+@kernel(f"({GRID}, {BOX}, f4[:, ::1], i8[::1], f4[::1], f8, i8[::1], UniTuple(f8, 2), u1[::1])")
+def stays_exact(grid, box, crop, cells, before, bound, route, known, mark):
+    """Looks at changes of the map since a tree was cut out.
+
+    cells, before  int64 padded cells that have changed, and float32 cell costs as they were; a cell may occur twice
+    bound          s; no cell without a cost cost less
+    route          int64 padded cells of a cheapest route from a start to the root; it may be empty
+    known          what it costs by `crop`, s, and the lowest cell cost now
+    mark           uint8 (size,), zeros; zeros afterwards
+    Returns the cost, s, below which all costs are as they were; and whether the route is one of the cheapest yet.
+
+    A change matters only from the exit key of its cell on. A route stays cheapest if none of its cells costs more,
+    none of the corners that it cuts is shut, and no way over a cell that costs less can cost less than it.
+    """
+    cell_cost, offsets, stride, rule, _ = grid
+    at_start, lowest = known
+    level = bound
+    stands = route.size > 0
+    for i in range(route.size):
+        mark[route[i]] = 1
+    for i in range(cells.size):
+        v = cells[i]
+        row = v // stride
+        col = v - row * stride
+        now, old = cell_cost[v], before[i]
+        own = _cost_in(crop, box, row, col)
+        least = np.float64(own)
+        level = min(level, np.float64(own) + np.float64(min(now, old)))
+        if (now < INF) != (old < INF):
+            # Its neighbours offer to it, or past its corner.
+            for k in range(8):
+                u = v + offsets[k]
+                c = np.float64(_cost_in(crop, box, u // stride, u % stride))
+                level = min(level, c + cell_cost[u])
+                least = min(least, c)
+        if now > old:
+            stands = stands and not mark[v]
+            if not now < INF:
+                for k in range(0, 8, 2):
+                    stands = stands and not mark[v + offsets[k]]
+        elif stands and now < old:
+            down, across = abs(row - route[0] // stride), abs(col - route[0] % stride)
+            steps = max(down, across) + (_DETOUR * min(down, across) if rule == RULE_OCTILE else 0.0)
+            there = max(steps - 2.0, 0.0) * lowest
+            stands = there + min(least, bound) >= at_start * (1.0 - 1e-6)
+    for i in range(route.size):
+        mark[route[i]] = 0
+    return level, stands
+
+
+@kernel(f"({GRID}, {BOX}, f4[:, ::1], i8, i8, u1[::1])")
+def walk_by_costs(grid, box, crop, start, root, directions):
+    """Writes the directions of a cheapest route from a padded cell that has a cost, by costs alone; of equals the
+    first as in `parents`. Returns how many, or -1 if it does not end at the root within as many as have room."""
+    cell_cost, offsets, stride, rule, corners = grid
+    v = start
+    n = 0
+    while v != root:
+        best = INF
+        way = -1
+        for j in range(4 if rule == RULE_FOUR else 8):
+            k = 2 * j if j < 4 else 2 * j - 7
+            u = v + offsets[k]
+            odd = k & 1
+            if (
+                odd
+                and not corners
+                and not max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) < INF
+            ):
+                continue
+            key = _cost_in(crop, box, u // stride, u % stride) + cell_cost[u] * step_length(rule, odd)
+            if key < best:
+                best = key
+                way = k
+        if way < 0 or n == directions.size:
+            return -1
+        directions[n] = way
+        n += 1
+        v += offsets[way]
+    return n

@@ -1,0 +1,173 @@
+"""Growths that stop and go on, and the trees kept of them, beside a Dijkstra that knows nothing of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support import slow_twins as naive
+from support.kernel_oracle import WALLS, unpadded
+from support.planner_strategies import RULES, random_climb, random_pace
+
+from planner_service.goal_trees import GoalTrees
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.partial_growth import PartialGrowth
+from shared_map.terrain.step_climb import Climb
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+
+ROUNDING = 1e-5
+
+
+def loaded(pace: np.ndarray, rules: dict, climb: Climb | None = None) -> CostGrid:
+    ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules), climb)
+    ground.load(pace)
+    return ground
+
+
+def open_cell(rng: np.random.Generator, pace: np.ndarray) -> int:
+    return int(rng.choice(np.flatnonzero(np.isfinite(pace))))
+
+
+def marked(rng: np.random.Generator, pace: np.ndarray, ratio: float) -> Window:
+    """A patch of other ground, walls among it, of cells that stay in the range of paces."""
+    row, col = int(rng.integers(pace.shape[0])), int(rng.integers(pace.shape[1]))
+    patch = pace[row : row + int(rng.integers(1, 4)), col : col + int(rng.integers(1, 4))]
+    patch[:] = random_pace(rng, *patch.shape, ratio, float(rng.choice([0.0, 0.3, 1.0])))
+    return Window(row, col, row + patch.shape[0], col + patch.shape[1])
+
+
+def costs_of(growth: PartialGrowth, pace: np.ndarray) -> np.ndarray:
+    cost = growth.cost.reshape(pace.shape[0] + 2, -1)[1:-1, 1:-1].reshape(-1)
+    return np.where(cost < 0, np.inf, cost)
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: dict) -> None:
+    rng = np.random.default_rng(1)
+    for n in range(60):
+        pace = random_pace(rng, *rng.integers(2, 40, 2), (1.0, 3.0, 40.0, 900.0)[n % 4], WALLS[n % 4])
+        ground, goal = loaded(pace, rules), open_cell(rng, pace)
+        best = naive.cost_to_go(pace, goal, **rules).reshape(-1)
+        growth, bucket = PartialGrowth(ground), ground.lowest_cell_cost
+        growth.begin(ground.pad(goal))
+        farthest = 0.0
+        for _ in range(6):
+            if rng.random() < 0.3:  # a tree that was put down goes on like one in hand
+                growth.resume(growth.cut(), np.inf)
+            asker = open_cell(rng, pace)
+            most = int(rng.choice([1 << 40, 1, 30]))
+            growth.go_on(np.array([ground.pad(asker)]), most)
+            cost = costs_of(growth, pace)
+            has = np.isfinite(cost)
+            assert has.sum() == growth.touched
+            np.testing.assert_allclose(cost[has], best[has], rtol=ROUNDING)
+            left = ~has & np.isfinite(pace.reshape(-1))
+            assert (best[left] >= growth.bound * (1 - ROUNDING)).all()
+            assert has[asker] or most < 1 << 40 or best[asker] == np.inf
+            # It goes no farther than the bucket of the farthest asker.
+            farthest = max(farthest, best[asker])
+            if growth.bound < np.inf:
+                assert growth.bound <= farthest * (1 + ROUNDING) + bucket
+                assert (cost[has] <= growth.bound * (1 + ROUNDING)).all()
+        everywhere = np.flatnonzero(np.isfinite(ground.cell_cost))
+        growth.go_on(everywhere, 1 << 40)
+        np.testing.assert_allclose(costs_of(growth, pace), best, rtol=ROUNDING)
+
+
+def price(pace: np.ndarray, cells: np.ndarray, rules: dict, climb: Climb | None = None) -> float:
+    """Cost of a route, step by step, each of which the rules must allow."""
+    total = 0.0
+    for here, there in zip(cells[:-1].tolist(), cells[1:].tolist(), strict=True):
+        (r0, c0), (r1, c1) = divmod(here, pace.shape[1]), divmod(there, pace.shape[1])
+        slanted = r0 != r1 and c0 != c1
+        assert max(abs(r0 - r1), abs(c0 - c1)) == 1
+        assert np.isfinite(pace[r1, c1])
+        assert not slanted or rules["neighbours"] == 8
+        assert not slanted or rules["corner_cutting"] or np.isfinite([pace[r0, c1], pace[r1, c0]]).all()
+        length = naive.step_length(1 if slanted else 0, rules["edge"])
+        along = 1.0 if climb is None else climb.along(np.array([here]), np.array([there]))[0]
+        total += float(pace[r1, c1]) * length * along
+    return total
+
+
+@pytest.mark.parametrize("kind", ["narrow", "wide", "directed"])
+def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: str) -> None:
+    rng = np.random.default_rng(2)
+    answered = dict.fromkeys(("ok", "growing", "unreachable", "lethal_goal", "lethal_start", "outside", "kept"), 0)
+    for n in range(150 if kind == "narrow" else 25):
+        rules, ratio = RULES[n % 5], {"narrow": (1.3, 6.0, 300.0)[n % 3], "wide": 1e5, "directed": 5.0}[kind]
+        pace = random_pace(rng, *rng.integers(4, 34, 2), ratio, WALLS[n % 4])
+        climb = random_climb(rng, GridSpec(*pace.shape, 1.0), 0.3, 0.9) if kind == "directed" else None
+        ground = loaded(pace, rules, climb)
+        trees = GoalTrees(ground, int(rng.choice([0, 6_000, 1 << 30])))
+        goals = [open_cell(rng, pace) for _ in range(3)]
+        for _ in range(25):
+            if rng.random() < 0.4:
+                trees.changed(ground.apply(pace, [marked(rng, pace, ratio) for _ in range(rng.integers(1, 4))]))
+            if rng.random() < 0.02:
+                trees.forget_all()
+            goal, start = int(rng.choice(goals)), int(rng.integers(-1, pace.size + 1))
+            found = trees.ask(goal, start, int(rng.choice([1, 40, 1 << 40])))
+            answered[found.status] += 1
+            answered["kept"] += found.from_cache
+            assert trees.bytes <= max(trees._budget, 0)
+            assert found.cells[0] == start
+            inside = 0 <= start < pace.size
+            if not inside or not np.isfinite(pace.flat[[goal, start]]).all():
+                expected = ["outside"] if not inside else ["lethal_goal", "lethal_start"]
+                assert found.status in expected
+                assert found.lower_bound_s == np.inf
+                continue
+            best = naive.cost_to_go(pace, goal, **rules, climb=climb).flat[start]
+            assert found.lower_bound_s <= best * (1 + 1e-12)
+            if found.status == "ok":
+                assert found.cells[-1] == goal
+                assert found.cost_s == pytest.approx(price(pace, found.cells, rules, climb), rel=1e-6)
+                assert found.cost_s == pytest.approx(best, rel=ROUNDING)
+                assert found.lower_bound_s >= best * (1 - 10 * ROUNDING)
+            elif found.status == "unreachable":
+                assert best == np.inf
+            else:
+                assert found.status == "growing"
+                assert found.grown_cells > 0
+    unseen = {name for name, count in answered.items() if not count}
+    assert unseen <= ({"growing"} if kind != "narrow" else set()), answered
+
+
+def test_who_asks_again_after_every_slice_is_answered_however_small_the_slices_and_the_cache_are() -> None:
+    pace = random_pace(np.random.default_rng(3), 20, 20, 4.0, 0.1)
+    pace.flat[[0, 19, 399]] = 1.0
+    trees = GoalTrees(loaded(pace, RULES[0]), 10_000)
+    asks = 0
+    left = {(0, 399), (19, 399), (399, 0)}
+    while left:
+        asks += 1
+        assert asks < 3 * pace.size
+        for goal, start in sorted(left):
+            if trees.ask(goal, start, 1).status == "ok":
+                left.remove((goal, start))
+
+
+def test_far_changes_and_dear_ones_beside_the_route_need_no_growth() -> None:
+    pace = np.ones((60, 60), np.float32)
+    ground = loaded(pace, RULES[0])
+    trees = GoalTrees(ground, 1 << 30)
+    goal, start = 30 * 60 + 10, 30 * 60 + 25
+    grown = trees.ask(goal, start, 1 << 40)
+    assert grown.grown_cells < 1_200
+    for window in (Window(50, 50, 60, 60), Window(27, 12, 29, 20)):
+        pace[window.row0 : window.row1, window.col0 : window.col1] = np.inf
+        trees.changed(ground.apply(pace, [window]))
+        again = trees.ask(goal, start, 1 << 40)
+        assert again.from_cache
+        assert again.cells.tolist() == grown.cells.tolist()
+    pace[30, 20] = np.inf
+    trees.changed(ground.apply(pace, [Window(30, 20, 31, 21)]))
+    assert trees.ask(goal, start, 1 << 40).grown_cells > 0
+
+
+def test_cells_of_the_grid_are_what_padded_ones_are() -> None:
+    ground = loaded(np.ones((5, 7), np.float32), RULES[0])
+    found = GoalTrees(ground, 0).ask(0, 34, 100)
+    padded = np.array([ground.pad(int(cell)) for cell in found.cells])
+    np.testing.assert_array_equal(unpadded(ground, padded), found.cells)

@@ -1,0 +1,159 @@
+"""Agents end to end on a simulated network, with a keeper: vehicles that operators send to places."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+from support.agent_world import OPEN, AgentWorld, FakePlaces, pace_of, scenario
+
+from shared_map.keeper.mark_store import KeeperStore
+from swarm.bus.bus import Event, Heard, Replied
+from swarm.wire.messages import Message
+from swarm.wire.messages.orders import GiveOrder, GoalState, GoalStates, SendVehicle, ZoneOrder
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, SEND_VEHICLE, ZONES, Topic
+
+
+class SentWorld(AgentWorld):
+    """Agents, a target, a keeper and a process that plans to places.
+
+    progress  vehicle -> its newest state as its agent has told it
+    """
+
+    def __init__(self, text: str, picture: list[str]) -> None:
+        super().__init__(text, pace_of(picture))
+        self.store = KeeperStore(":memory:")
+        self.keeper("k", self.store)
+        self.places = FakePlaces(self)
+        self.progress: dict[str, GoalState] = {}
+        self.person = self.bus("person")
+        self.person.subscribe(GOAL_STATES, self._told)
+        self.put_target("t", 1, 1)
+        self.start_all()
+        self.until(lambda: len(self.vehicles()) == self.scenario.vehicle_count, within_s=20)
+
+    def _told(self, event: Event) -> None:
+        assert isinstance(event, Heard)
+        assert isinstance(event.message, GoalStates)
+        self.progress.update({each.name: each for each in event.message.states})
+
+    def send(self, vehicle: str, *places: tuple[int, int], **fields: Any) -> None:
+        named = [f"cell:{row},{col}" for row, col in places]
+        self.ask(SEND_VEHICLE, SendVehicle(vehicle=vehicle, places=named, stamp_ns=self.now_ns, **fields))
+
+    def ask(self, topic: Topic, order: Message) -> None:
+        """Gives an order, which the keeper acknowledges."""
+        heard: list[Event] = []
+        if isinstance(order, ZoneOrder):
+            order = replace(order, stamp_ns=self.now_ns)
+        self.person.ask(topic, order, heard.append, tag="o", keeper="k")
+        self.until(lambda: heard, within_s=1)
+        assert isinstance(heard[0], Replied), heard
+
+    def states_of_goals(self) -> Counter[str]:
+        return Counter(each.state for each in self.progress.values())
+
+
+def test_a_vehicle_goes_from_place_to_place_and_then_holds_chases_or_begins_again() -> None:
+    world = SentWorld(scenario(4, [(10, 10), (10, 11), (11, 10), (11, 11)]), OPEN)
+    world.send("a0-00", (3, 15), (15, 15))
+    world.send("a0-01", (15, 3), then="chase")
+    world.send("a1-00", (5, 18), (18, 18), then="repeat")
+    visited: list[tuple[int, int]] = []
+
+    def look() -> None:
+        cell = world.where()["a1-00"]
+        if cell in ((5, 18), (18, 18)) and visited[-1:] != [cell]:
+            visited.append(cell)
+
+    world.after_tick.append(look)
+    world.until(lambda: world.states_of_goals()["completed"] == 2, within_s=60)
+    assert world.where()["a0-00"] == (15, 15)
+    world.run(20)
+    assert world.where()["a0-00"] == (15, 15)
+    assert world.states()["a0-00"] is VehicleState.ARRIVED
+    chasing = {vehicle.id: vehicle.target for vehicle in world.vehicles()}
+    assert chasing["a0-01"] == chasing["a1-01"] == "t"
+    world.until(lambda: len(visited) >= 5, within_s=60)
+    assert visited[:5] == [(5, 18), (18, 18)] * 2 + [(5, 18)]
+    assert world.progress["a1-00"].done >= 4
+    world.send("a0-00", off=True)
+    world.send("a1-00", off=True)
+    world.until(lambda: {vehicle.target for vehicle in world.vehicles()} == {"t"}, within_s=5)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    assert world.states_of_goals() == {"canceled": 2, "completed": 1}
+    world.assert_lawful()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_fifty_vehicles_that_are_sent_to_one_cell_all_get_there(seed: int) -> None:
+    starts = [(2 + n // 10, 5 + n % 10) for n in range(50)]
+    text = scenario(50, starts, per_agent=10).replace("seed = 3", f"seed = {seed}")
+    world = SentWorld(text, OPEN)
+    for vehicle in world.vehicles():
+        world.send(vehicle.id, (14, 10))
+    world.until(lambda: world.states_of_goals() == {"completed": 50}, within_s=240)
+    near = [max(abs(row - 14), abs(col - 10)) for row, col in world.where().values()]
+    assert max(near) <= 4 + 1  # 81 cells within four steps are the first that are fifty or more
+    world.assert_lawful()
+
+
+def test_a_vehicle_that_holds_makes_way_in_a_corridor_and_goes_back() -> None:
+    corridor = ["#" * 21, "#" + "." * 19 + "#", "#" * 10 + "." + "#" * 10, "#" * 21]
+    world = SentWorld(scenario(2, [(1, 3), (1, 5)], per_agent=1, capture=10.0), corridor)
+    world.send("a1-00", (1, 9))
+    world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=30)
+    world.send("a0-00", (1, 17))
+    world.until(lambda: world.states_of_goals() == {"completed": 2}, within_s=120)
+    world.until(lambda: world.where()["a1-00"] == (1, 9), within_s=30)
+    assert world.where()["a0-00"] == (1, 17)
+    world.assert_lawful()
+
+
+def test_a_place_without_a_way_blocks_until_there_is_one_and_a_stop_is_a_standby() -> None:
+    gap = ["." * 20] * 10 + ["#" * 5 + "." + "#" * 14] + ["." * 20] * 9
+    world = SentWorld(scenario(2, [(5, 5), (5, 7)]), gap)
+    zone = ZoneOrder(action="add", name="gap", polygon=[(10, 4), (10, 7), (11, 7), (11, 4)])
+    world.ask(ZONES, zone)
+    world.run(1.0)
+    world.send("a0-00", (15, 5))
+    world.until(lambda: world.states_of_goals() == {"blocked": 1}, within_s=10)
+    assert world.progress["a0-00"].reason == "no way leads there"
+    alarms = world.agents["a0"]._member.alarms
+    assert [(each.kind, each.about) for each in alarms.current()] == [("goal-blocked", "a0-00")]
+    world.ask(ZONES, replace(zone, action="remove", polygon=[]))
+    world.run(0.2)
+    world.places.bus.close()
+    world.places = FakePlaces(world)  # the fake one cannot take marks back
+    world.until(lambda: world.states_of_goals() == {"underway": 1}, within_s=10)
+    world.ask(GIVE_ORDER, GiveOrder(subject="vehicle", name="a0-00", stamp_ns=world.now_ns))
+    world.until(lambda: world.states_of_goals() == {"standby": 1}, within_s=5)
+    world.ask(GIVE_ORDER, GiveOrder(subject="vehicle", name="a0-00", off=True, stamp_ns=world.now_ns))
+    world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=60)
+    assert all(each.over_ns is not None for each in alarms.current())
+    world.assert_lawful()
+
+
+def test_goals_and_progress_survive_the_agent_the_keeper_and_the_planner_of_places() -> None:
+    world = SentWorld(scenario(2, [(5, 5), (5, 7)]), OPEN)
+    world.send("a0-00", (5, 15), (15, 15), (15, 5), then="chase")
+    world.until(lambda: world.progress.get("a0-00") is not None and world.progress["a0-00"].done == 1, within_s=30)
+    world.run(2.0)
+    world.crash_agent("a0")
+    world.kill("k.1")
+    world.keeper("k", world.store, 2)
+    world.run(1.0)
+    world.progress.clear()
+    world.start_agent("a0")
+    world.until(lambda: "a0-00" in world.progress, within_s=10)
+    assert world.progress["a0-00"].done >= 1
+    world.places.bus.close()
+    world.until(lambda: world.states_of_goals()["blocked"] == 1, within_s=60)
+    assert world.progress["a0-00"].reason == "no process plans routes to places"
+    world.places = FakePlaces(world)
+    world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=60)
+    world.until(lambda: all(vehicle.target == "t" for vehicle in world.vehicles()), within_s=10)
+    world.assert_lawful()
