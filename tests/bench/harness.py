@@ -1,8 +1,8 @@
-"""The base of all benchmarks: their command, progress, tables, pictures, pages, JSON, the machine and repetition.
+"""The base of all benchmarks: their command, progress, tables, JSON, the machine and repetition.
 
 A benchmark is a function which measures and returns its figures: values by name, and rows (dictionaries with the
 same names) in lists. `@benchmark` makes a command of it, whose options are the function's parameters, and adds
---json, --write and, where there is a plot, --picture. `BENCHMARKS` says in which module each one is.
+--json. `BENCHMARKS` says in which module each one is.
 """
 
 from __future__ import annotations
@@ -12,15 +12,12 @@ import inspect
 import json
 import os
 import platform
-import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -30,7 +27,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from launch_scripts.observe.run_folder import processor
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 
 BENCHMARKS = {
     "peers": "bench.planning.peers",
@@ -39,13 +36,11 @@ BENCHMARKS = {
     "directed": "bench.planning.directed",
     "start": "bench.planning.cold_start",
     "paper": "bench.planning.strategies",
-    "scale": "bench.planning.strategies",
     "gap": "bench.planning.strategies",
     "certificates": "bench.planning.certificates",
     "pulled": "bench.planning.pulled",
     "air": "bench.planning.air",
     "terrain": "bench.terrain",
-    "presence": "bench.wire.map_work",
     "compaction": "bench.wire.map_work",
     "wire": "bench.wire.beside_zenoh",
     "partition": "bench.wire.partition",
@@ -80,19 +75,6 @@ def _group() -> None:
     """A callback, without which Typer makes a single command of one benchmark."""
 
 
-@dataclass(frozen=True)
-class Lines:
-    """A plot of the report's `rows` on logarithmic axes: a panel per x and y, a line per value of `by`.
-
-    x  axes along; a panel shows the rows whose other axes are those of the report's `base`
-    y  axes up, each with its label
-    """
-
-    x: Sequence[str]
-    y: dict[str, str]
-    by: str
-
-
 def load(names: Iterable[str] = BENCHMARKS) -> typer.Typer:
     """The command group with these benchmarks; those of a module come together."""
     for name in names:
@@ -104,7 +86,6 @@ def benchmark(
     name: str | None = None,
     *,
     columns: Sequence[str] = (),
-    plot: Lines | None = None,
     fails: Sequence[str] = (),
 ) -> Callable[[Callable[..., dict[str, Any]]], Callable[..., dict[str, Any]]]:
     """Makes a command of a function which returns a report.
@@ -115,11 +96,7 @@ def benchmark(
 
     def register(function: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
         @functools.wraps(function)
-        def run(
-            context: typer.Context, as_json: bool, write: Path | None, picture: Path | None = None, **given: Any
-        ) -> None:
-            _check_file("--picture", picture, ".png")
-            _check_file("--write", write, ".md")
+        def run(as_json: bool, **given: Any) -> None:
             with _ending_in_order(), _progress():
                 report = {**function(**given), **machine()}
             tables, notes = list(_tables(report, columns)), report.get("notes", [])
@@ -128,28 +105,14 @@ def benchmark(
                 typer.echo(json.dumps(report, allow_nan=False))
             else:
                 _print(tables, notes, report)
-            if write is not None:
-                heading = str(report.get("heading", title))
-                _replace_section(write, heading, _page_section(_command_line(context), tables, notes, report))
-            if picture is not None and plot is not None:
-                _draw(plot, report, picture)
             if any(report.get(each) for each in fails):
                 raise typer.Exit(1)
 
         title = name or function.__name__
-        extra: dict[str, tuple[Any, Any]] = {
-            "as_json": (Annotated[bool, typer.Option("--json", help="Print one JSON object.")], False),
-            "write": (Annotated[Path | None, typer.Option(help="Put the tables into this page (.md), too.")], None),
-        }
-        if plot is not None:
-            extra["picture"] = (Annotated[Path | None, typer.Option(help="Write a plot (.png), too.")], None)
+        hint = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+        as_json = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=hint)
         signature = inspect.signature(function, eval_str=True)
-        added = [
-            inspect.Parameter(each, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
-            for each, (hint, default) in extra.items()
-        ]
-        added.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
-        signature = signature.replace(parameters=[*signature.parameters.values(), *added], return_annotation=None)
+        signature = signature.replace(parameters=[*signature.parameters.values(), as_json], return_annotation=None)
         run.__signature__ = signature  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in signature.parameters.values()}
         app.command(title)(run)
@@ -275,7 +238,7 @@ def _tables(report: dict[str, Any], columns: Sequence[str]) -> Iterator[tuple[st
                 [key.replace("_", " ") for key in keys],
                 [[_cell(row.get(key)) for key in keys] for row in value],
             )
-        elif name not in ("notes", "heading", *_MACHINE) and value not in ([], {}):
+        elif name not in ("notes", *_MACHINE) and value not in ([], {}):
             plain.append([name.replace("_", " "), _cell(value)])
     if plain:
         yield "", ["", ""], plain
@@ -307,75 +270,4 @@ def _print(tables: Sequence[tuple[str, list[str], list[list[str]]]], notes: Iter
         console.print(table)
     for note in notes:
         console.print(note)
-    console.print(_on_machine(report))
-
-
-def _on_machine(report: dict[str, Any]) -> str:
-    return f"{report['cores']} x {report['machine']}, Python {report['python']}, load {report['load']}."
-
-
-def _page_section(command: str, tables: Any, notes: Iterable[str], report: dict[str, Any]) -> str:
-    parts = [f"`{command}`", _on_machine(report)]
-    for title, headings, cells in tables:
-        lines = [f"| {' | '.join(line)} |" for line in ([each or " " for each in headings], *cells)]
-        lines.insert(1, "|---" * len(headings) + "|")
-        parts += [f"{title[0].upper()}{title[1:]}:", "\n".join(lines)] if title else ["\n".join(lines)]
-    return "\n\n".join([*parts, *notes])
-
-
-def _command_line(context: typer.Context) -> str:
-    """The command with the options that were given, but for those which say where results go."""
-    words = ["./launch_scripts/bench", str(context.info_name)]
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        value = context.params[parameter.name or ""]
-        if source is None or source.name != "COMMANDLINE" or parameter.name in ("as_json", "write", "picture"):
-            continue
-        words += [parameter.opts[0]] if value is True else [parameter.opts[0], f"{value}"]
-    return shlex.join(words)
-
-
-def _replace_section(page: Path, heading: str, text: str) -> None:
-    """Puts the text under the heading of a page: it replaces the old section, or is added at the end. Raises
-    StoreError."""
-    try:
-        whole = page.read_text(encoding="utf-8") if page.exists() else "# Figures\n"
-        before, _, rest = f"{whole.rstrip()}\n".partition(f"\n## {heading}\n")
-        after = rest[rest.index("\n## ") :] if "\n## " in rest else ""
-        page.write_text(f"{before.rstrip()}\n\n## {heading}\n\n{text}\n{after}", encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise StoreError(f"cannot write {page}: {error}") from error
-
-
-def _check_file(option: str, file: Path | None, suffix: str) -> None:
-    """Raises ConfigError now, not after minutes of measuring."""
-    if file is not None and (file.suffix.lower() != suffix or not file.absolute().parent.is_dir()):
-        raise ConfigError(f"{option} is {file}, expected a name that ends in {suffix}, in a folder that is there")
-
-
-def _draw(plot: Lines, report: dict[str, Any], path: Path) -> None:
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    from launch_scripts.observe.palette import STYLE
-
-    base, rows = report["base"], report["rows"]
-    with mpl.rc_context(STYLE):
-        drawn = Figure(figsize=(4.4 * len(plot.x), 4.0 * len(plot.y)), layout="constrained", dpi=150)
-        grid = drawn.subplots(len(plot.y), len(plot.x), squeeze=False, sharey="row")
-        for line, (y, label) in zip(grid, plot.y.items(), strict=True):
-            line[0].set_ylabel(label)
-            for axes, x in zip(line, plot.x, strict=True):
-                others = {name: value for name, value in base.items() if name != x}
-                for kind in dict.fromkeys(row[plot.by] for row in rows):
-                    points = sorted(
-                        (row[x], row[y])
-                        for row in rows
-                        if row[plot.by] == kind and row[y] and all(row[n] == v for n, v in others.items())
-                    )
-                    axes.loglog(*zip(*points, strict=True), "o-", label=kind) if points else None
-                axes.set_xlabel(x)
-                axes.set_title(", ".join(f"{value:,} {name}" for name, value in others.items()))
-        grid[0][0].legend()
-        drawn.suptitle(_on_machine(report), fontsize=9)
-        drawn.savefig(path)
+    console.print(f"{report['cores']} x {report['machine']}, Python {report['python']}, load {report['load']}.")

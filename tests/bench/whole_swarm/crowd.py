@@ -183,7 +183,6 @@ def crowd(
     if cut := sum(each["cut_short"] for each in drives):
         notes.append(f"Not measured to their end: {cut} drives, for each of which {LIMIT_S:g} s of CPU were up.")
     return {
-        "heading": "Crowds",
         "vehicles": vehicles,
         "agents": agents,
         "side": size,

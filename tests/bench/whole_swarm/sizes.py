@@ -191,9 +191,7 @@ def run_sizes(sizes: Sequence[Size], seconds: float, simulated: bool) -> dict[st
     kinds = SIMULATED if simulated else LIVE
     topics = topic_figures(rows)
     report["exponents"] = exponents([*kinds, *topics], [row for row in rows if "failed" not in row])
-    report["heading"] = "Simulation" if simulated else "Live processes"
-    if len(rows) > 1 and len({row["per_agent"] for row in rows}) == 1:
-        report["heading"] += f", {rows[0]['per_agent']} vehicles an agent"
+    report["mode"] = "simulation" if simulated else "live processes"
     plain = [Figure("agents", "agents"), Figure("side", "cells a side")]
     report["shown"] = {
         f"{sizes[0].targets} targets, ticks of {sizes[0].tick_hz:g} Hz, {seconds:g} s measured": lines_of(

@@ -1,85 +1,24 @@
-"""The cost of maps in agents and keepers: presence by the number of vehicles, and a keeper's store by
-incarnations."""
+"""The size of a keeper's store by incarnations of an agent."""
 
 from __future__ import annotations
 
 import math
-from statistics import median
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from support.made_up_swarm import some_fleet
 
-from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
+from bench.harness import Seed, benchmark, track
 from shared_map.keeper.compaction import compact
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from shared_map.vehicle_presence import Presence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.codec import decode, encode
-from swarm.wire.messages.vehicles import Fleet
 
-_PER_AGENT = 25
-_LEASE_NS = 2_000_000_000
 SIDE_CELLS = 512
 WRITES = 100
 CELLS = 24
 SPREAD = 40
-
-
-def fleets(grid: GridSpec, count: int, seed: int) -> list[Fleet]:
-    """`count` vehicles anywhere on the grid, of agents of 25."""
-    rng = np.random.default_rng(seed)
-    reports = []
-    for agent in range(count // _PER_AGENT):
-        rows, cols = rng.integers(0, grid.rows, _PER_AGENT), rng.integers(0, grid.cols, _PER_AGENT)
-        east_m, south_m = (cols + 0.5) * grid.resolution_m, (rows + 0.5) * grid.resolution_m
-        reports.append(some_fleet(f"a{agent}", 0, 1, rows * grid.cols + cols, east_m, south_m, []))
-    return reports
-
-
-def _presence_of(count: int, rounds: int) -> dict[str, float]:
-    """CPU milliseconds of the parts of a tick in which all agents have reported."""
-    grid = GridSpec(1024, 1024, 20.0)
-    said = fleets(grid, count, seed=1)
-    payloads = [encode(fleet) for fleet in said]
-    presence = Presence(_LEASE_NS)
-    seq = 0
-
-    def receive() -> None:
-        nonlocal seq
-        seq += 1
-        for fleet in said:
-            presence.receive(_again(fleet, seq), seq)
-
-    receive()
-    parts = {
-        "decode_ms": lambda: [decode(payload, Fleet) for payload in payloads],
-        "receive_ms": receive,
-        "columns_ms": presence.columns,
-    }
-    return {name: round(median(cpu_ms(part) for _ in range(rounds)), 3) for name, part in parts.items()}
-
-
-def _again(fleet: Fleet, seq: int) -> Fleet:
-    """A copy with another sequence number, as the network delivers it."""
-    return Fleet(**{name: getattr(fleet, name) for name in fleet.__struct_fields__ if name != "seq"}, seq=seq)
-
-
-@benchmark()
-def presence(
-    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, multiples of 25.")] = "1000,5000",
-    rounds: Annotated[int, typer.Option(min=1, help="Ticks; the median counts.")] = 50,
-) -> dict[str, Any]:
-    """CPU time per tick that a searching planner spends on the positions of all other vehicles.
-
-    \b
-    ./launch_scripts/bench presence --vehicles 10000
-    """
-    counts = numbers_of(vehicles, "vehicles", 25)
-    return {"rows": [{"vehicles": count, **_presence_of(count, rounds)} for count in track(counts)]}
 
 
 def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 from bench import harness
-from bench.harness import BENCHMARKS, Lines, benchmark, load
+from bench.harness import BENCHMARKS, benchmark, load
 from bench.isolated import isolated
 from support.benchmarks import bench, run
 
 from swarm.errors import ConfigError, SwarmError
 
-BASE = {"size": 1, "many": 10}
 ROWS = [
     {"size": size, "many": many, "kind": kind, "took_ms": size * many, "left_out": 1}
     for kind in ("a", "b")
@@ -29,16 +27,11 @@ def made(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(harness, "app", typer.Typer())
     harness.app.callback()(lambda: None)
 
-    @benchmark(
-        "made",
-        columns=("kind", "took_ms"),
-        plot=Lines(("size", "many"), {"took_ms": "ms"}, "kind"),
-        fails=("wrong",),
-    )
+    @benchmark("made", columns=("kind", "took_ms"), fails=("wrong",))
     def made(wrong: int = 0) -> dict[str, Any]:
         """Nothing."""
         rows = list(harness.track(ROWS))
-        return {"base": BASE, "rows": rows, "share": 0.123456789, "wrong": wrong, "notes": ["A note."]}
+        return {"rows": rows, "share": 0.123456789, "wrong": wrong, "notes": ["A note."]}
 
 
 def test_each_benchmark_is_listed_and_teaches_with_an_example() -> None:
@@ -67,21 +60,6 @@ def test_a_figure_that_must_be_nothing_is_the_exit_code(made: None) -> None:
     assert run("made", "--wrong", "1").exit_code == 1
 
 
-def test_a_page_gets_the_section_of_the_benchmark_and_keeps_the_others(made: None, tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("# Mine\n\nText.\n\n## made\n\nold\n\n## other\n\nkept\n")
-    run("made", "--wrong", "0", "--write", str(page))
-    text = page.read_text()
-    assert text.startswith("# Mine\n\nText.\n\n## made\n\n`./launch_scripts/bench made --wrong 0`\n")
-    assert text.endswith("\n\n## other\n\nkept\n")
-    assert "old" not in text
-    assert "| a | 20 |" in text
-    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
-    assert all(len({line.count("|") for line in table}) == 1 for table in tables)
-    run("made", "--wrong", "0", "--write", str(page))
-    assert page.read_text() == text
-
-
 def fail() -> None:
     raise ValueError("a reason")
 
@@ -101,13 +79,6 @@ def test_a_process_that_fails_is_told_in_a_sentence() -> None:
         ("gap --strategies best", "--strategies: 'best' is not one of auto, exact, full"),
         ("gap --strategies ,", "--strategies is ','"),
         ("gap --dem maze --vehicles 999999", "--vehicles is 999999; the field has"),
-        ("scale --picture no/such/scale.png", "in a folder that is there"),
-        ("scale --picture scale.pdf", "expected a name that ends in .png"),
-        ("presence --vehicles 24", "--vehicles is '24', expected numbers of at least 25"),
-        ("scale --sizes 0", "--sizes is '0', expected numbers of at least 16"),
-        ("scale --targets many", "--targets is 'many', expected numbers of at least 1"),
-        ("scale --field a.tif", "--field is 'a.tif', expected terrain, uniform, maze"),
-        ("scale --sizes 16 --targets 999 --vehicles 1", "--targets is 999; the field has"),
         ("wire --parts latency,speed", "'speed' is not one of latency, throughput"),
         ("crowd --worlds open,sea", "--worlds: 'sea' is not one of open, doors, corridor, maze"),
         ("crowd --seeds 5", "--seeds: '5' is not A:B"),
@@ -125,7 +96,6 @@ def test_a_process_that_fails_is_told_in_a_sentence() -> None:
         ("swarm --size 20", "--size is 20, expected 32 to 16384"),
         ("swarm --vehicles 1000 --size 40", "--size is 40, expected 64 or more for 1000 vehicles"),
         ("swarm --tick-hz nan", "--tick-hz is nan"),
-        ("swarm --write page.txt", "--write is page.txt, expected a name that ends in .md"),
     ],
 )
 def test_bad_input_is_one_sentence(words: str, complaint: str) -> None:

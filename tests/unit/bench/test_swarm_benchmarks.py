@@ -110,7 +110,7 @@ def test_what_must_not_be_is_named_and_a_series_goes_on_after_a_size_that_fails(
     monkeypatch.setattr(sizes, "measure_live", measure)
     found = sizes.run_sizes([size_of(n) for n in (100, 200, 300, 400, 500)], 1.0, False)
     assert [each["vehicles"] for each in found["rows"]] == [100, 200, 300]
-    assert found["heading"] == "Live processes"
+    assert found["mode"] == "live processes"
     assert found["broken"] == [
         "interrupted",
         "200 vehicles: not measured: it did not come up",
@@ -160,7 +160,7 @@ def test_a_small_crowd_is_driven() -> None:
 
 def test_a_simulated_swarm_is_measured() -> None:
     found = bench("swarm", "--vehicles", "20", "--targets", "2", "--simulated", "--seconds", "2")
-    assert found["heading"] == "Simulation"
+    assert found["mode"] == "simulation"
     [figures] = found["rows"]
     assert figures["simulated_s"] == pytest.approx(2.0)
     assert figures["cpu_all_per_vehicle_ms_per_s"] * 20 == pytest.approx(figures["cpu_all_ms_per_s"])
