@@ -8,7 +8,7 @@ from typing import Literal
 
 import msgspec
 
-from swarm.config.agents import plan_agents
+from swarm.config.agents import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
 from swarm.liveness import ranked_id
 
@@ -88,6 +88,15 @@ TABLE: dict[str, Role] = {
         entry="planner_service.main:run",
         jobs=lambda scenario: scenario.target_ids,
         standbys=lambda scenario: scenario.standbys.planner,
+        stops=2,
+        niceness=5,
+        memory_mib=2048,
+        kernels=True,
+        takes_over="beside",
+    ),
+    "places": Role(
+        entry="planner_service.places.main:run",
+        jobs=places_of,
         stops=2,
         niceness=5,
         memory_mib=2048,

@@ -132,6 +132,12 @@ def needed_kernels(scenario: Scenario) -> NeededKernels:
     return NeededKernels(*_once(first, classes, later))
 
 
+def place_kernels(scenario: Scenario) -> NeededKernels:
+    """Returns the kernels that the process which plans to places calls."""
+    needed = needed_kernels(scenario)
+    return NeededKernels(*_once((*needed.first, *GOALS), needed.classes, ()))
+
+
 def all_kernels() -> list[Kernel]:
     """Returns the kernels of planners on any map, each once: those needed more often come first."""
     return [

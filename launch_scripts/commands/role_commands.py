@@ -118,6 +118,15 @@ def planner(
 
 
 @command(app)
+def places(part: Part) -> None:
+    """Plan routes to any place, for vehicles that are sent somewhere.
+
+    swarm role places jacksboro --connect tcp/127.0.0.1:7447
+    """
+    run_role("places", "all", part)
+
+
+@command(app)
 def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part) -> None:
     """Drive the vehicles of one agent process.
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, cast
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.world.walks import WAY_MODULES
-from planner_service.kernel_build import needed_kernels
+from planner_service.kernel_build import needed_kernels, place_kernels
 from planner_service.kernels.compile import load
+from planner_service.places.service import PlacesService
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
@@ -74,6 +75,10 @@ def built(
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
             return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
+        case "places":
+            for kernel in place_kernels(setup.scenario):
+                load(kernel)
+            return PlacesService(setup, terrain, bus, post, boundary.function("kernels of classes", None, bool))
         case "targets":
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)

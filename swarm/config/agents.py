@@ -55,8 +55,14 @@ def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
         ("keeper", "0"),
         *(("targets", ranked_id("0", rank)) for rank in range(standbys.targets + 1)),
         *(("planner", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in scenario.target_ids),
+        *(("places", id) for id in places_of(scenario)),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]
+
+
+def places_of(scenario: Scenario) -> list[str]:
+    """Ids of the processes that plan routes to places."""
+    return ["all"] if scenario.planner.places else []
 
 
 def agent_of(vehicle: str) -> str:

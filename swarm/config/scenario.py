@@ -172,6 +172,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     push_s            newer routes are pushed to a vehicle at most this often
     routes            grid: vehicles drive from the middle of a cell to that of a neighbour; pulled: straight from
                       cell to distant cell, where that is no slower. With `cost.directional` only flights are
+    places            whether a process plans routes to any place, for vehicles that are sent somewhere
     """
 
     strategy: Annotated[str, plugin_name(Strategy)] = "auto"
@@ -185,6 +186,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
     push_s: Positive = 1.0
     routes: Literal["grid", "pulled"] = "grid"
+    places: bool = False
 
 
 class StandbyConfig(Section, frozen=True, kw_only=True):

@@ -21,8 +21,8 @@ from swarm.liveness import ranked_id
 from swarm.right_of_way.guest_session import GuestService
 from swarm.right_of_way.incarnations import MemoryLives
 from swarm.runtime.order_book import OrderBook
-from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
-from swarm.wire.topics import GIVE_ORDER, ZONES
+from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder
+from swarm.wire.topics import GIVE_ORDER, SEND_VEHICLE, ZONES
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
 
@@ -54,7 +54,7 @@ class OrderedSimulation(Simulation):
     def __init__(self, scenario: Scenario, **options: Any) -> None:
         super().__init__(scenario, **options)
         self.book = OrderBook()
-        self.refused: list[tuple[float, GiveOrder | ZoneOrder, str | None]] = []
+        self.refused: list[tuple[float, GiveOrder | SendVehicle | ZoneOrder, str | None]] = []
         self._operator = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
         self._orders_given = 0
 
@@ -65,11 +65,11 @@ class OrderedSimulation(Simulation):
         node.boot()
         return node
 
-    def order(self, at_s: float, order: GiveOrder | ZoneOrder) -> None:
+    def order(self, at_s: float, order: GiveOrder | SendVehicle | ZoneOrder) -> None:
         """An operator gives an order then. A target that is added gets a planner, as a launcher would start it."""
         self.at(at_s, partial(self.give, order))
 
-    def give(self, order: GiveOrder | ZoneOrder) -> None:
+    def give(self, order: GiveOrder | SendVehicle | ZoneOrder) -> None:
         """An operator gives an order now."""
         self._orders_given += 1
 
@@ -81,7 +81,7 @@ class OrderedSimulation(Simulation):
                 case AskEnded(replies=0, failure=failure):
                     self.refused.append((self.now_s, order, failure))
 
-        topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
+        topic = {ZoneOrder: ZONES, SendVehicle: SEND_VEHICLE}.get(type(order), GIVE_ORDER)
         order = replace(
             order, stamp_ns=self.scheduler.clock.now_ns() + self._orders_given
         )  # several may be given at once

@@ -1,0 +1,109 @@
+"""A fleet of twenty real vehicles with different goals: processes are killed, and all vehicles get there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.live_swarm import LiveSwarm, running
+from support.live_swarm import swarm as command
+from support.processes import eventually
+
+from swarm.client import connect
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+FLEET = """
+name = "fleet"
+seed = 3
+seconds = 300
+time_scale = 10
+
+[terrain]
+source = "synthetic"
+rows = 96
+cols = 128
+resolution_m = 30
+relief_m = 300
+roads = 4
+
+[[targets]]
+walk = "still"
+
+[[groups]]
+vehicles = 20
+
+[vehicles]
+per_agent = 10
+
+[planner]
+places = true
+
+[network]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
+
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[LiveSwarm]:
+    with running(tmp_path, "--no-live", text=FLEET) as fleet:
+        yield fleet
+
+
+def status(live: LiveSwarm) -> dict[str, Any]:
+    """The output of `swarm status`; empty while no process answers."""
+    done = command("status", "--connect", live.endpoint, "--json")
+    found: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
+    return found
+
+
+def test_twenty_vehicles_get_to_twenty_places_though_their_agent_and_the_planner_of_places_are_killed(
+    fleet: LiveSwarm,
+) -> None:
+    with connect(fleet.endpoint) as swarm, swarm.observer() as seen:
+        eventually(lambda: len(seen.vehicles) == 20, 60, "all vehicles")
+        frame, orders = swarm.frame, swarm.orders()
+
+        def cells() -> dict[str, int]:
+            return {id: frame.cell(each.x_m, each.y_m) for id, each in seen.vehicles.items()}
+
+        assert orders.pause().silent == []
+        eventually(lambda: cells() == (time.sleep(1.0) or cells()), 30, "a halt")  # type: ignore[func-returns-value]
+        began = cells()
+        ids = sorted(began)
+        # Each goes to where another one has been, so that there is a way.
+        goals = {id: began[ids[(n + 7) % 20]] for n, id in enumerate(ids)}
+        done = command(
+            "order", "vehicle", "send", ids[0], "cell:{},{}".format(*frame.grid.row_col(goals[ids[0]])),
+            "--connect", fleet.endpoint,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "1 processes obey" in done.stdout
+        for id in ids[1:]:
+            assert orders.send(id, ["cell:{},{}".format(*frame.grid.row_col(goals[id]))]).silent == []
+        for name in ("agent-a0", "places-all"):
+            os.kill(fleet.pid_of(name), signal.SIGKILL)
+            eventually(lambda name=name: fleet.said(f"{name}: killed"), 20, "its end")  # type: ignore[misc]
+        assert orders.resume().silent == []
+
+        def all_there() -> bool:
+            goals_now = status(fleet).get("goals", [])
+            return len(goals_now) == 20 and all(each["state"] == "completed" for each in goals_now)
+
+        eventually(all_there, 120, "all vehicles at their places")
+        assert cells() == goals
+        assert {each.target for each in seen.vehicles.values()} == {None}
+        orders.recall(ids[3])
+        eventually(lambda: seen.vehicles[ids[3]].target == "t", 20, "the chase of a vehicle that was recalled")
+        assert len([each for each in orders.goals() if not each.off]) == 19
