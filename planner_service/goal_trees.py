@@ -271,8 +271,7 @@ class GoalTrees:
         if kept is not None and self._growth.root >= 0:
             kept.tree = self._growth.cut()
             self.bytes += _bytes(kept.tree)
-        self._growth.forget()
-        self._evict()
+            self._evict()
 
     def _drop(self, goal: int) -> None:
         kept = self._kept.pop(goal, None)
