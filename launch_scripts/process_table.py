@@ -97,6 +97,7 @@ TABLE: dict[str, Role] = {
     "places": Role(
         entry="planner_service.places.main:run",
         jobs=places_of,
+        standbys=lambda scenario: scenario.standbys.planner,
         stops=2,
         niceness=5,
         memory_mib=2048,

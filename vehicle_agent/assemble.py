@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.mark_filter import MarkFilter, author_of, readable_groups
+from shared_map.replication.mark_filter import MarkFilter, author_of
 from shared_map.replication.regions_of_interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
@@ -17,7 +17,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Bus, Post
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AgentPlan, plan_agents
+from swarm.config.agents import AgentPlan, plan_agents, readable_groups
 from swarm.config.plugin_names import assignment_key
 from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.errors import ConfigError

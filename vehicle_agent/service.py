@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
+from swarm.config.agents import place_job
 from swarm.liveness import Roster, job_of
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
@@ -462,7 +463,11 @@ class AgentService:
                         vehicle_class=self._class,
                     )
                     self._member.ask_by_name(
-                        PLACE_ROUTE, place, tag=f"{_ROUTES}{request}", timeout_s=self._answer_s
+                        PLACE_ROUTE,
+                        place,
+                        tag=f"{_ROUTES}{request}",
+                        timeout_s=self._answer_s,
+                        places=place_job(self._setup.scenario, self.agent.plan.group.name),
                     )
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
                     self.counters.count("reroute_requests", reroutes)

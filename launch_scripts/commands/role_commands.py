@@ -118,12 +118,17 @@ def planner(
 
 
 @command(app)
-def places(part: Part) -> None:
-    """Plan routes to any place, for vehicles that are sent somewhere.
+def places(
+    group: Annotated[str, typer.Option(autocompletion=complete.group_names)], part: Part, rank: Rank = 0
+) -> None:
+    """Plan between any two places for the vehicles of a group, or stand by (`planner.places`).
 
-    swarm role places jacksboro --connect tcp/127.0.0.1:7447
+    swarm role places my.toml --group all
+
+    group  The group whose vehicles ask, as the scenario names it.
+    rank   0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
-    run_role("places", "all", part)
+    run_role("places", ranked_id(group, rank), part)
 
 
 @command(app)

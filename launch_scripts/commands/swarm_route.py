@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -24,9 +25,16 @@ from swarm.runtime.operator import replies_to
 from swarm.wire.access import OPERATOR
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlaceRouteReply,
+    PlaceRouteRequest,
+    RouteReply,
+    RouteRequest,
+)
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
-from swarm.wire.topics import COST, NAMELESS, ROUTE, asker_of
+from swarm.wire.topics import COST, NAMELESS, PLACE_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -106,12 +114,37 @@ def ask_planner(
     if not replies and failure is None:  # no planner, or an earlier version
         replies, failure = replies_to(bus, NAMELESS[topic.name], request, _TIMEOUT_S, target=target)
     took_ms = (time.monotonic() - began_s) * 1e3
+    return _answered(replies, failure, frame, cell, took_ms, f"no planner of target {target!r} answers {where}")
+
+
+def ask_places(
+    bus: Bus, where: object, start: Place, goal: Place, *, steps: int, vehicle_class: str = GROUND
+) -> Answer:
+    """Asks for the route between two places. Raises BusError or ConfigError in one sentence."""
+    frame = frame_of_run(bus, where)
+    cell, to = cell_of(start, frame, "--from"), cell_of(goal, frame, "--to")
+    request = PlaceRouteRequest(to=to, cells=[cell], max_cells=steps, vehicle_class=vehicle_class)
+    began_s = time.monotonic()
+    while True:
+        replies, failure = replies_to(bus, PLACE_ROUTE, request, _TIMEOUT_S, asker=asker_of(OPERATOR, "command"))
+        took_s = time.monotonic() - began_s
+        found = [reply for reply in replies if isinstance(reply, PlaceRouteReply)]
+        if took_s > _TIMEOUT_S or not any(reply.status == "growing" for reply in found):
+            break
+    told = [reply.to_target("place", frame.grid.rows, frame.grid.cols) for reply in found]
+    missing = f"no process plans between places for {where}: set planner.places = true in its scenario"
+    return _answered(told, failure, frame, cell, took_s * 1e3, missing)
+
+
+def _answered(
+    replies: Sequence[object], failure: str | None, frame: MapFrame, cell: int, took_ms: float, missing: str
+) -> Answer:
     for reply in replies:
         if isinstance(reply, RouteReply | CostReply):
             return Answer(reply, frame, cell, took_ms)
     if failure is not None and failure != "timeout":
         raise ConfigError(failure)
-    raise BusError(f"no planner of target {target!r} answers {where}")
+    raise BusError(missing)
 
 
 def as_json(answer: Answer) -> str:

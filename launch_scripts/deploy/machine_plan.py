@@ -178,7 +178,7 @@ def _processes(scenario: Scenario, hosts: HostsConfig) -> list[PlannedProcess]:
     }
     named = [(role, str(n)) for role, numbers in ids.items() for n in numbers]
     named += [(spec.role, spec.id) for spec in processes_of(scenario, tuple(carried - ids.keys()))]
-    cores = {**_CORES, "planner": scenario.planner.cpu_budget}
+    cores = {**_CORES, "planner": scenario.planner.cpu_budget, "places": scenario.planner.cpu_budget}
     return [
         PlannedProcess(
             role=role,

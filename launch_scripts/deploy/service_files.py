@@ -111,6 +111,7 @@ def _words(process: PlannedProcess, run_id: str) -> list[str]:
     job, rank = split_rank(process.id)
     which = {
         "planner": ["--target", job, "--rank", str(rank)],
+        "places": ["--group", job, "--rank", str(rank)],
         "targets": ["--rank", str(rank)],
         "monitor": [],
     }.get(process.role, ["--id", process.id])

@@ -76,9 +76,11 @@ def built(
                 load(kernel)
             return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
         case "places":
+            worker = boundary.worker(outside.worker)
+            of_places: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
-            return PlacesService(setup, terrain, bus, post, boundary.function("kernels of classes", None, bool))
+            return PlacesService(setup, terrain, bus, post, worker, of_places)
         case "targets":
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)
@@ -275,4 +277,8 @@ class Node:
 
 
 def _tick_hz(role: str, scenario: Scenario) -> float:
-    return {"planner": scenario.planner.tick_hz, "agent": scenario.vehicles.tick_hz}.get(role, 10.0)
+    return {
+        "planner": scenario.planner.tick_hz,
+        "places": scenario.planner.tick_hz,
+        "agent": scenario.vehicles.tick_hz,
+    }.get(role, 10.0)

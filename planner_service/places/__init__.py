@@ -1,6 +1,5 @@
-"""Routes to any place: one process for all vehicles that are sent somewhere.
+"""Routes between any two places, for all vehicles that are sent somewhere and for all others that ask.
 
-The service answers from trees that are kept by goal and class (`goal_trees`). A growth goes on for some cells with
-each question, and the answer says so while it is not done: the asker comes again, and the loop never waits. A cache
-is no state, so a new life begins with an empty one.
+The service answers from trees that are kept by goal and class (`goal_trees`). A worker grows them beside the loop,
+a slice of cells at a time, and askers take turns. A cache is no state, so a new life begins with an empty one.
 """

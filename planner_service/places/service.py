@@ -1,71 +1,169 @@
-"""The shell of routes to places: questions from the bus to the trees of their class, and answers back."""
+"""The shell of `places`: routes between any two cells of the map, for groups that share their marks.
+
+A place is a goal without a process of its own: its tree is grown as far as somebody asks and is kept for the next
+(`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
+changes, and the asker that has paid least is next. Nothing here must outlive the process: the one that takes over
+grows again when asked.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planner_service.goal_trees import GoalAnswer, GoalTrees
+from planner_service.planner import MOST_ROUTES, MOST_STEPS
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.cost_map import CostMap
-from shared_map.replication.mark_filter import MarkFilter, readable_groups
+from shared_map.learning.learned_factors import LearnedGauges
+from shared_map.replication.mark_filter import MarkFilter
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from shared_map.vehicle_class_maps import ClassMaps
-from swarm.bus.bus import Asked, Bus, Event, Post
+from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
+from swarm.clock import NS_PER_S
+from swarm.config.agents import place_job, plan_agents, readable_groups
 from swarm.config.explain import choice
-from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, class_numbers
+from swarm.grid import GridSpec
+from swarm.liveness import job_of
+from swarm.runtime.election import Candidacy
+from swarm.runtime.fair_queue import FairQueue
 from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest
-from swarm.wire.route_columns import Route, RouteBatch, RouteStatus, directions_of
-from swarm.wire.topics import PLACE_ROUTE, is_own
+from swarm.wire.route_columns import LETHAL_START, NO_TARGET, OK, OUTSIDE, UNREACHABLE, RouteBatch, directions_of
+from swarm.wire.topics import PLACE_ROUTE, asker_of, is_own
 
-_BUDGET_BYTES = 256 << 20
-"""Trees of all classes that are kept, besides one in hand of each class."""
-_AT_ONCE_CELLS = 1 << 17
-"""Cells grown between two ticks, some 3 ms; later questions wait."""
-_MOST_ROUTES = 1000
-_MOST_HELD = 4096
+log = logging.getLogger(__name__)
+
+TREES_BYTES = 256 << 20
+"""What the trees of a class that are kept may take."""
+SLICE_CELLS = 1 << 16
+"""Cells that are grown before others have their turn: 1 to 4 ms."""
+_MOST_WAITING, _MOST_EACH = 4096, 256
+"""Questions that wait, of all askers and of one. Of more the oldest are refused."""
+_HOLD_NS = NS_PER_S
+"""A question waits so long at most for its growth; then it is answered as far as it is known."""
+_CELL_NS = 25
+"""Time that a simulation counts for a cell grown."""
 _STATUSES = {
-    "ok": RouteStatus.OK,
-    "growing": RouteStatus.NO_TARGET,
-    "unreachable": RouteStatus.UNREACHABLE,
-    "lethal_goal": RouteStatus.UNREACHABLE,
-    "lethal_start": RouteStatus.LETHAL_START,
-    "outside": RouteStatus.OUTSIDE,
-}
-"""Status of an answer -> status of its route; a vehicle asks again after NO_TARGET."""
+    "ok": OK, "unreachable": UNREACHABLE, "outside": OUTSIDE, "lethal_start": LETHAL_START,
+    "lethal_goal": UNREACHABLE, "growing": NO_TARGET,
+}  # fmt: skip
+
+
+@dataclass(slots=True, eq=False)
+class _Question:
+    """A question, and as much of its answer as is known."""
+
+    event: Asked
+    request: PlaceRouteRequest
+    asked_ns: int
+    found: list[GoalAnswer] = field(default_factory=list)
+    rests: list[float] = field(default_factory=list)
+    """s, what remains after the steps of each route that are given."""
+
+    @property
+    def done(self) -> bool:
+        return len(self.found) == len(self.request.cells)
 
 
 class _ClassTrees:
-    """The trees of one class on its map."""
+    """The map of one class of vehicles, and the trees on it."""
 
-    def __init__(self, scenario: Scenario, cost_map: CostMap, budget_bytes: int) -> None:
-        self._map = cost_map
-        self._costs = CostGrid(cost_map.grid, scenario.planner, cost_map.terrain.climb)
+    def __init__(self, cost_map: CostMap, costs: CostGrid) -> None:
+        self.cost_map = cost_map
+        self._costs = costs
         cost_map.take_dirty()
-        self._costs.load(cost_map.pace_s_per_m)
-        self.trees = GoalTrees(self._costs, budget_bytes)
+        costs.load(cost_map.pace_s_per_m)
+        self.map_version = cost_map.version
+        self.trees = GoalTrees(costs, TREES_BYTES)
 
     def keep_up(self) -> None:
-        """Takes what has changed in the map."""
-        if dirty := self._map.take_dirty():
-            self.trees.changed(self._costs.apply(self._map.pace_s_per_m, dirty))
+        """Takes the changes of the map. Not beside a growth."""
+        if self.cost_map.dirty:
+            self.trees.changed(self._costs.apply(self.cost_map.pace_s_per_m, self.cost_map.take_dirty()))
+        self.map_version = self.cost_map.version
+
+    def work(self, question: _Question) -> int:
+        """Answers as much of a question as a slice of cells gives. Returns the cells that it has grown."""
+        request, grown = question.request, 0
+        while not question.done and grown < SLICE_CELLS:
+            start = request.cells[len(question.found)]
+            answer = self.trees.ask(request.to, start, SLICE_CELLS - grown)
+            grown += answer.grown_cells
+            if answer.status == "growing":
+                break
+            question.found.append(answer)
+            rest = 0.0
+            if 0 < request.max_cells < answer.cells.size - 1:
+                rest = self.trees.ask(request.to, int(answer.cells[request.max_cells]), SLICE_CELLS).cost_s
+            question.rests.append(rest)
+        return grown
+
+    def reply(self, question: _Question, incarnation: int) -> PlaceRouteReply:
+        """The answer as it is known. Cells that are still to be reached have the status NO_TARGET."""
+        request, found = question.request, question.found
+        status = "ok" if question.done else "growing"
+        if any(each.status == "lethal_goal" for each in found):
+            status = "lethal_goal"
+        elif not 0 <= request.to < self._costs.grid.cells:
+            status = "outside_goal"
+        known = _batch(found, request.cells, question.rests, request.max_cells, self._costs)
+        return PlaceRouteReply(
+            to_cell=request.to,
+            incarnation=incarnation,
+            map_version=self.map_version,
+            routes=known.columns(),
+            status=status,  # type: ignore[arg-type]
+            vehicle_class=request.vehicle_class,
+        )
+
+
+def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], most: int, costs: CostGrid) -> RouteBatch:
+    """The routes of some answers, cut after `most` steps if that is not 0."""
+    grid: GridSpec = costs.grid
+    most = min(most or MOST_STEPS, MOST_STEPS // max(len(found), 1))
+    codes = [directions_of(each.cells[: most + 1], grid.cols) for each in found]
+    codes += [b""] * (len(cells) - len(found))
+    unknown = len(cells) - len(found)
+    lengths = [_length_m(each, costs) for each in codes]
+
+    def column(values: list[float], rest: float) -> NDArray[np.float64]:
+        return np.array([*values, *[rest] * unknown], np.float64)
+
+    return RouteBatch(
+        np.array([*(_STATUSES[each.status] for each in found), *[NO_TARGET] * unknown], np.uint8),
+        np.array(cells, np.int64),
+        np.frombuffer(b"".join(codes), np.uint8),
+        np.cumsum([len(each) for each in codes], dtype=np.int64),
+        column([each.cost_s for each in found], math.inf),
+        column([each.lower_bound_s if each.status == "ok" else 0.0 for each in found], 0.0),
+        np.array(lengths, np.float64),
+        column(rests, 0.0),
+    )
+
+
+def _length_m(codes: bytes, costs: CostGrid) -> float:
+    diagonal = sum(code & 1 for code in codes)
+    return float((len(codes) - diagonal + diagonal * costs.diagonal) * costs.grid.resolution_m)
 
 
 class PlacesService:
-    """Serves routes from any cell to any other.
+    """Serves routes between any two cells. The process is named after the first group that it serves.
 
-    class_kernels  whether the kernels for all classes may be called, not only those of "ground"
+    kernels  whether those of all classes may be called by now, not only of "ground"; if not given, they may
     """
 
     def __init__(
@@ -74,23 +172,30 @@ class PlacesService:
         terrain: Terrain,
         bus: Bus,
         post: Post,
-        class_kernels: Callable[[], bool] | None = None,
+        worker: Worker,
+        kernels: Callable[[], bool] | None = None,
     ) -> None:
         scenario = setup.scenario
-        self._scenario, self._id, self._incarnation = scenario, setup.id, setup.incarnation
-        self._bus, self._post = bus, post
-        self._class_kernels = class_kernels or (lambda: True)
+        self._scenario, self._job, self._incarnation = scenario, job_of(setup.id), setup.incarnation
+        self._bus, self._post, self._worker = bus, post, worker
+        self._kernels = kernels or (lambda: True)
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
-        cost_map = CostMap(terrain, learning=scenario.map.learning)
-        self._maps = ClassMaps(cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
-        self.replica = MapReplica(terrain.grid, self._maps, filter=MarkFilter(terrain.grid, read_by_all(scenario)))
-        self._sync = MapSync(self.replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        self._classes: dict[str, _ClassTrees] = {}
+        self._cost_map = CostMap(terrain, learning=scenario.map.learning)
+        filter = MarkFilter(terrain.grid, readable_groups(scenario, self._job))
+        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
+        self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        self._learned = LearnedGauges(self._cost_map.keys, self.counters)
         self._obedience = OrderClient(setup, bus, post, self._obeys)
-        self._held: deque[Asked] = deque()
-        self._now_ns = self._left = 0
-        for name in ("place_routes", "place_cells_grown"):
+        self._classes: dict[str, _ClassTrees] = {}
+        self._waiting: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
+        self._at_work: _Question | None = None
+        """The question of which the worker has a slice."""
+        self._leads = False
+        self._now_ns = 0
+        for name in ("place_routes", "place_cells_grown", "place_questions_refused"):
             self.counters.count(name, 0)
         self._member.needs("the shared map", lambda: self._sync.joined)
 
@@ -101,110 +206,125 @@ class PlacesService:
         self._member.join()
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
-        self._bus.serve(PLACE_ROUTE, self._post, undecoded=True, places=self._id)
+        self._candidacy.start()
+        self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, Asked) and isinstance(event.request, PlaceRouteRequest):
-            if len(self._held) >= _MOST_HELD:
-                event.refuse(f"{_MOST_HELD} questions wait here already: ask again in a second")
-                event.end()
-            else:
-                self._held.append(event)
-                self._answer()
-        elif not self._member.on_member_event(event):
-            any(handle(event, now_ns) for handle in (self._sync.on_map_event, self._obedience.on_order_event))
+        self._now_ns = now_ns
+        match event:
+            case Asked(request=PlaceRouteRequest() as request):
+                self._take(event, request, now_ns)
+            case WorkDone(result=int() as grown):
+                self._worked(grown, now_ns)
+            case _ if not self._member.on_member_event(event):
+                handlers = (
+                    self._sync.on_map_event,
+                    self._candidacy.on_election_event,
+                    self._obedience.on_order_event,
+                )
+                any(handle(event, now_ns) for handle in handlers)
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
         self._sync.tick(now_ns)
-        for trees in self._classes.values():
-            trees.keep_up()
-        self._obedience.tick(now_ns)
-        self._left = _AT_ONCE_CELLS
-        self._answer()
+        self._learned.tick(self._cost_map.factors)
+        self._lead(self._candidacy.tick(not self.lacks(), now_ns), now_ns)
+        self.counters.gauge("places_waiting", float(len(self._waiting)))
         self.counters.gauge("place_trees", float(sum(each.trees.trees for each in self._classes.values())))
         self.counters.gauge("place_bytes", float(sum(each.trees.bytes for each in self._classes.values())))
+        self._obedience.tick(now_ns)
+        self._go_on()
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._candidacy.stop()
+        while (question := self._waiting.take()) is not None:
+            self._refuse(question.event, "the process ends")
         self._member.publish_stats(now_ns)
 
-    def _answer(self) -> None:
-        """Answers waiting questions as far as a tick has time to grow trees; agents come first."""
-        while self._held and self._left > 0:
-            at = next((n for n, asked in enumerate(self._held) if is_own(asked.asker)), 0)
-            asked = self._held[at]
-            del self._held[at]
-            if not asked.expired:
-                assert isinstance(asked.request, PlaceRouteRequest)
-                reply = self._reply(asked.request)
-                if isinstance(reply, str):
-                    asked.refuse(reply)
-                else:
-                    asked.answer(reply, places=self._id)
-            asked.end()
+    def _lead(self, leads: bool, now_ns: int) -> None:
+        if leads == self._leads:
+            return
+        self._leads = leads
+        if leads:
+            self._bus.serve(PLACE_ROUTE, self._post, undecoded=True, places=self._job)
+        else:
+            self._bus.unserve(PLACE_ROUTE, places=self._job)
+        self._candidacy.tell(self._member, now_ns)
 
-    def _reply(self, request: PlaceRouteRequest) -> PlaceRouteReply | str:
+    # --- questions ----------------------------------------------------------------------------------------------
+
+    def _take(self, event: Asked, request: PlaceRouteRequest, now_ns: int) -> None:
         name = request.vehicle_class
-        if name not in self._classes:
+        if name != GROUND and name not in self._maps.of:
             known = [GROUND, *self._maps.of]
-            if name not in known:
-                return f"there is no class {name!r}{choice(name, known, ' there are ')}"
-            if name != GROUND and not self._class_kernels():
-                return f"the kernels for class {name} are still being compiled"
-            cost_map = self._maps.common if name == GROUND else self._maps.of[name]
-            self._classes[name] = _ClassTrees(self._scenario, cost_map, _BUDGET_BYTES // len(known))
-        if len(request.cells) > _MOST_ROUTES:
-            return f"{len(request.cells)} routes at once, at most {_MOST_ROUTES}: ask in parts"
-        trees = self._classes[name].trees
-        answers = []
-        for cell in request.cells:
-            answers.append(trees.ask(request.to, cell, max(self._left, 1)))
-            self._left -= answers[-1].grown_cells
-        self.counters.count("place_routes", len(answers))
-        self.counters.count("place_cells_grown", sum(each.grown_cells for each in answers))
-        statuses = {each.status for each in answers}
-        inside = 0 <= request.to < self.replica.grid.cells
-        status = "growing" if "growing" in statuses else "lethal_goal" if "lethal_goal" in statuses else "ok"
-        return PlaceRouteReply(
-            to_cell=request.to,
-            incarnation=self._incarnation,
-            map_version=self._maps.common.version,
-            routes=RouteBatch.of(
-                [self._route(trees, request, *each) for each in zip(request.cells, answers, strict=True)]
-            ).columns(),
-            status=status if inside else "outside_goal",  # type: ignore[arg-type]
-            vehicle_class=name,
-        )
+            self._refuse(event, f"there is no class {name!r}{choice(name, known, ' there are ')}")
+        elif (other := self._foreign(event.asker)) is not None:
+            self._refuse(event, f"{event.asker} is of group {other}: ask its own places")
+        elif len(request.cells) > MOST_ROUTES:
+            self._refuse(event, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
+        elif name != GROUND and not self._kernels():
+            self._refuse(event, f"the kernels for class {name} are still being compiled")
+        else:
+            self._wait(_Question(event, request, now_ns), self._price(request))
+            self._go_on()
 
-    def _route(self, trees: GoalTrees, request: PlaceRouteRequest, start: int, answer: GoalAnswer) -> Route:
-        if answer.status != "ok":
-            return Route(status=_STATUSES[answer.status], start=start)
-        cells, rest_s = answer.cells, 0.0
-        if 0 < request.max_cells < len(cells) - 1:
-            cells = cells[: request.max_cells + 1]
-            rest_s = trees.ask(request.to, int(cells[-1]), 1).cost_s
-        if not math.isfinite(rest_s):
-            cells, rest_s = answer.cells, 0.0
-        codes = directions_of(cells, self.replica.grid.cols)
-        steps = np.where(np.frombuffer(codes, np.uint8) & 1, math.sqrt(2.0), 1.0)
-        return Route(
-            status=RouteStatus.OK,
-            start=start,
-            directions=codes,
-            cost_s=answer.cost_s,
-            lower_bound_s=answer.lower_bound_s,
-            length_m=float(steps.sum()) * self.replica.grid.resolution_m,
-            remaining_s=rest_s,
-        )
+    def _foreign(self, asker: str) -> str | None:
+        """The group of an agent which may not know what this process knows; None of all others. Routers hold the
+        name of an asker against its certificate."""
+        groups = (plan.group.name for plan in plan_agents(self._scenario) if asker == asker_of("agent", plan.id))
+        group = next(groups, None)
+        return None if group is None or place_job(self._scenario, group) == self._job else group
+
+    def _wait(self, question: _Question, price: int) -> None:
+        asker = question.event.asker
+        dropped = self._waiting.put(asker, question, price=price, rank=0 if is_own(asker) else 1)
+        if dropped is not None:
+            self._refuse(dropped.event, "too many questions wait: ask again later")
+
+    def _price(self, request: PlaceRouteRequest) -> int:
+        """Cells that a slice of an answer will grow at most: three times the square of the way there."""
+        cols = self._cost_map.grid.cols
+        row, col = divmod(request.to, cols)
+        away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
+        return min(3 * max(away, default=0) ** 2, SLICE_CELLS) + len(request.cells) + 1
+
+    def _go_on(self) -> None:
+        """Gives the worker the next slice, if it has none."""
+        if self._at_work is None and (question := self._waiting.take()) is not None:
+            trees = self._trees(question.request.vehicle_class)
+            trees.keep_up()
+            self._at_work = question
+            self._worker.submit("places", partial(trees.work, question), self._post, SLICE_CELLS * _CELL_NS)
+
+    def _trees(self, name: str) -> _ClassTrees:
+        trees = self._classes.get(name)
+        if trees is None:
+            cost_map = self._cost_map if name == GROUND else self._maps.of[name]
+            costs = CostGrid(cost_map.grid, self._scenario.planner, cost_map.terrain.climb)
+            trees = self._classes[name] = _ClassTrees(cost_map, costs)
+            log.info("places of %s: trees for the class %s", self._job, name)
+        return trees
+
+    def _worked(self, grown: int, now_ns: int) -> None:
+        question, self._at_work = self._at_work, None
+        if question is None:
+            return
+        self.counters.count("place_cells_grown", grown)
+        if question.done or now_ns - question.asked_ns >= _HOLD_NS:
+            trees = self._trees(question.request.vehicle_class)
+            question.event.answer(trees.reply(question, self._incarnation), places=self._job)
+            question.event.end()
+            self.counters.count("place_routes", len(question.found))
+        else:
+            self._wait(question, self._price(question.request))
+        self._go_on()
 
     def _obeys(self, order: Obey) -> bool:
         """A zone is obeyed once the map has it: the next question finds it in the trees."""
         return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
 
-
-def read_by_all(scenario: Scenario) -> frozenset[str] | None:
-    """The groups whose marks every group takes in: routes to places tell no group what it must not know. None if
-    that is all groups."""
-    readable = [found for group in scenario.groups if (found := readable_groups(scenario, group.name)) is not None]
-    return frozenset.intersection(*readable) if readable else None
+    def _refuse(self, event: Asked, reason: str) -> None:
+        self.counters.count("place_questions_refused")
+        event.refuse(reason)
+        event.end()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 from shared_map.replication.tiles import beyond_tile, of_all_classes, region_tiles
+from swarm.config.agents import readable_groups
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import RESERVED_GROUP
 from swarm.grid import GridSpec
@@ -20,19 +21,6 @@ def author_of(group: str, name: str) -> str:
     name  of the process and its incarnation
     """
     return f"{group}.{name}"
-
-
-def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
-    """The groups whose marks and positions a group takes in: its own, and those that it reads and that write to it.
-    None if that is all groups."""
-    groups = {each.name: each for each in scenario.groups}
-    mine = groups[group]
-    heard = {
-        other.name
-        for other in scenario.groups
-        if other.name == group or (_names(mine.reads, other.name) and _names(other.writes, group))
-    }
-    return None if heard == groups.keys() else frozenset(heard)
 
 
 def readable_for_target(
@@ -55,10 +43,6 @@ def readable_for_target(
                 return None
             heard |= readable
     return frozenset(heard)
-
-
-def _names(listed: Sequence[str], group: str) -> bool:
-    return "*" in listed or group in listed
 
 
 class MarkFilter:

@@ -43,6 +43,7 @@ class Bearer:
     def own(self, field: str) -> str:
         """Required value of a key's field where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
+        own["places"] = job_of(self.id)
         own["asker"] = asker_of(self.role, self.id)
         return own.get(field, self.id)
 

@@ -18,6 +18,7 @@ from swarm.client.terrain_frame import Frame
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
+from swarm.places import Given
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.planning import GROUND, POSE_LEASE_S
 from swarm.wire.messages.processes import RunInfo
@@ -169,6 +170,29 @@ class Swarm:
         Its failure is a BusError. Raises ConfigError on a place outside the terrain.
         """
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
+
+    def route(
+        self,
+        start: Given,
+        goal: Given,
+        *,
+        vehicle_class: str = GROUND,
+        vehicle: str = "client",
+        timeout_s: float = 5.0,
+    ) -> Route:
+        """The best route between any two places, if the scenario has `planner.places`.
+
+        start, goal  (lat, lon) in degrees, or texts such as "cell:40,200"
+        vehicle      the vehicle that asks; with certificates, the name in the certificate
+
+        Raises BusError if no process answers, ConfigError on a place outside the terrain.
+        """
+        from_cell, to_cell = self.frame.cell_named(start), self.frame.cell_named(goal)
+        asked = self._session.ask_place(to_cell, from_cell, vehicle_class, timeout_s, vehicle)
+        reply = self._session.answers(asked, timeout_s)[0]
+        grid = self.frame.grid
+        told = reply.to_target("place", grid.rows, grid.cols)
+        return Route.of(self.frame, told.routes[0], told)
 
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... For the user of the swarm, or with certificates

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 
 from swarm.config.scenario import GroupConfig, Scenario
@@ -55,14 +57,39 @@ def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
         ("keeper", "0"),
         *(("targets", ranked_id("0", rank)) for rank in range(standbys.targets + 1)),
         *(("planner", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in scenario.target_ids),
-        *(("places", id) for id in places_of(scenario)),
+        *(("places", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in places_of(scenario)),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]
 
 
 def places_of(scenario: Scenario) -> list[str]:
-    """Ids of the processes that plan routes to places."""
-    return ["all"] if scenario.planner.places else []
+    """The processes that plan between any two places: one for all groups which read the marks of the same groups,
+    named after the first of them."""
+    served = dict.fromkeys(place_job(scenario, group.name) for group in scenario.groups)
+    return list(served) if scenario.planner.places else []
+
+
+def place_job(scenario: Scenario, group: str) -> str:
+    """The one of these processes which serves a group: it has marks of no other groups than the group reads."""
+    reads = readable_groups(scenario, group)
+    return next(each.name for each in scenario.groups if readable_groups(scenario, each.name) == reads)
+
+
+def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
+    """The groups whose marks and positions a group takes in: its own, and those that it reads and that write to it.
+    None if that is all groups."""
+    groups = {each.name: each for each in scenario.groups}
+    mine = groups[group]
+    heard = {
+        other.name
+        for other in scenario.groups
+        if other.name == group or (_names(mine.reads, other.name) and _names(other.writes, group))
+    }
+    return None if heard == groups.keys() else frozenset(heard)
+
+
+def _names(listed: Sequence[str], group: str) -> bool:
+    return "*" in listed or group in listed
 
 
 def agent_of(vehicle: str) -> str:

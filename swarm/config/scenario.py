@@ -192,7 +192,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 class StandbyConfig(Section, frozen=True, kw_only=True):
     """Processes that stand by: as many as said keep up with each one that leads, and take over when it is dead.
 
-    planner  standbys of each target's planner; each costs as much as that planner
+    planner  standbys of each target's planner, and of `places`; each costs as much as that process
     targets  standbys of the process that moves the targets
     """
 

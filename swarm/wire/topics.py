@@ -362,7 +362,7 @@ BELIEVED = Topic(
 LEAD = Topic(
     "lead", "lead/{role}/{id}", processes.Beat, "which of the processes with one job are ready, and which leads",
     "10 Hz, where there are standbys",
-    access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
+    access(put="planner:role,id places:role,id targets:role,id", hear="planner places targets monitor"),
     priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
