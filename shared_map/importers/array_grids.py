@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats
-from shared_map.importers.raster_files import BAD_ARCHIVE
+from shared_map.importers.raster_files import LONGEST_REASON
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
@@ -91,7 +91,7 @@ def read_npz(path: Path) -> PlainGrid:
     heights = heights.astype(np.float32)
     try:
         numbers = {name: float(array) for name, array in arrays.items() if name not in ("elevation", "photo")}
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise TerrainError(f"terrain {path}: its cell size is no single number: {error}") from error
     for name in {"resolution_m", "dx", "dy"} & numbers.keys():
         check_step(numbers[name], path)
@@ -116,19 +116,21 @@ def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
     try:
-        with _ShortReads(path) as file, zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            wanted = {name: members[name] for name in _NPZ_ARRAYS if name in members}
-            total = sum(info.file_size for info in wanted.values())
+        with _ShortReads(path) as file, np.load(file, max_header_size=_HEADER_BYTES) as archive:
+            wanted = [name for name in _NPZ_ARRAYS if name in archive.files]
+            total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in wanted)
             if total > kind.most_bytes:
                 most = size(kind.most_bytes)
                 raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
-            held = ", ".join(name[:40] for name in sorted(members)[:_SHOWN_MEMBERS])
-            return {name: _array(archive, info) for name, info in wanted.items()}, held or "nothing"
+            held = ", ".join(name[:40] for name in sorted(archive.files)[:_SHOWN_MEMBERS])
+            return {name: archive[name] for name in wanted}, held or "nothing"
+    except TerrainError:
+        raise
     except OSError as error:
         raise kind.unreadable(path, error) from error
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {error}") from error
+    except Exception as error:  # of damaged headers numpy raises whatever it runs into
+        why = str(error).partition("\n")[0][:LONGEST_REASON]
+        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {why}") from error
 
 
 class _ShortReads(io.FileIO):
@@ -139,30 +141,6 @@ class _ShortReads(io.FileIO):
         if count is not None and count > _MOST_TABLE_BYTES:
             raise zipfile.BadZipFile(f"its table of contents has {size(count)}")
         return super().read(-1 if count is None else count) or b""
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """A member, whose header is looked at before memory is taken. Raises ValueError, or what zipfile raises."""
-    with archive.open(info) as file:
-        try:
-            first = np.lib.format.read_magic(file) == (1, 0)
-            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-            shape, in_columns, dtype = read(file, max_header_size=_HEADER_BYTES)
-        except BAD_ARCHIVE:
-            raise
-        except Exception as error:  # of damaged headers numpy raises whatever their evaluation runs into
-            raise ValueError("its header is none of numpy's") from error
-        if dtype.kind not in "iufb" or dtype.itemsize > 8:
-            raise ValueError(f"it holds {str(dtype)[:40]!r}; expected numbers of at most 8 bytes")
-        cells, has = math.prod(shape), info.file_size - file.tell()
-        if cells > 3 * MAX_CELLS:
-            raise ValueError(f"its header says {' x '.join(map(str, shape))}; at most {MAX_CELLS} cells are read")
-        if cells * dtype.itemsize != has:
-            raise ValueError(
-                f"its header promises {size(cells * dtype.itemsize)} of numbers, and it has {size(max(has, 0))}"
-            )
-        # The remainder is read, at the end of which the checksum is compared.
-        return np.frombuffer(file.read(), dtype).reshape(shape, order="F" if in_columns else "C")
 
 
 # --- maps without heights -----------------------------------------------------------------------------------

@@ -81,7 +81,8 @@ def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
         ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected numbers in two dimensions"),
         ({"elevation": np.ones((3, 3))}, "does not say how large a cell is; set terrain.resolution_m"),
         ({"elevation": np.ones((3, 3)), "resolution_m": -1.0}, "must be positive"),
-        ({"elevation": np.array([["a", "b"]])}, "of numbers"),
+        ({"elevation": np.array([["a", "b"]])}, "expected numbers"),
+        ({"elevation": np.ones((3, 3)), "resolution_m": "a"}, "its cell size is no single number"),
     ):
         np.savez(path, **arrays)
         with pytest.raises(TerrainError, match=words):
