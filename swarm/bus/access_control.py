@@ -10,11 +10,13 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from swarm.config.setting_types import RESERVED_GROUPS
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
+from swarm.wire.access import MEMBERS, ROLES, Grant
 from swarm.wire.fields import check_id
-from swarm.wire.topics import ALIVE_KEY, TOPICS
+from swarm.wire.messages.map_data import KEEPERS
+from swarm.wire.topics import ALIVE_KEY, TOPICS, asker_of
 
 ROUTER = "router"
 _EVERYTHING = (
@@ -29,7 +31,8 @@ class Bearer:
     """The name to which a certificate was issued.
 
     name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
-    author  what its ids as an author begin with: the group and id of an agent or rover, else the id
+    author  what its ids as an author begin with: the group and id of an agent or rover, of a keeper "keeper" and
+            its id, else the id
     """
 
     name: str
@@ -40,6 +43,7 @@ class Bearer:
     def own(self, field: str) -> str:
         """Required value of a key's field where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
+        own["asker"] = asker_of(self.role, self.id)
         return own.get(field, self.id)
 
 
@@ -57,10 +61,13 @@ def bearer(name: str) -> Bearer:
             f"{name!r} is no name of a process: write ROLE.ID or agent.GROUP.ID, such as planner.t0; the roles are"
             f" {roles}"
         )
-    if role == "agent" and group.split(".")[0] == OPERATOR:
+    first = author.split(".")[0]
+    if role in ("agent", "rover") and first in RESERVED_GROUPS:
         raise ConfigError(
-            f"{name!r} is no name of a process: no group is called {OPERATOR!r}, as zones are its marks"
+            f"{name!r} is no name of a process: no group is called {first!r}, as {RESERVED_GROUPS[first]}"
         )
+    if role == "keeper":
+        return Bearer(name, role, author, f"{KEEPERS}.{author}")
     return Bearer(name, role, id if role in ("agent", "rover") else author, author)
 
 

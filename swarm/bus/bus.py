@@ -28,7 +28,7 @@ from typing import Protocol, TypeVar
 
 from swarm.liveness import Peer
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import NO_ASKER, Topic
 
 TIMEOUT_PARAMETER = "timeout_s"
 """Parameter of a query on the wire: how many seconds its asker waits."""
@@ -64,6 +64,10 @@ class Question:
     __slots__ = ()
     topic: Topic
     answerer: Answerer
+    asker: str
+    """Name of the asker, as its key says; "" if the key names none."""
+    size: int
+    """Bytes of the request, if it is not decoded yet."""
 
     @property
     def timeout_s(self) -> float:
@@ -101,11 +105,17 @@ class Asked(Question):
     fields: Mapping[str, str]
     request: Message
     answerer: Answerer
+    size = 0
+
+    @property
+    def asker(self) -> str:  # type: ignore[override]
+        return asker_in(self.fields)
 
     def answer(self, message: Message, **fields: str | int) -> None:
-        """Sends one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
-        among those asked for is not sent. Raises RuntimeError after `end`."""
-        self.answerer.answer(message, fields)
+        """Sends one reply. `fields` complete the key where `serve` left wildcards, beside the asker; a reply whose
+        key is not among those asked for is not sent. Raises RuntimeError after `end`."""
+        asker = {"asker": self.asker or NO_ASKER} if "asker" in self.topic.fields else {}
+        self.answerer.answer(message, {**asker, **fields})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +128,14 @@ class Undecoded(Question):
     topic: Topic
     answerer: Answerer
     decoded: Callable[[], Asked | None]
+    asker: str = ""
+    size: int = 0
+
+
+def asker_in(fields: Mapping[str, str]) -> str:
+    """The asker that the fields of a key name; "" if they name none."""
+    asker = fields.get("asker", "")
+    return "" if asker == "*" else asker
 
 
 @dataclass(frozen=True, slots=True)

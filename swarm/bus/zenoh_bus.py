@@ -31,6 +31,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
     Undecoded,
+    asker_in,
     check_subscription,
 )
 from swarm.bus.endpoints import listening, wait_for_router, why_not_listening, why_unreachable
@@ -95,6 +96,11 @@ class ZenohAnswerer:
         # A tool may ask with `**`, which no key template parses: all that we serve is meant.
         asked = topic.parse(self._bus.namespace, key) or {**dict.fromkeys(topic.fields, "*"), **self._concrete}
         return Asked(topic, asked, request, self)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        return len(self._asked)
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
@@ -301,7 +307,8 @@ class ZenohBus:
 
         def leave(query: zenoh.Query) -> None:
             answerer = ZenohAnswerer(self, topic, concrete, query)
-            post(Undecoded(topic, answerer, answerer.decoded))
+            asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+            post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
 
         expression = topic.expression(self._namespace, **fields)
         arrivals = Arrivals(_QUERY_BUFFER)

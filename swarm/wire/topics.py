@@ -35,6 +35,7 @@ class Topic:
     access     which roles may put, serve, ask and hear it
     request    for a queryable: the query; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
+    costly     for a queryable: askers take turns, by the field `asker` of the key; agents come before all others
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
     newest     each value carries the whole state of its key, so a reader may skip to the newest
@@ -51,6 +52,7 @@ class Topic:
     access: Access
     request: type[Message] | None = None
     bulk: type[Message] | None = None
+    costly: bool = False
     published: bool = True
     trusted: bool = False
     newest: bool = True
@@ -275,14 +277,26 @@ BODY = Topic(
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 ROUTE = Topic(
-    "route", "target/{target}/route", planning.RouteReply, "routes from cells to the target", "asked",
-    access(serve="planner:target", ask="agent rover"),
-    request=planning.RouteRequest, published=False,
+    "route", "target/{target}/route/{asker}", planning.RouteReply, "routes from cells to the target", "asked",
+    access(serve="planner:target", ask="agent:asker rover:asker"),
+    request=planning.RouteRequest, published=False, costly=True,
 )  # fmt: skip
 COST = Topic(
-    "cost", "target/{target}/cost", planning.CostReply, "cost-to-go of a batch of cells", "asked",
+    "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
+    access(serve="planner:target", ask="agent:asker targets:asker monitor:asker rover:asker"),
+    request=planning.CostRequest, published=False, costly=True,
+)  # fmt: skip
+NAMELESS_ROUTE = Topic(
+    "nameless-route", "target/{target}/route", planning.RouteReply,
+    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
+    access(serve="planner:target", ask="agent rover"),
+    request=planning.RouteRequest, published=False, costly=True,
+)  # fmt: skip
+NAMELESS_COST = Topic(
+    "nameless-cost", "target/{target}/cost", planning.CostReply,
+    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
     access(serve="planner:target", ask="agent targets monitor rover"),
-    request=planning.CostRequest, published=False,
+    request=planning.CostRequest, published=False, costly=True,
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", planning.PlannerStatus, "how a planner is doing", "2 Hz",
@@ -336,13 +350,32 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
-    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, BELIEVED, LEAD, ZONES,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST,
+    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
 """Liveliness tokens, one per process, which raises no other than its own. All roles may watch them."""
 _TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64})/([0-9]{1,19})")
+
+
+NAMELESS = {ROUTE.name: NAMELESS_ROUTE, COST.name: NAMELESS_COST}
+"""Topic -> the one of the same questions without the name of an asker."""
+NAMED_SINCE = 9
+"""Wire version from which on planners answer questions with the name of an asker."""
+NO_ASKER = "-"
+"""In the key of an answer, the asker of a question under many names."""
+
+
+def asker_of(role: str, id: str) -> str:
+    """The name under which a process asks."""
+    return f"{role}.{id}"
+
+
+def is_own(asker: str) -> bool:
+    """Returns True if an asker is an agent of the run: its questions come before those of others."""
+    return asker.startswith("agent.")
 
 
 def peer_of(key: str) -> Peer:

@@ -61,6 +61,10 @@ FORBIDDEN = [
     ("agent", "serve", "run/agent/zz"),
     ("agent", "serve", "run/keeper/0"),
     ("agent", "serve", "target/t0/route"),
+    ("agent", "ask", "target/t0/route/agent.a1"),
+    ("agent", "ask", "target/t0/cost/rover.a0"),
+    ("agent", "ask", "target/t0/route/*"),
+    ("rover", "ask", "target/t0/cost/agent.r1"),
     ("agent", "hear", "vehicle/a1/*/route"),
     ("agent", "hear", "**"),
     ("agent", "raise", "alive/agent/zz/1"),
@@ -146,6 +150,7 @@ def allows(who: Bearer | None, topic: Topic, operation: str, key: str) -> bool:
     for grant in getattr(topic.access, operation):
         if grant.role == who.role:
             own = {"role": who.role, "author": f"{who.author}.1", "target": who.id.removesuffix(".r1")}
+            own["asker"] = f"{who.role}.{who.id}"
             return all(fields[field] == own.get(field, who.id) for field in grant.own)
     return False
 

@@ -41,7 +41,7 @@ from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import COST, GIVE_ORDER, OBEYED, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
@@ -149,7 +149,7 @@ def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
         event.answer(reply)
         event.end()
 
-    bus.serve(COST, post, target="t0")
+    bus.serve(NAMELESS_COST, post, target="t0")
 
 
 def test_any_zenoh_session_gets_a_readable_answer(world):
@@ -197,11 +197,11 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
 def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     planner, inbox, answers = world.bus("planner"), Inbox(), Box()
     before = threading.enumerate()
-    planner.serve(COST, inbox.post, undecoded=True, target="t0")
+    planner.serve(NAMELESS_COST, inbox.post, undecoded=True, target="t0")
     assert threading.enumerate() == before
     a, stranger = world.bus("a"), world.bus("stranger").session
     world.settle()
-    a.ask(COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
+    a.ask(NAMELESS_COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
     question = inbox.take(2.0)
     assert isinstance(question, Asked)
     assert (question.request, question.fields, question.timeout_s) == (
@@ -209,7 +209,7 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     )
     question.refuse("not now")
     question.end()
-    world.until(lambda: answers == [AskEnded("q", COST, 0, "not now")])
+    world.until(lambda: answers == [AskEnded("q", NAMELESS_COST, 0, "not now")])
     for selector, payload, complaint in (
         ("swarm/target/t0/cost", b"garbage", b"cost: "),
         ("swarm/target/t0/cost?timeout_s=never", encode(CostRequest(cells=[3])), b"not a positive number"),
@@ -219,7 +219,7 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
         (reply,) = replies
         assert complaint in reply.err.payload.to_bytes()
     assert planner.counts["payloads_dropped"] == 2
-    planner.unserve(COST, target="t0")
+    planner.unserve(NAMELESS_COST, target="t0")
     world.settle()
     assert list(stranger.get("swarm/target/t0/cost", timeout=1.0)) == []
     assert inbox.take(0) is None
@@ -411,7 +411,7 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
         "batch": lambda: b.subscribe(POSE, broken, together=True),
         "query": lambda: b.serve(RUN, broken, role="agent", id="b"),
         "reply": lambda: b.ask(RUN, Nothing(), broken, tag="q"),
-        "end": lambda: b.ask(COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),
+        "end": lambda: b.ask(NAMELESS_COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),
         "token": lambda: b.watch_alive(broken),
         "link": lambda: b.watch_links(broken),
     }[what]
@@ -496,7 +496,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
         event.answer(reply)
         event.end()
 
-    a.serve(COST, answer, target="t0")
+    a.serve(NAMELESS_COST, answer, target="t0")
     world.settle()
 
     def get(text: str):
@@ -508,7 +508,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
     assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [7.5]
     assert heard[0].request == CostRequest(row=4, col=2)
     wrong = get('{"rwo": 4}').err.payload.to_string()
-    assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
+    assert wrong == "nameless-cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1
 
 
