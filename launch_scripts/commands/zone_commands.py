@@ -123,7 +123,7 @@ def list_zones(where: Where, as_json: AsJson = False) -> None:
 
     swarm order zone ls
     """
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         zones, frame = Operator(bus).zones(), frame_of_run(bus, where)
     if as_json:
         typer.echo(json.dumps(_fields(zones, frame), indent=2))
@@ -139,7 +139,7 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         frame = frame_of_run(bus, where)
         given = [Operator(bus).zone(order) for order in list(orders_on(frame))]
     zones = given[-1][0]

@@ -66,9 +66,9 @@ def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
 def why_not_listening(error: Exception) -> str:
     """Returns the reason why no process can listen there, from the library's message."""
     found = _OS_ERROR.search(str(error))
-    if found is None:
+    number = error.errno if isinstance(error, OSError) else int(found[1]) if found is not None else None
+    if number is None:
         return "the network library refuses; its own words are in the log (is the port taken?)"
-    number = int(found[1])
     hint = _HINTS.get(number)
     return os.strerror(number) + (f" ({hint})" if hint else "")
 

@@ -86,6 +86,8 @@ class ZenohAnswerer:
         try:
             if self._fault is not None:
                 raise self._fault
+            if query.payload is None and topic.trusted and intake.authenticator is not None:
+                raise ProtocolError("its fields are no payload, which alone a code can cover")
             intake.check(topic, key, query, self._asked)
             request = intake.request(topic.request, query, self._asked, self._parameters)
         except ProtocolError as error:
@@ -188,7 +190,6 @@ class ZenohBus:
     def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
         self._session = session
         self._namespace = namespace
-        self.authenticator = authenticator
         self.intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
@@ -212,6 +213,15 @@ class ZenohBus:
     @property
     def counts(self) -> Mapping[str, int]:
         return self.intake.counts
+
+    @property
+    def authenticator(self) -> Authenticator | None:
+        """Signs messages on trusted topics, and checks them."""
+        return self.intake.authenticator
+
+    def trust(self, authenticator: Authenticator | None) -> None:
+        """Signs and checks from now on: a client learns only from the swarm which run it is."""
+        self.intake.authenticator = authenticator
 
     @property
     def closed(self) -> bool:

@@ -143,12 +143,13 @@ _LOGGED_KEYS = 10_000
 class Intake:
     """The messages of one session, of any topic below its namespace. Any thread may use it.
 
-    counts  of messages and bytes both ways, and of payloads that were dropped
+    authenticator  of the run; None: no code is checked
+    counts         of messages and bytes both ways, and of payloads that were dropped
     """
 
     def __init__(self, namespace: str, authenticator: Authenticator | None) -> None:
         self._namespace = namespace
-        self._authenticator = authenticator
+        self.authenticator = authenticator
         self.counts = new_counts()
         self._counting = threading.Lock()
         """Held to add to `counts`."""
@@ -216,7 +217,7 @@ class Intake:
     def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
         """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
         if topic.trusted:
-            check_code(self._authenticator, attached(carrier), topic, key, payload, asked)
+            check_code(self.authenticator, attached(carrier), topic, key, payload, asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""

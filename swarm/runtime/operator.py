@@ -11,6 +11,8 @@ import threading
 import time
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
+
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.errors import BusError, ConfigError
 from swarm.liveness import Roster, job_of
@@ -94,7 +96,7 @@ class Operator:
         """
         members = self._members()
         keeper, began_s = self._keeper(members), time.monotonic()
-        reply = self._order(GIVE_ORDER, order, keeper)
+        reply = self._order(GIVE_ORDER, replace(order, stamp_ns=time.time_ns()), keeper)
         assert isinstance(reply, Orders)
         given = reply.given
         assert given is not None
@@ -122,7 +124,7 @@ class Operator:
         return keepers[0]
 
     def _order_zone(self, order: ZoneOrder, keeper: str) -> Zones:
-        reply = self._order(ZONES, order, keeper)
+        reply = self._order(ZONES, replace(order, stamp_ns=time.time_ns()), keeper)
         assert isinstance(reply, Zones)
         return reply
 

@@ -50,6 +50,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     lasts_s       after so long the zone ends by itself; without it never
     vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
+    stamp_ns      when it was given, as in `GiveOrder`
     """
 
     action: Literal["add", "remove", "list"] = "list"
@@ -61,6 +62,12 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     lasts_s: _Seconds | None = None
     corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
     vehicle_class: Id | None = None
+    stamp_ns: StampNs = 0
+
+    @property
+    def changes(self) -> bool:
+        """True if it asks for more than a list."""
+        return self.action != "list"
 
     def relate(self) -> None:
         if self.name and _ZONE_NAME.fullmatch(self.name) is None:
@@ -166,6 +173,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     row, col  instead of a cell
     at        a place instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     new       the target must not be there yet; otherwise it must
+    stamp_ns  when it was given: where codes authenticate orders, an order counts once, and for a minute
     """
 
     subject: Subject | None = None
@@ -180,6 +188,12 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     speed_m_per_s: _Speed = _SPEED_M_PER_S
     new: bool = False
     at: PlaceText = ""
+    stamp_ns: StampNs = 0
+
+    @property
+    def changes(self) -> bool:
+        """True if it asks for more than the orders in force."""
+        return self.subject is not None
 
     def relate(self) -> None:
         if self.name:
