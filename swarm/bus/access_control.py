@@ -81,6 +81,18 @@ def common_name(name: str, revoked: Collection[str]) -> str:
     return candidate
 
 
+def patterned(key: str) -> str:
+    """A key expression of a subscription or queryable, so that it begins with a wildcard: routers number no part of
+    such a one, and so can confuse none (docs/design/misrouted-keys.md). It also matches in each namespace which
+    ends as that of the key: its owner compares the namespace of what comes."""
+    return f"$*{key}"
+
+
+def _declared(keys: list[str]) -> list[str]:
+    """Key expressions which a process may declare in order to hear or serve these: as they are, and patterned."""
+    return keys + [patterned(key) for key in keys]
+
+
 def access_control(namespace: str, names: Iterable[str], revoked: Collection[str] = ()) -> dict[str, Any]:
     """Returns the value of a router's `access_control`: each name may do what the table of topics grants to its
     role, and any other name is denied everything. Links over tcp/ have no names; they stay open, as
@@ -88,7 +100,8 @@ def access_control(namespace: str, names: Iterable[str], revoked: Collection[str
 
     revoked  common names that are denied everything from now on
     """
-    rules = [_rule("everything", flow, _EVERYTHING, [f"{namespace}/**"]) for flow in ("ingress", "egress")]
+    all_keys = _declared([f"{namespace}/**"])
+    rules = [_rule("everything", flow, _EVERYTHING, all_keys) for flow in ("ingress", "egress")]
     everything = [rule["id"] for rule in rules]
     subjects: list[dict[str, Any]] = [{"id": _LOOPBACK, "link_protocols": ["tcp"]}]
     policies = [{"rules": everything, "subjects": [_LOOPBACK]}]
@@ -116,11 +129,12 @@ def _rules(namespace: str, who: Bearer) -> list[dict[str, Any]]:
     wide = {name: list(_keys(namespace, who, name, own=False)) for name in ("serve", "ask")}
     rows = (
         ("ingress", ("put",), table["put"]),
-        ("ingress", ("declare_queryable", "reply"), table["serve"]),
+        ("ingress", ("declare_queryable",), _declared(table["serve"])),
+        ("ingress", ("reply",), table["serve"]),
         ("ingress", ("query",), table["ask"]),
-        ("ingress", ("declare_subscriber",), table["hear"]),
+        ("ingress", ("declare_subscriber",), _declared(table["hear"])),
         ("ingress", ("liveliness_token",), [token] if who.role in MEMBERS.split() else []),
-        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), [tokens]),
+        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), _declared([tokens])),
         ("egress", ("put",), table["hear"]),
         ("egress", ("query",), wide["serve"]),
         ("egress", ("reply",), wide["ask"]),

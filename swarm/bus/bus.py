@@ -16,6 +16,8 @@ Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has n
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
             logged once per key and minute, and never posted. A message on a trusted topic without the run's code is
             rejected, too, if the bus has an `Authenticator`; such a query is refused.
+Misrouting  A payload that names another key than the one under which it came is never posted, and is counted apart
+            (`payloads_misrouted`). A query that names another key is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
             caller.
 """
@@ -26,7 +28,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
+from swarm.errors import ProtocolError
 from swarm.liveness import Peer
+from swarm.wire.meant import MisroutedError
 from swarm.wire.messages import Message
 from swarm.wire.topics import NO_ASKER, Topic
 
@@ -241,9 +245,15 @@ def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], hear: Callable[[S]
 
 
 def new_counts() -> dict[str, int]:
-    """Returns the counters of a bus: messages, the bytes of their payloads, and dropped payloads. Keys, codes and
-    what the network adds are not in the bytes."""
-    return {"messages_out": 0, "messages_in": 0, "bytes_out": 0, "bytes_in": 0, "payloads_dropped": 0}
+    """Returns the counters of a bus: messages, the bytes of their payloads, dropped and misrouted payloads. Keys,
+    codes and what the network adds are not in the bytes."""
+    names = ("messages_out", "messages_in", "bytes_out", "bytes_in", "payloads_dropped", "payloads_misrouted")
+    return dict.fromkeys(names, 0)
+
+
+def counter_of(error: ProtocolError) -> str:
+    """Returns the counter of a payload which is rejected for this reason."""
+    return "payloads_misrouted" if isinstance(error, MisroutedError) else "payloads_dropped"
 
 
 class Bus(Protocol):

@@ -18,6 +18,7 @@ from typing import Any
 
 import zenoh
 
+from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
@@ -51,6 +52,7 @@ from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
+from swarm.wire.meant import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
@@ -80,7 +82,6 @@ class ZenohAnswerer:
         """Returns the query, decoded; None if it is rejected, which ends the query."""
         intake, topic, query = self._bus.intake, self._topic, self._query
         assert query is not None
-        assert topic.request is not None
         key = str(query.key_expr)
         intake.received(self._asked)
         try:
@@ -88,8 +89,7 @@ class ZenohAnswerer:
                 raise self._fault
             if query.payload is None and topic.trusted and intake.authenticator is not None:
                 raise ProtocolError("its fields are no payload, which alone a code can cover")
-            intake.check(topic, key, query, self._asked)
-            request = intake.request(topic.request, query, self._asked, self._parameters)
+            request = intake.request(topic, query, self._asked, self._parameters)
         except ProtocolError as error:
             intake.drop(key, error)
             self.refuse(f"{topic.name}: {error}")
@@ -116,7 +116,8 @@ class ZenohAnswerer:
         key = topic.keyed(bus.namespace, **{**self._concrete, **fields})
         if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        payload = encode_json(message) if self._as_json else encode(message)
+        below = bus.intake.below(key)
+        payload = encode_json(message, below) if self._as_json else meant_for(below, encode(message))
         bus.intake.sent(payload)
         if self._as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
@@ -241,7 +242,8 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self.closed:
             return
-        key, payload = topic.keyed(self._namespace, **fields), encode(message)
+        below = topic.value(fields)[1]
+        key, payload = f"{self._namespace}/{below}", meant_for(below, encode(message))
         self.intake.sent(payload)
         self._session.put(
             key,
@@ -294,13 +296,17 @@ class ZenohBus:
         return self.intake.together(topic, samples) if samples else []
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
+        subscribers = self._subscribers.pop(self._pattern(topic, fields), ())
         collecting = self._collecting.get(topic.name, ())
         self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
         self._undeclare_all(subscribers)
 
+    def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:
+        """The key expression of a subscription or queryable."""
+        return patterned(topic.expression(self._namespace, **fields))
+
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
@@ -311,18 +317,18 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            asked = ZenohAnswerer(self, topic, concrete, query).decoded()
-            if asked is not None:
+            answerer = ZenohAnswerer(self, topic, concrete, query)
+            if not self.intake.concerns(query):
+                answerer.end()
+            elif undecoded:
+                asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+                post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
+            elif (asked := answerer.decoded()) is not None:
                 post(asked)
 
-        def leave(query: zenoh.Query) -> None:
-            answerer = ZenohAnswerer(self, topic, concrete, query)
-            asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
-            post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
-
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         arrivals = Arrivals(_QUERY_BUFFER)
-        into = zenoh.handlers.Callback(guarded(leave), indirect=False) if undecoded else _into(arrivals)
+        into = zenoh.handlers.Callback(guarded(arrive), indirect=False) if undecoded else _into(arrivals)
         queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
         if undecoded:
@@ -331,7 +337,7 @@ class ZenohBus:
             self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
-        self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
+        self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
 
     def ask(
         self,
@@ -345,7 +351,8 @@ class ZenohBus:
     ) -> None:
         replies = 0
         failure: str | None = None
-        expression, asked = topic.expression(self._namespace, **fields), encode(request)
+        expression = topic.expression(self._namespace, **fields)
+        asked = meant_for(self.intake.below(expression), encode(request))
         began_s = time.monotonic()
 
         def arrive(reply: zenoh.Reply) -> None:
@@ -358,6 +365,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
+                check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
                 named = self.intake.fields(topic, key)
@@ -393,6 +401,8 @@ class ZenohBus:
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
+            if not str(sample.key_expr).startswith(f"{self._namespace}/"):
+                return
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
@@ -405,7 +415,7 @@ class ZenohBus:
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
         arrivals = Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._namespace}/{key}", _into(arrivals), history=True
+            patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
         )
         self._read(subscriber, arrive, "alive", arrivals.take)
 

@@ -13,6 +13,7 @@ from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode, encode_json
+from swarm.wire.meant import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored
@@ -31,7 +32,7 @@ def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
     assert box == [Heard(TRUE_POSE, {"target": "t0"}, pose())]
     assert a.counts["messages_out"] == 1
     assert b.counts["messages_in"] == 1
-    assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(encode(pose()))
+    assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(meant_for("world/target/t0/pose", encode(pose())))
 
 
 def test_a_process_hears_itself(world: World):
@@ -80,20 +81,24 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
     b.collect(TRUE_POSE)
     b.subscribe(MARKS, together, together=True)
     world.settle()
-    short = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    unnamed = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    short = unnamed[:-1] + b', "key": "world/target/t0/pose"}'
     world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t0")
+    world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t4")  # it is meant for t0
+    world.put_bytes(a, TRUE_POSE, unnamed, in_json=True, target="t5")  # the key of a pose is not implied
     world.put_bytes(a, TRUE_POSE, short, target="t1")  # without the encoding it is garbage
     world.put_bytes(
         a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
     )  # whatever it says, this is MessagePack
-    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:], in_json=True, target="t3")
+    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:].replace(b"t0", b"t3"), in_json=True, target="t3")
     world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
     world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
     world.until(lambda: len(alone) == 2 and together)
     assert [event.message for event in alone] == [pose(), pose("t2")]
     assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
-    world.until(lambda: b.counts["payloads_dropped"] == 3)
+    world.until(lambda: b.counts["payloads_dropped"] == 4)
     assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
+    assert b.counts["payloads_misrouted"] == 2  # heard and collected
 
 
 def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_outside_may_put(world: World):

@@ -230,8 +230,8 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
 
 
 MOST_DIGEST_BYTES = 1 << 16
-"""Bound of one digest, so that it is compared within a tick. It names 3,000 sets, more than most agents ever leave. A
-replica that holds more publishes parts (`Digest.after`)."""
+"""Bound of one digest, so that it is compared within a tick. It names 3,000 sets, more than most agents ever leave.
+A replica that holds more publishes parts (`Digest.after`)."""
 KEEPERS = "keeper"
 """The authors under which keepers publish digests begin with this and a dot, and no group is called so: an author's
 role is what its name says, as access is granted by name."""
