@@ -127,7 +127,6 @@ def test_of_what_a_stalled_router_delivers_under_wrong_keys_none_is_believed(pat
     finally:
         os.kill(router.process.pid, signal.SIGCONT)
         router.kill()
-    print([(len(each.right), len(each.wrong), each.bus.counts) for each in listeners])
     for each in listeners:
         assert each.bus.counts["payloads_misrouted"] == len(each.wrong)
         assert len(each.taken) == len(each.right) > 1000

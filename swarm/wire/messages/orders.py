@@ -51,6 +51,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     lasts_s       after so long the zone ends by itself; without it never
     vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
     stamp_ns      when it was given, as in `GiveOrder`
+    holes         parts of the polygon which are not of the zone, each as corners [row, col]; only with `polygon`
     """
 
     action: Literal["add", "remove", "list"] = "list"
@@ -63,6 +64,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
     vehicle_class: Id | None = None
     stamp_ns: StampNs = 0
+    holes: Annotated[list[Corners], Meta(max_length=MOST_CORNERS // 3)] = []
 
     @property
     def changes(self) -> bool:
@@ -83,6 +85,9 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
         corners = len(self.polygon or self.polygon_m or self.corners)
         if corners < 3:
             raise ValueError(f"polygon has {corners} corners, expected 3 ... {MOST_CORNERS}")
+        for hole in self.holes:
+            if not self.polygon or len(hole) < 3:
+                raise ValueError("holes have three corners or more, and go with polygon")
         if (self.kind == "pace") != (self.pace_s_per_m is not None):
             raise ValueError("pace_s_per_m goes with kind pace, and only with it")
 
