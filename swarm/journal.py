@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import DamagedError, StoreError, SwarmError
-from swarm.files import writing
+from swarm.files import sync_folder, writing
 
 DIGEST_BYTES = 8
 _HEAD = struct.Struct("<32s8sQQ8s")
@@ -184,7 +184,8 @@ class Journal:
         return self._spare >= 0 or self._size - self._at >= self._size // 2
 
     def begin(self) -> None:
-        """Makes the file if there is none in this format, and the spare one if it can."""
+        """Makes the file if there is none in this format, and the spare one if it can. Empties `found`."""
+        self.found = []
         if self._file < 0:
             self._switch()
         self.reserve()
@@ -272,27 +273,22 @@ class Journal:
         check_witness(self._path, witness, found, digests.get)
         with writing(self._path):
             self._file = os.open(self._path, os.O_RDWR)
-        self._seal, self._at, self._size, self._synced = found, at, len(data), found == seal
+        self._seal, self._at, self._size = found, at, len(data)
+        self._synced = False  # a record that is whole counts from now on, and a witness may be missing
         self.sync()
 
     def _switch(self) -> None:
         """Goes over to the spare file."""
         if (why := self.reserve()) is not None:
             raise StoreError(why)
-        start = secrets.token_bytes(
-            DIGEST_BYTES
-        )  # remains of an earlier use of the file follow from no such digest
+        start = secrets.token_bytes(DIGEST_BYTES)  # remains in the spare file do not follow from it
         seal, records = _chained(self._seal._replace(first=self._seal.last, digest=start), self._live())
         content = seal.packed() + start + records
         with writing(self._path):
             _write(self._spare, content, 0)
             os.fsync(self._spare)
             self._spare_path.replace(self._path)
-            folder = os.open(self._path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            sync_folder(self._path.parent)
         self._lock.witness(seal)
         if self._file >= 0:
             os.close(self._file)

@@ -21,7 +21,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import DamagedError, ProtocolError, StoreError, SwarmError
-from swarm.files import writing
+from swarm.files import sync_folder, writing
 from swarm.journal import DIGEST_BYTES, Lock, Seal, check_witness, digest_of, read_seal, witness_of
 
 log = logging.getLogger(__name__)
@@ -204,6 +204,7 @@ class SealedDatabase:
                 part.unlink(missing_ok=True)
                 self._begun(_connect(part)).close()
                 part.replace(self.path)
+                sync_folder(self.path.parent)
         witness = witness_of(self.path, _KIND)
         db = _connect_to_read(self.path) if self._read_only else _connect(self.path)
         try:
@@ -281,8 +282,9 @@ class SealedDatabase:
             raise DamagedError(_damaged(self.path, "expected the rows of its seal, found more or fewer"))
         check_witness(self.path, witness, seal, lambda number: seal.digest if number == seal.last else None)
         self._seal = seal
-        if not self._read_only:
+        if self._lock is not None:
             self._watch(db)
+            self._lock.witness(seal)  # there may be none
         return db
 
     def _check_version(self, meta: dict[str, str], known: str) -> None:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
+from random import Random
 
 import pytest
 from msgspec.msgpack import encode
+from support.effort import few
 
 from swarm.errors import DamagedError, StoreError
 from swarm.wire.messages.traffic import Grant, Table
@@ -71,6 +76,38 @@ def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_
     store.sync()
     assert len(syncs) == 1
     store.close()
+
+
+_PROMISES = """
+import itertools, sys
+from pathlib import Path
+from swarm.wire.messages.traffic import Grant, Table
+from vehicle_agent.promise_store import FilePromiseStore
+store = FilePromiseStore(Path(sys.argv[1]))
+start = max((promised for promised, _ in store.saved.values()), default=0)
+for promised in itertools.count(start + 1):
+    for plot in range(3):
+        grants = {f"a0-{n}": Grant([n], (promised, n)) for n in range(40)}
+        store.save(promised, Table(plot=plot, agent="a0", epoch=promised, seq=1, hosts={}, grants=grants))
+    store.sync()
+    print(promised, flush=True)
+"""
+
+
+def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path) -> None:
+    chance, acknowledged = Random(3), 0
+    for _ in range(few(25)):
+        command = [sys.executable, "-c", _PROMISES, str(tmp_path / "promises-a0")]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as agent:
+            assert agent.stdout is not None
+            for _ in range(chance.randrange(1, 60)):
+                acknowledged = int(agent.stdout.readline())
+            time.sleep(chance.uniform(0, 0.003))
+            agent.kill()
+            acknowledged = max([acknowledged, *map(int, agent.stdout.read().split())])
+        store = FilePromiseStore(tmp_path / "promises-a0")
+        assert min(promised for promised, _ in store.saved.values()) >= acknowledged
+        store.close()
 
 
 def test_one_that_waits_goes_on_with_what_the_life_before_has_left(tmp_path: Path) -> None:
