@@ -164,8 +164,10 @@ class HeldSets:
         that came after it."""
         if len(rows) % DIGEST_ROW_BYTES:
             return []
-        numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
         newer = [tile for _, tiles in self.ledger.missing({author: rows}) for tile in tiles]
+        if not newer or not len(self.tombstones):
+            return newer
+        numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
         return [tile for tile in newer if not self.tombstones.above(tile, author, numbers[tile])]
 
     def _could_hold(self, author: str, tile: int) -> bool:

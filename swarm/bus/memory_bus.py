@@ -38,7 +38,7 @@ from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
 from swarm.wire.meant import SHARED, check_meant, meant_for
 from swarm.wire.messages import Message
-from swarm.wire.topics import TOPICS, Topic
+from swarm.wire.topics import TOPICS, Topic, check_size
 
 # One query on the simulated network: which queryables have not ended yet, and how their answers travel.
 
@@ -128,6 +128,7 @@ class MemoryAnswerer:
             if asking.over:
                 return
             try:
+                check_size(payload, asking.topic.answer_bytes)
                 check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
             except ProtocolError as error:
                 asking.bus.counts[counter_of(error)] += 1
@@ -583,6 +584,7 @@ class MemoryBus:
         """Posts a question that has come under a key, or refuses it."""
         assert queryable.post is not None
         try:
+            check_size(payload, event.topic.ask_bytes)
             check_meant(key, payload)
             check_code(self.authenticator, code, event.topic, key, payload)
         except ProtocolError as error:
@@ -706,6 +708,7 @@ class _Sample:
     def parse(self) -> None:
         payload, kind = self.payload, self.topic.message
         try:
+            check_size(payload, self.topic.put_bytes)
             in_json = self.in_json and may_be_json(payload)
             if in_json:
                 payload = packed_json(payload, kind, self.fields)

@@ -37,7 +37,7 @@ from swarm.wire.codec import (
 )
 from swarm.wire.meant import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import Topic, check_size
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""
@@ -230,6 +230,7 @@ class Intake:
         """Decodes a query with the payload `asked`. Raises ProtocolError."""
         key, wanted = str(query.key_expr), topic.request
         assert wanted is not None
+        check_size(asked, topic.ask_bytes)
         if query.payload is None:
             check_named(self.below(key), parameters.pop(KEY_FIELD, None))
             self.check(topic, key, query, asked)
@@ -242,6 +243,7 @@ class Intake:
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
         """A payload as MessagePack, which is meant for its key and has the code that its topic needs. Raises
         ProtocolError."""
+        check_size(payload, topic.put_bytes)
         in_json = says_json(sample, payload)
         packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
@@ -252,10 +254,16 @@ class Intake:
         """A key below the namespace."""
         return key.removeprefix(self._start)
 
-    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
-        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
+    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes | None = None) -> None:
+        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code, or a reply is too
+        long.
+
+        asked  the payload of the question, where this is an answer
+        """
+        if asked is not None:
+            check_size(payload, topic.answer_bytes)
         if topic.trusted:
-            check_code(self.authenticator, attached(carrier), topic, key, payload, asked)
+            check_code(self.authenticator, attached(carrier), topic, key, payload, asked or b"")
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""
