@@ -31,7 +31,7 @@ class OrderedPlanners:
     own    processes that this launcher started: of the scenario's own targets it sees to their planners only
     whole  whether this launcher started the whole swarm: then no other will start them
     say    tells the user
-    no_room  number of planners of added targets here -> reason why the machine cannot carry so many
+    no_room  number of planners of added targets here -> reason why the machine cannot carry that number
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class OrderedPlanners:
         self._started_s: dict[str, float] = {}
         """Planner -> when it was started here last."""
         self._told = ""
-        """Why planners are not started, as the user was told last."""
+        """Reason why planners are not started, as the user was told last."""
         self._refused: set[str] = set()
 
     def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:

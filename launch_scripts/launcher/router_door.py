@@ -151,7 +151,7 @@ class _Visitor(_End):
         self._proved = False
         self._spoke = True
         self._turns = 0
-        """How often the router has replied."""
+        """Number of replies of the router."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)

@@ -42,6 +42,18 @@ def listening(endpoint: str) -> bool:
         return False
 
 
+def keeps_open(endpoint: str) -> bool:
+    """Returns True if a process accepts a connection there and does not end it at once, as a proxy does that has no
+    router behind it."""
+    try:
+        with socket.create_connection(host_port(endpoint), timeout=_KNOCK_S) as connection:
+            return bool(connection.recv(1))
+    except TimeoutError:
+        return True
+    except OSError:
+        return False
+
+
 def wait_for_router(endpoints: Sequence[str]) -> None:
     """Block until something listens at one of the endpoints, however long it takes; say once that it waits.
 

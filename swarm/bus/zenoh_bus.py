@@ -35,7 +35,7 @@ from swarm.bus.bus import (
     asker_in,
     check_subscription,
 )
-from swarm.bus.endpoints import listening, wait_for_router, why_not_listening, why_unreachable
+from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_intake import (
     Arrivals,
@@ -161,23 +161,30 @@ def open_bus(
 
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
-    patient        wait until a process listens: a process may be started before its router
+    patient        wait until a router listens: a process may be started before it, and a proxy be between
     authenticator  signs messages on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
-    if patient:
-        wait_for_router(endpoints)
-    try:
-        return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
-    except zenoh.ZError as error:
-        if patient and not any(map(listening, endpoints)):
-            return open_bus(network, patient=True, authenticator=authenticator)
-        log.info("zenoh says: %s", error)
-        if mode == "router":
-            what, reason = "listen on", why_not_listening(error)
-        else:
-            what, reason = "reach a router at", why_unreachable(endpoints, encrypted=network.tls is not None)
-        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason}") from error
+    said = False
+    while True:
+        if patient:
+            wait_for_router(endpoints)
+        try:
+            return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
+        except zenoh.ZError as error:
+            if not patient or any(map(keeps_open, endpoints)):
+                raise _why_not(error, network, mode) from error
+            if not said:
+                log.warning("no router behind %s yet: waiting for one (Ctrl-C ends this)", ", ".join(endpoints))
+            said = True
+
+
+def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError:
+    log.info("zenoh says: %s", error)
+    if mode == "router":
+        return BusError(f"cannot listen on {', '.join(network.listen)}: {why_not_listening(error)}")
+    reason = why_unreachable(network.connect, encrypted=network.tls is not None)
+    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {reason}")
 
 
 class ZenohBus:

@@ -219,7 +219,9 @@ def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
     """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
     if match is None:
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
+        why = ": quic/ is not offered, as strangers could keep members out" if endpoint.startswith("quic/") else ""
+        such = "expected one such as tcp/127.0.0.1:7447 or tls/host:7447"
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint{why}; {such}")
     if int(match[3]) > 65535:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
     protocol, host = match[1], match[2].strip("[]")

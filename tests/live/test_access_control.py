@@ -272,7 +272,7 @@ class Stage:
     """A router with access control, and sessions with certificates of their own."""
 
     admission: Admission
-    """Of our own router, if it is that."""
+    """The session of our own router, if it is that."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -482,6 +483,26 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
     wrong = get('{"rwo": 4}').err.payload.to_string()
     assert wrong == "nameless-cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1
+
+
+def test_who_waits_for_a_router_waits_behind_a_proxy_that_has_none_yet(caplog: pytest.LogCaptureFixture) -> None:
+    proxy = socket.create_server(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{proxy.getsockname()[1]}"
+    network = NetworkConfig(connect=(endpoint,), connect_timeout_s=0.3)
+    opened: list[ZenohBus] = []
+    waits = threading.Thread(target=lambda: opened.append(open_bus(network, patient=True)), daemon=True)
+    waits.start()
+    while "no router behind" not in caplog.text:
+        proxy.accept()[0].close()
+    for _ in range(8):  # further attempts
+        proxy.accept()[0].close()
+    assert waits.is_alive()
+    proxy.close()
+    router = Router(endpoint)
+    waits.join(20)
+    opened[0].close()
+    router.kill()
+    assert caplog.text.count("no router behind") == 1
 
 
 def test_who_leaves_before_it_obeys_is_not_called_silent_and_who_hangs_is(world: ZenohWorld) -> None:
