@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from itertools import chain, repeat
 from typing import Any
 
 import msgpack
@@ -21,15 +21,15 @@ from swarm.bus.bus import Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig
 from swarm.wire.codec import KEY_FIELD
-from swarm.wire.topics import TOPICS, Topic
+from swarm.wire.topics import COST, NOTE, ROUTE, STATS, TOPICS, Topic
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 STALLS = 20
-LEASE_S = 0.5
-PUT = [topic for topic in TOPICS if topic.published]
-SERVED = [topic for topic in TOPICS if topic.request is not None]
-TALKERS, LISTENERS = 2, 4
+LEASE_S = 1.0
+CONFUSED = (NOTE, STATS, COST, ROUTE)
+"""Topics of a session whose keys have the same form: each wrong key is heard."""
+TALKERS, AS_IN_WIRE_8, PATTERNED = 2, 30, 3
 
 
 def fields_of(topic: Topic) -> dict[str, str]:
@@ -38,17 +38,27 @@ def fields_of(topic: Topic) -> dict[str, str]:
 
 
 class Listener:
-    """A session which declares all that there is to hear and to serve, and looks at each payload itself.
+    """A session which looks at each payload itself. With patterns it declares all that there is to hear and serve.
 
+    patterned     whether its key expressions begin with a wildcard
     right, wrong  payloads that came, by whether they name the key under which they came
     taken         events which the bus posted
     """
 
-    def __init__(self, bus: ZenohBus, patch: pytest.MonkeyPatch) -> None:
+    def __init__(self, bus: ZenohBus, patterned: bool, patch: pytest.MonkeyPatch) -> None:
         self.bus = bus
+        self.patterned = patterned
         self.right: list[str] = []
         self.wrong: list[str] = []
         self.taken: list[Event] = []
+        with patch.context() as for_now:
+            if not patterned:
+                for_now.setattr(zenoh_bus, "patterned", lambda key: key)
+            for topic in TOPICS if patterned else CONFUSED:
+                if topic.published:
+                    bus.subscribe(topic, self.taken.append)
+                if topic.request is not None:
+                    bus.serve(topic, self._asked, **fields_of(topic))
         own, concerns = bus.intake._own, bus.intake.concerns
 
         def own_samples(samples: list[Any]) -> list[Any]:
@@ -63,10 +73,6 @@ class Listener:
 
         patch.setattr(bus.intake, "_own", own_samples)
         patch.setattr(bus.intake, "concerns", concerned)
-        for topic in PUT:
-            bus.subscribe(topic, self.taken.append)
-        for topic in SERVED:
-            bus.serve(topic, self._asked, **fields_of(topic))
 
     def _look(self, key: str, payload: bytes) -> None:
         named = msgpack.unpackb(payload, strict_map_key=False)[KEY_FIELD]
@@ -77,58 +83,52 @@ class Listener:
         event.end()
 
 
-@contextmanager
-def talking(bus: ZenohBus, every_s: float = 0.05) -> Iterator[None]:
-    """Puts on each topic, and asks on each, until the end."""
-    over = threading.Event()
-
-    def talk() -> None:
-        while not over.wait(every_s):
-            for topic in PUT:
-                bus.publish(topic, BY_TYPE[topic.message], **fields_of(topic))
-            for topic in SERVED:
-                request = BY_TYPE[topic.request]  # type: ignore[index]
-                bus.ask(topic, request, lambda event: None, tag="q", timeout_s=1.0, **fields_of(topic))
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+def talk(bus: ZenohBus, topics: Sequence[Topic]) -> None:
+    """Puts and asks once on each of these topics."""
+    for topic in topics:
+        if topic.published:
+            bus.publish(topic, BY_TYPE[topic.message], **fields_of(topic))
+        if topic.request is not None:
+            request = BY_TYPE[topic.request]
+            bus.ask(topic, request, lambda event: None, tag="q", timeout_s=1.0, **fields_of(topic))
 
 
-def stalled(network: NetworkConfig, router: Router, stalls: int, patch: pytest.MonkeyPatch) -> list[Listener]:
+@pytest.fixture
+def router() -> Iterator[Router]:
+    router = Router(f"tcp/127.0.0.1:{free_ports(1)[0]}")
+    yield router
+    os.kill(router.process.pid, signal.SIGCONT)
+    router.kill()
+
+
+def stalled(router: Router, stalls: int, patch: pytest.MonkeyPatch) -> list[Listener]:
     """Listeners that have heard others through a router which stood still again and again."""
+    network = NetworkConfig(connect=(router.endpoint,), lease_s=LEASE_S)
     with ExitStack() as stack:
-        listeners = [Listener(stack.enter_context(open_bus(network)), patch) for _ in range(LISTENERS)]
-        for _ in range(TALKERS):
-            stack.enter_context(talking(stack.enter_context(open_bus(network))))
+        kinds = [False] * AS_IN_WIRE_8 + [True] * PATTERNED
+        listeners = [Listener(stack.enter_context(open_bus(network)), kind, patch) for kind in kinds]
+        talkers = [stack.enter_context(open_bus(network)) for _ in range(TALKERS)]
         for _ in range(stalls):
-            time.sleep(LEASE_S)  # all are back, and the sockets of those who talk fill up again
+            time.sleep(LEASE_S)  # all are back
             os.kill(router.process.pid, signal.SIGSTOP)
-            time.sleep(1.2 * LEASE_S)
+            until_s = time.monotonic() + 1.6 * LEASE_S
+            for topics in chain([TOPICS], repeat(CONFUSED)):  # what their sockets keep comes in a burst
+                for bus in talkers:
+                    talk(bus, topics)
+                time.sleep(0.01)
+                if time.monotonic() > until_s:
+                    break
             os.kill(router.process.pid, signal.SIGCONT)
         time.sleep(2 * LEASE_S)
-        stack.pop_all().close()
-        return listeners
+    return listeners
 
 
-@pytest.mark.parametrize("patterned", [True, False], ids=["patterns begin with a wildcard", "as in wire version 8"])
-def test_of_what_a_stalled_router_delivers_under_wrong_keys_none_is_believed(patterned, monkeypatch):
-    if not patterned:
-        monkeypatch.setattr(zenoh_bus, "patterned", lambda key: key)
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    router = Router(endpoint)
-    try:
-        network = NetworkConfig(connect=(endpoint,), lease_s=LEASE_S)
-        listeners = stalled(network, router, STALLS // 2, monkeypatch)
-    finally:
-        os.kill(router.process.pid, signal.SIGCONT)
-        router.kill()
+def test_of_what_a_stalled_router_delivers_under_wrong_keys_none_is_believed(router, monkeypatch):
+    listeners = stalled(router, STALLS, monkeypatch)
+    assert sum(len(each.right) for each in listeners) > 1000
     for each in listeners:
-        assert each.bus.counts["payloads_misrouted"] == len(each.wrong)
-        assert len(each.taken) == len(each.right) > 1000
-        assert each.bus.counts["payloads_dropped"] == 0
-        assert not (patterned and each.wrong)
+        counts = each.bus.counts
+        assert counts["payloads_misrouted"] == len(each.wrong)
+        assert len(each.taken) == len(each.right)
+        assert counts["payloads_dropped"] == 0
+        assert not (each.patterned and each.wrong)
