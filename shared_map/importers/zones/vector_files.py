@@ -44,6 +44,7 @@ class Layer:
     index    its number in the file
     crs      as the file has it; empty if it has none
     columns  names of its attributes
+    count    features which the file says that it holds
     """
 
     source: str | bytes
@@ -52,6 +53,7 @@ class Layer:
     name: str
     crs: str
     columns: tuple[str, ...]
+    count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +109,14 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             if kind.driver == "GPKG":
                 _check_table(path, name, what)
             index = listed[:, 0].tolist().index(name)
-            info = pyogrio.read_info(source, layer=index)
+            info = pyogrio.read_info(source, layer=index, force_feature_count=True)
+            count = int(info["features"])
+            index_file = path.with_suffix(".SHX" if path.suffix.isupper() else ".shx")
+            if kind.driver == "ESRI Shapefile" and index_file.is_file():
+                count = max(count, (index_file.stat().st_size - 100) // 8)  # GDAL believes its header
             columns = tuple(str(field) for field in info["fields"])
             shown = name if isinstance(source, str) else "fence"
-            found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns))
+            found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns, count))
         return found
 
 
@@ -140,7 +146,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
         tags: list[dict[str, str]] = [{} for _ in numbers]
         for name, values in zip(meta["fields"], fields, strict=True):
             for row, value in zip(tags, values.tolist(), strict=True):
-                if value is not None and value == value and value != "":
+                if value is not None and str(value) not in ("", "nan", "NaT"):
                     row[str(name)] = str(value)
         id_column = next((name for name in _IDS if name in wanted), "")
         ids = [row.get(id_column, str(number))[:60] for row, number in zip(tags, numbers, strict=True)]
@@ -153,6 +159,11 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
             raise TerrainError(f"{layer.what}: feature {ids[n]} cannot be used: {why}; repair or remove it")
         yield Features(ids, shapes, of, tags, [ids[n] for n in np.flatnonzero(unclosed)])
         if len(numbers) < _CHUNK:
+            if first + len(numbers) != layer.count:
+                raise TerrainError(
+                    f"{layer.what} is damaged: it holds {layer.count} features, of which {first + len(numbers)} are"
+                    " read; ogr2ogr makes a copy of these"
+                )
             return
 
 
