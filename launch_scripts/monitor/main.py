@@ -49,7 +49,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
 
         info = setup.info(terrain.grid, terrain.digest)
         service = LoadingMonitor(Member(info, bus, inbox.post, setup.before), inbox.post, load)
-        process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health)
+        process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health, gather=bus.gather)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

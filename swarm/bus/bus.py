@@ -288,17 +288,23 @@ class Bus(Protocol):
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keeps samples from now on until `collected`, the newest `Topic.buffer`. For samples that are used at
+        """Keeps samples from now on until `gather`, the newest `Topic.buffer`. For samples that are used at
         ticks only: a sample that wakes no thread costs a fifth."""
         ...
 
+    def gather(self) -> None:
+        """Makes the samples that wait available to `collected`, on all topics. The loop of a process calls it
+        before it reads the clock: no input of a tick is newer than the tick's time, wherever the process is
+        stopped. It costs 2 microseconds for eight topics without a sample."""
+        ...
+
     def collected(self, topic: Topic) -> list[Heard]:
-        """Returns the samples kept on a topic since the last call, merged as in `newest_of`."""
+        """Returns the samples gathered on a topic since the last call, merged as in `newest_of`."""
         ...
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        """Returns all samples kept on a topic since the last call, in order, with keys as in a `HeardMany`: for a
-        topic with many small messages. The reader compares each key with its message."""
+        """Returns all samples gathered on a topic since the last call, in order, with keys as in a `HeardMany`: for
+        a topic with many small messages. The reader compares each key with its message."""
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:

@@ -405,7 +405,8 @@ class MemoryBus:
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self._kept: dict[str, deque[_Sample]] = {}
-        """Topic -> samples that wait for `collected`."""
+        """Topic -> samples that wait for `gather`."""
+        self._gathered: dict[str, deque[_Sample]] = {}
         self.swap: Swap | None = None
         """Two prefixes of this bus that are confused at present."""
         self.tokens: list[Peer] = []
@@ -480,12 +481,17 @@ class MemoryBus:
     def _declare(self, topic: Topic, subscription: Declaration) -> None:
         self.network.subscriptions[self.namespace, topic.name].add(subscription)
 
+    def gather(self) -> None:
+        for name, kept in self._kept.items():
+            self._gathered.setdefault(name, deque(maxlen=kept.maxlen)).extend(kept)
+        self._kept.clear()
+
     def collected(self, topic: Topic) -> list[Heard]:
-        kept = self._kept.pop(topic.name, ())
+        kept = self._gathered.pop(topic.name, ())
         return newest_of(topic, [(sample.key, sample) for sample in kept], self._heard)
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        kept = self._kept.pop(topic.name, ())
+        kept = self._gathered.pop(topic.name, ())
         return [(sample.key, heard.message) for sample in kept if (heard := self._heard(sample, together=True))]
 
     def arrived(self, sample: _Sample, subscription: Declaration) -> None:

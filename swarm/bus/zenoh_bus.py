@@ -12,8 +12,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import zenoh
@@ -205,8 +207,8 @@ class ZenohBus:
         """Entities that are declared and not yet undeclared, in order; `close` undeclares them in reverse."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
-        self._collecting: dict[str, list[Any]] = {}
-        """Topic -> its subscribers, which are read by `collected` only."""
+        self._collecting: dict[str, list[tuple[Any, deque[zenoh.Sample]]]] = {}
+        """Topic -> each subscription that is collected, and what was gathered of it."""
         self._queryables: dict[str, list[Any]] = {}
         """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
@@ -288,24 +290,34 @@ class ZenohBus:
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
         self._entities.append(subscriber)
-        self._collecting.setdefault(topic.name, []).append(subscriber)
+        self._collecting.setdefault(topic.name, []).append((subscriber, deque(maxlen=topic.buffer)))
+
+    def gather(self) -> None:
+        for collecting in self._collecting.values():
+            for subscriber, gathered in collecting:
+                gathered += taken_from(subscriber.handler, gathered.maxlen or 0)
 
     def collected(self, topic: Topic) -> list[Heard]:
         heard: list[Heard] = []
-        for subscriber in self._collecting.get(topic.name, ()):
-            heard += self.intake.newest(topic, taken_from(subscriber.handler, topic.buffer))
+        for samples in self._gathered(topic):
+            heard += self.intake.newest(topic, samples)
         return heard
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        samples: list[zenoh.Sample] = []
-        for subscriber in self._collecting.get(topic.name, ()):
-            samples += taken_from(subscriber.handler, topic.buffer)
+        samples = list(chain.from_iterable(self._gathered(topic)))
         return self.intake.together(topic, samples) if samples else []
+
+    def _gathered(self, topic: Topic) -> Iterator[list[zenoh.Sample]]:
+        """Takes the gathered samples of each subscription to a topic, where there are any."""
+        for _, gathered in self._collecting.get(topic.name, ()):
+            if gathered:
+                yield list(gathered)
+                gathered.clear()
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         subscribers = self._subscribers.pop(self._pattern(topic, fields), ())
         collecting = self._collecting.get(topic.name, ())
-        self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
+        self._collecting[topic.name] = [each for each in collecting if each[0] not in subscribers]
         self._undeclare_all(subscribers)
 
     def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:

@@ -97,6 +97,7 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
     assert [event.message for event in alone] == [pose(), pose("t2")]
     assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
     world.until(lambda: b.counts["payloads_dropped"] == 4)
+    b.gather()
     assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
     assert b.counts["payloads_misrouted"] == 2  # heard and collected
 
@@ -128,9 +129,16 @@ def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World
             a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
         world.put_bytes(a, TRUE_POSE, b"garbage", target="t1")
     world.until(lambda: len(box) == 10 and b.counts["payloads_dropped"] == 5)
+    assert b.collected(TRUE_POSE) == []  # nothing was gathered
+    b.gather()
     assert b.collected(TRUE_POSE) == [
         Heard(TRUE_POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")
     ]
+    a.publish(TRUE_POSE, pose(seq=5), target="t0")
+    world.until(lambda: len(box) == 11)
+    assert b.collected(TRUE_POSE) == []  # it came after the inbox was read
+    b.gather()
+    assert [each.message for each in b.collected(TRUE_POSE)] == [pose(seq=5)]
     assert b.collected(TRUE_POSE) == []
     assert b.counts["payloads_dropped"] == 6  # each that was heard; of those collected the one after the newest
 
@@ -142,6 +150,7 @@ def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(wo
     b.collect(MARKS, region=0)
     b.collect(MARKS, region=1)
     world.settle()
+    b.gather()
     assert b.collected_together(MARKS) == []
     sent = [marks("a0.1", tile) for tile in (*range(12), 3, 3)]
     for region in (0, 1, 2):
@@ -150,15 +159,18 @@ def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(wo
             world.put_bytes(a, MARKS, b"garbage", region=str(region), tile=str(each.tile), author="a0.1")
     world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent))
     dropped = b.counts["payloads_dropped"]
+    b.gather()
     collected = b.collected_together(MARKS)
     assert collected == [(f"marks/{region}/{each.tile}/a0.1", each) for region in (0, 1) for each in sent]
     assert b.counts["payloads_dropped"] == dropped + 2 * len(sent)
+    b.gather()
     assert b.collected_together(MARKS) == []
     b.unsubscribe(MARKS, region=0)
     world.settle()
     for region in (0, 1):
         a.publish(MARKS, sent[0], region=region, tile=0, author="a0.1")
     world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent) + 2)
+    b.gather()
     assert b.collected_together(MARKS) == [("marks/1/0/a0.1", sent[0])]
 
 
@@ -173,6 +185,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
         if n % 200 == 0:
             world.settle()
     world.until(lambda: bool(box) and box[-1].message.text == f"n{NOTE.buffer + 49}")
+    b.gather()
     texts = [each.message.text for each in b.collected(NOTE)]
     assert texts[-1] == f"n{NOTE.buffer + 49}"
     assert len(texts) == NOTE.buffer  # the newest ones, of a topic whose values all count
@@ -180,6 +193,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
     world.settle()
     a.publish(NOTE, note("late"), role="agent", id="a0")
     world.settle()
+    b.gather()
     assert b.collected(NOTE) == []
 
 

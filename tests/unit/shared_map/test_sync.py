@@ -52,6 +52,7 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
     swarm.run(0.15)
     assert not all_equal([author, reader])
     (rows,) = author.replica.own_digest().values()
+    swarm.buses["p"].gather()
     assert reader.sync.holds("a1.1", rows, swarm.now_ns)  # what an order needs is not fetched: it waits here
     assert all_equal([author, reader])
 
@@ -231,12 +232,14 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
         digest = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
         keeper_says.publish(DIGEST, digest, author="keeper.k.1")
         swarm.run(0.01)
+        swarm.buses["p"].gather()
         listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[2]}
     uncounted = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[3]})
     keeper_says.publish(DIGEST, uncounted, author="keeper.k.1")
     swarm.run(0.01)
+    swarm.buses["p"].gather()
     listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[3]}
