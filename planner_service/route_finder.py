@@ -85,7 +85,7 @@ class RouteFinder:
     ValueError
         On a pace that is NaN, zero or negative, an array without two dimensions, or an unknown strategy.
     TypeError
-        On a row or column that is no whole number.
+        On a row or column that is no whole number, or a setting that does not exist.
     """
 
     def __init__(
@@ -104,6 +104,8 @@ class RouteFinder:
         self.grid = GridSpec(rows, cols, resolution_m)
         if (strategy := settings.setdefault("strategy", "full")) not in STRATEGIES:
             raise ValueError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
+        for name in settings.keys() - set(PlannerConfig.__struct_fields__):
+            raise TypeError(f"{name} is no setting{choice(name, PlannerConfig.__struct_fields__)}")
         self._config = PlannerConfig(**settings)
         self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
@@ -121,6 +123,7 @@ class RouteFinder:
 
         Raises ValueError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
         """
+        row, col = _whole(row, col)
         block = np.atleast_2d(np.asarray(pace, np.float32))
         window = Window(row, col, row + block.shape[0], col + block.shape[1])
         if block.ndim != 2 or row < 0 or col < 0 or window.row1 > self.grid.rows or window.col1 > self.grid.cols:
@@ -133,7 +136,8 @@ class RouteFinder:
 
     def route(self, row: int, col: int) -> FoundRoute:
         """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status."""
-        cell = self._cell(row, col) if self.grid.inside(row, col) else -1
+        row, col = _whole(row, col)
+        cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
         cells = np.array([(row, col)], np.int64)
         if found.status is RouteStatus.OK:
@@ -141,8 +145,8 @@ class RouteFinder:
         return FoundRoute(found.status, cells, found.cost_s, found.lower_bound_s, found.length_m)
 
     def _cell(self, row: int, col: int) -> int:
-        """The index of a cell. Raises TypeError on a row or column that is no integer, OutsideGridError outside."""
-        return self.grid.cell(operator.index(row), operator.index(col))
+        """The index of a cell. Raises OutsideGridError outside."""
+        return self.grid.cell(*_whole(row, col))
 
     def pull(self, route: FoundRoute) -> PulledRoute:
         """A route pulled straight: fewer turns, less time, no lethal cell and no corner that its steps may not cut.
@@ -186,3 +190,11 @@ class RouteFinder:
             tree.adopt(grown, pace, self._target, [], self._version, [])
         if tree.wants_strides:
             tree.take_strides(tree.stride_job().run())
+
+
+def _whole(row: Any, col: Any) -> tuple[int, int]:
+    """A place as a cell. Raises TypeError between cells: half a row may be half a map away."""
+    try:
+        return operator.index(row), operator.index(col)
+    except TypeError as error:
+        raise TypeError(f"row {row!r}, col {col!r}: a cell has whole numbers") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 
@@ -49,7 +48,20 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.messages.vehicles import Chasers, Fleet
-from swarm.wire.topics import BELIEVED, CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.topics import (
+    BELIEVED,
+    CHASERS,
+    COST,
+    FLEET,
+    NAMELESS_COST,
+    NAMELESS_ROUTE,
+    POSE,
+    PUSHED_ROUTE,
+    ROUTE,
+    SIGHTED,
+    STATUS,
+    is_own,
+)
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +70,8 @@ _PRESENCE_NS = 5 * NS_PER_S
 """A vehicle of which nothing was heard for so long sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 """A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
+_CELLS_AT_ONCE = 1 << 16
+"""Cells asked for after which waiting queries wait for the next tick or event."""
 
 
 class PlannerService:
@@ -126,7 +140,7 @@ class PlannerService:
         """True if its target was removed: then it serves no queries."""
         self._now_ns = 0
         self._served = False
-        self._held: deque[tuple[int, Asked]] = deque()
+        self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
         self._stride_searches: dict[str, StrideSearch] = {}
         """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
@@ -317,13 +331,14 @@ class PlannerService:
             self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
-        """Answers a query. If there will be a tree to answer from soon, it waits for that, but not long.
+        """Answers queries. If there will be a tree to answer from soon, a query waits for that, but not long.
 
-        A query for one class never waits for the tree of another.
+        A query for one class never waits for the tree of another. Agents come first. After `_CELLS_AT_ONCE` cells
+        the others wait for the next call.
         """
-        waiting: deque[tuple[int, Asked]] = deque()
-        while self._held:
-            asked_ns, event = self._held.popleft()
+        held, self._held = self._held, []
+        cells = 0
+        for n, (asked_ns, event) in enumerate(sorted(held, key=_is_of_others)):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
@@ -333,12 +348,13 @@ class PlannerService:
                 event.end()
                 continue
             planner = self._planners.used(name, now_ns)
-            crowded = len(waiting) + len(self._held) >= _MOST_HELD
-            if self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS:
-                waiting.append((asked_ns, event))
+            crowded = len(self._held) + len(held) - n > _MOST_HELD
+            must_wait = self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS
+            if must_wait or cells > _CELLS_AT_ONCE:
+                self._held.append((asked_ns, event))
                 continue
+            cells += len(request.cells) + 1
             planner.answer(request, now_ns, partial(self._send, event))
-        self._held = waiting
 
     def _send(self, asked: Asked, answer: Answer) -> None:
         if isinstance(answer, Refusal):
@@ -394,7 +410,7 @@ class PlannerService:
         self._watch.leads = leads
         for _, planner in self._planners:
             planner.lead(leads)
-        for topic in (ROUTE, COST):
+        for topic in (ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST):
             if leads:
                 self._bus.serve(topic, self._post, undecoded=True, target=self._target)
             else:
@@ -423,3 +439,7 @@ class PlannerService:
                     self._tell_status(status)
                 case Believed() as believed:
                     self._bus.publish(BELIEVED, believed, target=self._target)
+
+
+def _is_of_others(held: tuple[int, Asked]) -> bool:
+    return not is_own(held[1].asker)

@@ -155,8 +155,6 @@ def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: F
     terrain; made-up ones are kept for later runs."""
     for name in driven_classes(scenario):
         folder, key = _folder(run_dir, name), _prepared_key(scenario, name)
-        if _load(folder, key, scenario, common, name) is not None:
-            continue
         kept = _kept_key(scenario, name)
         if kept is None or not fetch_kept(kept, folder):
             _save(folder, key, class_grounds(scenario, common, truth)[name])

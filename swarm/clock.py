@@ -6,6 +6,8 @@ import time
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
+_APART_NS, _TRIES = 100_000, 1000
+"""Two readings that are further apart are taken again: the process was stopped between them."""
 
 
 class Clock(Protocol):
@@ -20,10 +22,15 @@ class MonotonicClock:
     """The machine's time at the start of the process, continued by its monotonic counter.
 
     Two readings in one process may be subtracted. Readings of two machines differ as their clocks did at the start.
+    The offset is wrong by at most `_APART_NS`, even if the process is stopped while it reads the two counters.
     """
 
     def __init__(self) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        for _ in range(_TRIES):
+            before_ns, date_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+            self._offset_ns = date_ns - after_ns
+            if after_ns - before_ns <= _APART_NS:
+                break
 
     def now_ns(self) -> int:
         return self._offset_ns + time.monotonic_ns()

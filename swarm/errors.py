@@ -65,6 +65,12 @@ class StoreError(SwarmError):
     exit_code = 6
 
 
+class DamagedError(SwarmError):
+    """A store that is not as it was written. A full disk gets better (`StoreError`), a damaged record does not."""
+
+    exit_code = StoreError.exit_code
+
+
 class ProtocolError(SwarmError):
     """A payload that is no message, or a message that breaks its rules. The bus counts and drops it; no service
     sees it."""

@@ -58,6 +58,15 @@ def write_file(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
 
 
+def sync_folder(folder: Path) -> None:
+    """Has the names in a folder on the disk: a file that replaced another stays there after a loss of power."""
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
 def check_writable(folder: Path, size: int = _PROBE_BYTES, *, file: Path | None = None) -> None:
     """Raises StoreError if a folder takes no file of some bytes: it is written, and removed.
 

@@ -86,13 +86,15 @@ def read_place(given: Given, what: str) -> Place:
         return Place(f"[{row}, {col}]", "cell", row, col, True)
     match = _PLACE.fullmatch(given.strip())
     if match is None:
-        raise ConfigError(f"{what} is {given[:60]!r}; expected {FORMS}")
+        comma = re.sub(r"(?<=[\d.])[\s;]+(?=[-+.\d])", ",", given.strip(), count=1)
+        perhaps = f"; did you mean {comma[:60]!r}?" if _PLACE.fullmatch(comma) else ""
+        raise ConfigError(f"{what} is {given[:60]!r}; expected {FORMS}{perhaps}")
     first, second = match[2], match[3]
     whole = all(_WHOLE.fullmatch(number) for number in (first, second))
     kind: Any = match[1]
     place = Place(given.strip()[:60], kind, float(first), float(second), whole)
-    if kind == "latlon":
-        _check_degrees(place, what)
+    if kind == "latlon" and not _is_degrees(place):
+        raise ConfigError(f"{what} is {_shown(place)}: no latitude (-90 to 90) and longitude (-360 to 360)")
     return place
 
 
@@ -104,7 +106,7 @@ def cell_of(given: Given, frame: Frame, what: str) -> int:
     cells = {kind: cell for kind in kinds if (cell := _cell_at(_corner(place, kind, frame, what), grid)) >= 0}
     if not cells:
         extents = "; ".join(extent_of(frame, kind) for kind in kinds)
-        raise ConfigError(f"{what} is {_shown(place)}, outside the terrain: {extents}")
+        raise ConfigError(f"{what} is {_shown(place)}, outside the terrain: {extents}{_perhaps(place, frame)}")
     if len(set(cells.values())) > 1:
         raise ConfigError(f"{what} is {_shown(place)}, {_two_meanings(kinds)}")
     return next(iter(cells.values()))
@@ -125,7 +127,8 @@ def corners_of(given: Sequence[Given], frame: Frame, what: str) -> list[Corner]:
     corners = [_corner(place, place.kind or kinds[0], frame, what) for place in places]
     for place, corner in zip(places, corners, strict=True):
         if not all(map(math.isfinite, corner)):
-            raise ConfigError(f"{what} is {_shown(place)}, far from the terrain: {extent_of(frame)}")
+            hint = _perhaps(place, frame)
+            raise ConfigError(f"{what} is {_shown(place)}, far from the terrain: {extent_of(frame)}{hint}")
     return corners
 
 
@@ -210,9 +213,8 @@ def _corner(place: Place, kind: Kind, frame: Frame, what: str) -> Corner:
                 f"{what} is {_shown(place)}, and the terrain has no place on Earth; give xy:X,Y in its own metres"
                 " or cell:ROW,COL, or say where it lies with terrain.crs"
             )
-        if place.kind is None and place.whole and not _is_degrees(place):
-            return math.nan, math.nan  # a row and a column, then
-        _check_degrees(place, what)
+        if not _is_degrees(place):
+            return math.nan, math.nan
         x_m, y_m = frame.from_wgs84(place.first, place.second)
     return (grid.north_m - y_m) / grid.resolution_m, (x_m - grid.west_m) / grid.resolution_m
 
@@ -221,12 +223,16 @@ def _is_degrees(place: Place) -> bool:
     return abs(place.first) <= 90 and abs(place.second) <= 360
 
 
-def _check_degrees(place: Place, what: str) -> None:
-    if not _is_degrees(place):
-        raise ConfigError(
-            f"{what} is {_shown(place)}: no latitude (-90 to 90) and longitude (-360 to 360); write xy:X,Y for"
-            " metres of the map"
-        )
+def _perhaps(place: Place, frame: Frame) -> str:
+    """The end of a sentence about a place outside the terrain: its numbers exchanged, or as metres of the map,
+    where the terrain has that."""
+    kinds: tuple[Kind, ...] = ("xy",) if frame.grid.crs == "local" else ("latlon", "xy")
+    for kind in kinds if place.kind != "cell" else ():
+        for first, second in ((place.first, place.second), (place.second, place.first)):
+            other = Place(f"{kind}:{first:.12g},{second:.12g}", kind, first, second, False)
+            if _cell_at(_corner(other, kind, frame, ""), frame.grid) >= 0:
+                return f"; did you mean {other.text!r}?"
+    return ""
 
 
 def _cell_at(corner: Corner, grid: GridSpec) -> int:

@@ -44,6 +44,8 @@ LISTEN_NS = NS_PER_S
 """Each body is published at least this often, so that a new subscriber knows it."""
 _GHOSTS = 3
 """Places that a body has leapt from and that are still closed, at most."""
+_MOST_SENDERS = 4
+"""Lives of one id, of which each may still be there: one that starts again, a second program by mistake."""
 _MOST_TOLD = 1000
 _LEAP_M = 5.0
 """Distance beyond the one its speed explains: the error of satellite positions."""
@@ -150,6 +152,8 @@ class Bodies:
         kind = "refused"
         if wrong is None:
             kind, wrong = "crowded", self._crowded(known, leaps, charge)
+        if wrong is None and known is None:
+            kind, wrong = "senders", self._outgrown(report.id, charge)
         if wrong is not None:
             self._complain(kind, report.id, f"is not avoided: {wrong}")
             return
@@ -203,6 +207,16 @@ class Bodies:
         charged = self._charged + charge - (0 if known is None or leaps else known.charge)
         if charged > MOST_CELLS:
             return f"with it, bodies could close {charged} cells, expected at most {MOST_CELLS}"
+        return None
+
+    def _outgrown(self, id: str, charge: int) -> str | None:
+        """Reason why one more sender under an id is refused: it is what a certificate names, so it has a share."""
+        own = [known for n in self._senders.get(id, ()) if (known := self._known.get((id, n))) is not None]
+        if len(own) >= _MOST_SENDERS:
+            return f"{len(own)} senders have this id already"
+        charged, most = charge + sum(known.charge for known in own), MOST_CELLS // _MOST_SENDERS
+        if own and charged > most:
+            return f"its senders could close {charged} cells, expected at most {most}"
         return None
 
     def _leaps(self, before: Body, report: Body, passed_ns: int) -> bool:

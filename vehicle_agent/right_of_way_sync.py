@@ -254,14 +254,19 @@ class RightOfWaySync:
                 self._bus.publish(topic, message, plot=message.plot, member=member, agent=self._id)
 
     def _perform(self, actions: Sequence[Action]) -> None:
+        """Performs what one event or tick has brought: what is to be on file first, with one sync for all of it."""
+        filed = [action for action in actions if isinstance(action, Save | OwnRecord)]
+        for each in filed:
+            if isinstance(each, Save):
+                self._store.save(each.promised, each.table)
+            else:
+                self._store.save_own(each)
+        if filed:
+            self._store.sync()
         for action in actions:
             match action:
-                case Save(promised, table):
-                    self._store.save(promised, table)
                 case AskKnown():
                     self._asked_ns, self._unasked = None, True  # at the next tick
-                case OwnRecord():
-                    self._store.save_own(action)
                 case Tell(members, standing):
                     for member in members:
                         self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self._id)

@@ -58,6 +58,9 @@ from vehicle_agent.target_choice import AskCosts
 
 log = logging.getLogger(__name__)
 
+_ROUTES, _COSTS = "route-", "cost-"
+"""Tags of what we ask, each with a number."""
+
 _LONGEST_AGE_NS = 10 * NS_PER_S
 """An older report was stamped by a clock that does not agree with ours: no delay is measured by it."""
 _GAUGES = [
@@ -163,9 +166,9 @@ class AgentService:
                 self._on_routes(event, reply, now_ns)
             case Replied(tag=tag, message=CostReply() as reply):
                 self._on_costs(_number(tag), reply)
-            case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
+            case AskEnded(tag=tag) if tag.startswith(_ROUTES):
                 self.agent.routes_ended(_number(tag), now_ns)
-            case AskEnded(tag=tag, topic=topic) if topic is COST:
+            case AskEnded(tag=tag) if tag.startswith(_COSTS):
                 self._on_costs_ended(_number(tag), now_ns)
             case Appeared() | Disappeared():
                 self._on_planner(event, now_ns)
@@ -390,10 +393,11 @@ class AgentService:
                         force=force,
                         vehicle_class=self._class,
                     )
-                    self._bus.ask(ROUTE, asking, self._post, tag=f"route-{request}", target=target)
+                    tag = f"{_ROUTES}{request}"
+                    self._member.ask_by_name(ROUTE, asking, tag=tag, target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
-                    self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
+                    self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}")
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:

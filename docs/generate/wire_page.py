@@ -19,6 +19,7 @@ from swarm.bus import bus
 from swarm.wire import codec
 from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
+from swarm.wire.meant import SHARED
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.vehicles import VehicleState
@@ -195,7 +196,8 @@ def example(topic: Topic) -> str:
     """The shortest JSON for a topic: what its message needs and its key does not say."""
     hints = typing.get_type_hints(topic.message, include_extras=True)
     needed = (field.name for field in msgspec.structs.fields(topic.message) if field.required)
-    return json.dumps({name: _value(name, hints[name]) for name in needed if name not in topic.fields})
+    said = {"key": topic.below(key_fields(topic))} if topic.message in SHARED else {}
+    return json.dumps({name: _value(name, hints[name]) for name in needed if name not in topic.fields} | said)
 
 
 def _value(name: str, hint: Any) -> Any:

@@ -134,6 +134,19 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
         yield failure("runs", complaint)
 
 
+def why_no_room(scenario: Scenario, cells: int, planners: int, here: Machine) -> str | None:
+    """Reason why this machine cannot carry planners beside a scenario; None if it can.
+
+    A quarter of its cores is for such planners, even where the scenario needs the others.
+    """
+    share = max(_BUSY_SHARE * here.cores - needs_of(scenario, cells).cores, (1 - _BUSY_SHARE) * here.cores)
+    if planners > (most := int(share / _PLANNER_CORES)):
+        return f"{planners} planners of added targets, and this machine of {here.cores} cores carries {most}"
+    if (wanted := _PROCESS_BYTES + cells * _TREE_CELL_BYTES) > here.free_bytes:
+        return f"it needs about {size(wanted)} of memory, and {size(here.free_bytes)} are free"
+    return None
+
+
 def _nearest(runs: Path) -> Path:
     """Returns a folder of runs, or the nearest existing folder above it."""
     return next(path for path in (runs.absolute(), *runs.absolute().parents) if path.exists())

@@ -13,14 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.check.findings import Finding, failure
 from launch_scripts.simulation.world.walks import Budget, TrueTerrain, WalkWorld, walk_of
 from planner_service.strategy import Growths, StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from shared_map.array_files import Floats
 from shared_map.terrain.cost_layers import checked_layer, cost_world
 from swarm.config.explain import choice
-from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
-from swarm.config.scenario import PlannerConfig
+from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin, plugins_of
+from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec, walk
 from swarm.plugins.find import Plugin, find_plugin
@@ -208,6 +209,32 @@ def _dynamics(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
             )
         took.append(ticks)
     return took
+
+
+_MADE: Mapping[str, Callable[[GridSpec, Floats, int], object]] = {
+    "sensor": lambda grid, truth, seed: SensorWorld(grid, truth, 35.0, "a0", seed),
+    "walk": lambda grid, truth, seed: WalkWorld("t0", TrueTerrain(grid, truth), random.Random(seed), Budget()),
+    "assignment": lambda grid, truth, seed: AssignmentWorld("a0", "all", ("t0",), seed),
+    "strategy": lambda grid, truth, seed: StrategyWorld("t0", grid, PlannerConfig()),
+    "dynamics": lambda grid, truth, seed: DynamicsWorld("a0", grid, seed),
+}
+"""Kind -> world in which a run makes a plug-in of it, from grid, true pace and seed."""
+
+
+def not_made(scenario: Scenario, grid: GridSpec, truth: Floats) -> Iterator[Finding]:
+    """Yields plug-ins of a scenario that a run could not make, where they can be imported. Those of cost layers are
+    made with the terrain."""
+    for named in plugins_of(scenario):
+        world = _MADE.get(named.kind.name)
+        try:
+            plugin = None if world is None else find_plugin(named, scenario.plugin_folder)
+        except SwarmError:
+            continue  # reported with the plug-ins that cannot be imported
+        if world is not None and plugin is not None and plugin.factory is not None:
+            try:
+                plugin.make(world(grid, truth, scenario.seed))
+            except SwarmError as error:
+                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
 
 
 _ASKED: Mapping[str, Callable[[Plugin, int, Tell], list[object]]] = {

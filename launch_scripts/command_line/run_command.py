@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import typer
@@ -98,6 +99,9 @@ def _sentence(error: TyperException) -> str:
     elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
         names = [name for each in ctx.command.params if not getattr(each, "hidden", False) for name in each.opts]
         said = f"No such option: {option}{nearest(option, names)}"
+    for before, word in pairwise(sys.argv):
+        if re.fullmatch(r"\S*\d,", before) and re.fullmatch(r"[-+.\d]+", word):
+            return f"{said.removesuffix('.')}; a place has no blank: did you mean '{before}{word}'?"
     if ctx is None:
         return said
     said = re.sub(r"(?<!\.)\.$", "", said)

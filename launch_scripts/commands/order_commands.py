@@ -149,7 +149,7 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
     from swarm.runtime.operator import Operator
     from swarm.runtime.order_book import OrderBook
 
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         book = Operator(bus).orders()
     if as_json:
         typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
@@ -222,7 +222,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     made = [checked(GiveOrder, fields if place is None else {**fields, "cell": 0}) for fields in orders]
     silent = 0
     printed: list[dict[str, Any]] = []
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         for order in made:
             said: dict[str, Any] = {}
             if place is not None:

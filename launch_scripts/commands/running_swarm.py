@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -20,6 +20,7 @@ from launch_scripts.commands.shared_options import Tls
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
     from swarm.config.scenario import NetworkConfig
+    from swarm.wire.messages.processes import RunInfo
 
 RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete.runs)]
 RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
@@ -82,6 +83,23 @@ class Where(Tls):
         from swarm.bus.zenoh_bus import open_bus
 
         return open_bus(self.network())
+
+    @contextmanager
+    def operators_bus(self) -> Iterator[tuple[ZenohBus, list[RunInfo]]]:
+        """A session whose orders the run accepts as those of its operator, and the processes of the run, at least
+        one. Raises BusError without any."""
+        from launch_scripts.observe.latest_messages import run_of_most
+        from launch_scripts.observe.run_observer import ask_run
+        from swarm.bus.zenoh_bus import open_bus
+        from swarm.errors import BusError
+        from swarm.runtime.run_secret import authenticator_of
+
+        network = self.network()
+        with open_bus(network) as bus:
+            if not (found := ask_run(bus)):
+                raise BusError(f"no process of a run answers {self}")
+            bus.trust(authenticator_of(network, run_of_most(found)[0]))
+            yield bus, found
 
     def __str__(self) -> str:
         endpoint = self.connect or ", ".join(self._found.connect)

@@ -56,10 +56,12 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
     from rich.console import Console
 
     from launch_scripts.launcher.terminal_tables import columns
-    from launch_scripts.observe.run_registry import registered
+    from launch_scripts.observe.run_registry import logging_into, open_logs, registered
     from launch_scripts.plain_text import plain
 
-    told = [_fields(run) for run in registered() if all or run.launchers]
+    logs = list(open_logs())
+    found = [(run, len(logging_into(run.folder, logs))) for run in registered()]
+    told = [_fields(run, processes) for run, processes in found if all or run.launchers or processes]
     if as_json:
         typer.echo(json.dumps(told, indent=2))
         return
@@ -78,7 +80,8 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 def down(run: RunArgument = None) -> int:
     """End a run of this machine as Ctrl-C does, and wait for its report.
 
-    If the run has not ended, a second `swarm down` kills the processes that are left.
+    If the run has not ended, a second `swarm down` kills the processes that are left. So does the first, if the
+    launcher of the run is not there any more.
 
     swarm down
 
@@ -88,24 +91,31 @@ def down(run: RunArgument = None) -> int:
 
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folder import read_report
-    from launch_scripts.observe.run_registry import registered
+    from launch_scripts.observe.run_registry import is_of_a_swarm, registered
     from swarm.errors import ConfigError, SwarmError
 
     running = [each.name for each in registered() if each.launchers]
     if run is None and len(running) > 1:
         raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
     found = _chosen(run)
+    terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
+    if not found.launchers and (left_over := found.processes()):
+        for pid in left_over.values():
+            with suppress(psutil.NoSuchProcess):
+                psutil.Process(pid).kill()
+        terminal.say(f"run {found.name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
+        return 0
     if not found.launchers:
         raise ConfigError(f"run {found.name} does not run here; these do: {', '.join(running) or 'none'}")
     for pid in found.launchers:
         with suppress(psutil.NoSuchProcess):  # it ended by itself
             process = psutil.Process(pid)
-            if not re.search("swarm|launch_scripts", " ".join(process.cmdline())):
+            if not is_of_a_swarm(pid):
                 raise ConfigError(
                     f"run {found.name}: process {pid} is no launcher; its entry in the registry is wrong"
                 )
             process.send_signal(signal.SIGINT)
-    terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
+            process.resume()  # a stopped one does not hear before
     with terminal.busy(f"run {found.name} ends"):
         while (left := _run_in(found.folder).launchers) and time.monotonic() < until_s:
             time.sleep(_TURN_S)
@@ -153,7 +163,8 @@ def logs(
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:
                 return
-            follow = bool(_run_in(found.folder).launchers)  # once more after its end
+            now = _run_in(found.folder)
+            follow = bool(now.launchers or now.processes())  # once more after its end
             time.sleep(_TURN_S)
             told = _new_lines(found.folder, process, read)
 
@@ -198,6 +209,7 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
 
     found = _chosen(run)
     running = found.processes()
+    again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
     if process not in running:
         has = ", ".join(sorted(running)) or "none"
         raise ConfigError(f"run {found.name} has no process {process!r} on this machine; it has {has}")
@@ -205,13 +217,14 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
         psutil.Process(running[process]).kill()
     except psutil.NoSuchProcess:
         raise ConfigError(f"{process} has just ended by itself") from None
-    typer.echo(f"{process} of run {found.name}, pid {running[process]}, is killed: its launcher starts it again")
+    typer.echo(f"{process} of run {found.name}, pid {running[process]}, is killed: {again}")
 
 
 def in_background(*, as_json: bool) -> int:
     """Runs this command again in the background, without `-d`. Returns once the swarm is whole, or else the exit
     code of the command. Raises ConfigError or StoreError if the run could not be found later."""
     from launch_scripts.observe.run_registry import registered, registry
+    from launch_scripts.stop_requests import stop_requests
     from swarm.errors import ConfigError, StoreError
     from swarm.files import check_writable
 
@@ -224,18 +237,20 @@ def in_background(*, as_json: bool) -> int:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
     words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
     words = [word for word in words if not re.fullmatch("-d+|--detach", word)]
-    launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, errors="replace", start_new_session=True)
-    assert launcher.stdout is not None
-    try:
-        for line in launcher.stdout:
-            typer.echo(line, nl=False, err=True)
-            mine = (run for run in registered() if launcher.pid in run.launchers)
-            if (run := next(mine, None)) is not None and run.is_whole:
-                typer.echo(f"run {run.name} goes on in the background; `swarm down` ends it", err=True)
-                return 0
-    except KeyboardInterrupt:
-        launcher.send_signal(signal.SIGINT)
-    return launcher.wait()
+    with stop_requests() as asked:
+        launcher = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=STDOUT, errors="replace", start_new_session=True)
+        assert launcher.stdout is not None
+        while True:
+            try:
+                for line in launcher.stdout:
+                    typer.echo(line, nl=False, err=True)
+                    mine = (run for run in registered() if launcher.pid in run.launchers)
+                    if not asked() and (run := next(mine, None)) is not None and run.is_whole:
+                        typer.echo(f"run {run.name} goes on in the background; `swarm down` ends it", err=True)
+                        return 0
+                return launcher.wait()
+            except KeyboardInterrupt:
+                launcher.send_signal(signal.SIGINT)
 
 
 def _chosen(name: str | None) -> KnownRun:
@@ -259,13 +274,18 @@ def _run_in(folder: Path) -> KnownRun:
     return next((run for run in registered() if run.folder == folder), KnownRun(folder, (), 0, False))
 
 
-def _fields(run: KnownRun) -> dict[str, Any]:
+def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
     """A row of `swarm ps`."""
     from launch_scripts.observe.run_folder import REPORT_FILE, run_facts
     from launch_scripts.ports import page_of
 
     facts, report = run_facts(run.folder), run.folder / REPORT_FILE
-    over = "ended" if os.path.exists(report) or facts.get("recorded") is False else "broke off"
+    if run.launchers:
+        state = "stopped" if run.is_stopped else "running" if run.is_whole else "starting"
+    elif processes:
+        state = "left over"
+    else:
+        state = "ended" if os.path.exists(report) or facts.get("recorded") is False else "broke off"
     began: str | None = str(facts.get("began"))
     now_s = time.time() if run.launchers else max((f.stat().st_mtime for f in _log_files(run.folder)), default=0.0)
     try:
@@ -275,10 +295,10 @@ def _fields(run: KnownRun) -> dict[str, Any]:
     return {
         "run": run.name,
         "scenario": None if "scenario" not in facts else str(facts["scenario"]),
-        "state": ("running" if run.is_whole else "starting") if run.launchers else over,
+        "state": state,
         "began": began,
         "seconds": lasted_s,
-        "processes": len(run.processes()),
+        "processes": processes,
         "page": page_of(run.web_port) if run.launchers and run.web_port else None,
         "folder": str(run.folder),
     }

@@ -264,6 +264,7 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
     from launch_scripts.check.findings import failure
     from launch_scripts.launcher.console import progress
     from shared_map.terrain.terrain import build_terrain, build_truth
+    from swarm.config.plugin_names import plugins_of
 
     try:
         with progress() as tell:
@@ -274,6 +275,10 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         return
     yield from scenario_check.places(scenario, terrain, truth)
     yield from scenario_check.plots(scenario, terrain.grid)
+    if any(each.name not in each.kind.built_in for each in plugins_of(scenario)):
+        from launch_scripts.check.plugin_check import not_made
+
+        yield from not_made(scenario, terrain.grid, truth)
     wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
     yield from machine.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)

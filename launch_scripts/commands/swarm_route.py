@@ -21,11 +21,12 @@ from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.operator import replies_to
+from swarm.wire.access import OPERATOR
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus
-from swarm.wire.topics import COST, ROUTE
+from swarm.wire.topics import COST, NAMELESS, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -99,7 +100,11 @@ def ask_planner(
         else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
     )
     began_s = time.monotonic()
-    replies, failure = replies_to(bus, COST if cost else ROUTE, request, _TIMEOUT_S, target=target)
+    asker = asker_of(OPERATOR, "command")
+    topic = COST if cost else ROUTE
+    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target, asker=asker)
+    if not replies and failure is None:  # no planner, or an earlier version
+        replies, failure = replies_to(bus, NAMELESS[topic.name], request, _TIMEOUT_S, target=target)
     took_ms = (time.monotonic() - began_s) * 1e3
     for reply in replies:
         if isinstance(reply, RouteReply | CostReply):

@@ -89,7 +89,7 @@ def info(
     elevation_encoding  Encoding of heights, where the file does not state it.
     """
     from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import doubts_about, facts_of
+    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
@@ -108,17 +108,17 @@ def info(
         terrain = build_terrain(scenario, tell)
     rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
     facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
-    doubts = doubts_about(facts)
+    notes, doubts = notes_and_doubts(terrain, facts)
     if as_json:
         zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
-        console.print_json(json.dumps({**facts, "zones": zones, "notes": terrain.notes, "doubts": doubts}))
+        console.print_json(json.dumps({**facts, "zones": zones, "notes": notes, "doubts": doubts}))
         return
     table = Table(show_header=False, box=None)
     for key, value in facts.items():
         shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
         table.add_row(key, shown)
     console.print(table)
-    _say(*(f"- {note}" for note in terrain.notes), *(f"! {doubt}" for doubt in doubts))
+    _say(*lines_of(notes, doubts))
 
 
 def _say(*lines: str) -> None:
@@ -158,6 +158,7 @@ def cost(
     vehicle_class  Vehicle class of the scenario.
     """
     from shared_map.terrain.terrain import build_terrain
+    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
     from shared_map.vehicle_class_grounds import class_terrains
 
     check_target(out, "--out", *_TIFF)
@@ -180,7 +181,7 @@ def cost(
         f" {1 - finite.size / terrain.grid.cells:.1%} lethal, pace {finite.min():.3g} to {finite.max():.3g} s/m"
         f" (median {np.median(finite):.3g}), digest {terrain.digest}"
     )
-    _say(_shares(terrain), *(f"- {note}" for note in terrain.notes))
+    _say(_shares(terrain), *lines_of(*notes_and_doubts(terrain, facts_of(terrain))))
 
 
 @command(app)
@@ -353,6 +354,7 @@ def classify(
     out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
     """
     from shared_map.terrain.terrain import build_terrain
+    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 
     check_target(out, "--out", *_TIFF)
     check_target(picture, "--picture", ".png")
@@ -371,7 +373,7 @@ def classify(
     if out is not None:
         write_raster(out, [terrain.classes], terrain.grid, descriptions=["class"])
     _draw(terrain, picture, f"{photo.name} on {elevation.name}")
-    _say(*(f"- {note}" for note in terrain.notes))
+    _say(*lines_of(*notes_and_doubts(terrain, facts_of(terrain))))
 
 
 def _compare(terrain: Terrain, path: Path) -> None:

@@ -15,22 +15,17 @@ from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Joins, Part, run_role
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, GroupName
-from launch_scripts.observe.run_observer import ask_run
-from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place
 from swarm.right_of_way.guest_session import say_gone
 from swarm.runtime.operator import replies_to
-from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
-    from swarm.config.scenario import NetworkConfig
-    from swarm.wire.messages.processes import RunInfo
 
 _WITHIN_S = 5.0
 """Longest wait until cells are free: wardens answer within a lease, which is shorter."""
@@ -100,16 +95,15 @@ def remove(
 
     names  Agents, such as extra, or vehicles, such as a0-03.
     """
-    network = where.network()
-    found = _members(network, where)
-    agents = {info.id for info in found if info.role == "agent"}
-    asked: dict[str, list[str]] = {}
-    for name in names:
-        agent = name if name in agents else agent_of(name)
-        if agent not in agents:
-            raise ConfigError(f"no agent {agent} takes part {where}; it has {', '.join(sorted(agents)) or 'none'}")
-        asked.setdefault(agent, []).append(name)
-    with _open(network, found[0].run_id) as bus:
+    with where.operators_bus() as (bus, found):
+        agents = {info.id for info in found if info.role == "agent"}
+        asked: dict[str, list[str]] = {}
+        for name in names:
+            agent = name if name in agents else agent_of(name)
+            if agent not in agents:
+                there = ", ".join(sorted(agents)) or "none"
+                raise ConfigError(f"no agent {agent} takes part {where}; it has {there}")
+            asked.setdefault(agent, []).append(name)
         # A request that names the agent itself means all of its vehicles, which an empty list expresses.
         said = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
     for one in said.values():
@@ -133,26 +127,11 @@ def forget(name: str, where: Where) -> None:
 
     name  The guest, such as extra or rover7.
     """
-    network = where.network()
-    run = _members(network, where)[0]
-    with _open(network, run.run_id) as bus:
+    with where.operators_bus() as (bus, found):
+        run = found[0]
         if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):
             raise BusError(f"the cells of {name} are not known to be free after {_WITHIN_S:g} s: say it again")
     typer.echo(f"{name} is removed, and its cells are free")
-
-
-def _members(network: NetworkConfig, where: Where) -> list[RunInfo]:
-    """The processes of the run, at least one."""
-    with open_bus(network) as bus:
-        found = ask_run(bus)
-    if not found:
-        raise BusError(f"no process of a run answers {where}")
-    return found
-
-
-def _open(network: NetworkConfig, run_id: str) -> ZenohBus:
-    """A session whose messages the run's vehicles accept as those of its operator."""
-    return open_bus(network, authenticator=authenticator_of(network, run_id))
 
 
 def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:

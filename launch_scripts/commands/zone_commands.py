@@ -19,7 +19,9 @@ from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
-from swarm.errors import ConfigError
+from swarm.config.ground import ZoneConfig
+from swarm.config.input_files import FileKind, check_file
+from swarm.errors import ConfigError, TerrainError
 from swarm.places import FORMS, corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
@@ -57,20 +59,22 @@ def add(
 
     swarm order zone add --file quarry.geojson --name quarry --class truck
 
-    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
+    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several. A fence's file says
+    itself which of its areas keep in. Elsewhere --kind keep-in closes all but the areas.
 
     polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
     polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
-    file           A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.
+    file           A file of areas instead, as in a scenario's zones, in any system.
     layer          Layer of a file that has several.
     crs            Coordinate system, if the file names none: EPSG:32632, or local.
-    kind           lethal, or pace:X for X seconds per metre.
+    kind           lethal, keep-in (all else is lethal), or pace:X for X seconds per metre.
     for_           Duration: 90s, 10m, 2h. Until it is removed, if not given.
     name           Zone name. Replaces a zone of the same name.
     vehicle_class  Vehicle class; if not given, all vehicles.
     """
     fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(for_)}
     fields["vehicle_class"] = vehicle_class
+    inside = kind == "keep-in"
     if file is None:
         if layer is not None or crs is not None:
             raise ConfigError("zone add: --layer and --crs go with --file")
@@ -82,27 +86,39 @@ def add(
         order = checked(ZoneOrder, fields)
 
         def of_places(frame: MapFrame) -> Iterable[ZoneOrder]:
-            if not places:
+            if not (places or inside):
                 return [order]
-            return [msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon"))]
+            corners = corners_of(places or [f"xy:{x},{y}" for x, y in order.polygon_m], frame, "--polygon")
+            if not inside:
+                return [msgspec.structs.replace(order, polygon=corners)]
+            from shared_map.importers.zones.outlines import all_but
+
+            return _zones(fields, all_but(corners, frame.grid, MOST_CORNERS))
 
         return _give(of_places, where, as_json)
     if polygon is not None or polygon_m is not None:
         raise ConfigError("zone add: give either --file or a polygon")
-    if not file.is_file():
-        raise ConfigError(f"--file: {file} does not exist")
+    try:
+        check_file(file, FileKind.VECTORS)
+    except TerrainError as error:
+        raise ConfigError(f"--file: {error}") from error
     checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
 
     def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
-        from shared_map.importers.zones.vector_shapes import outlines_of
+        from shared_map.importers.zones.outlines import outlines_of
 
-        outlines = outlines_of(file, frame.grid, layer, crs, MOST_CORNERS)
-        several = len(outlines) > 1 and name
-        for number, outline in enumerate(outlines, 1):
-            called = f"{name}-{number}" if several else name
-            yield checked(ZoneOrder, fields | {"name": called, "polygon": outline})
+        zone = ZoneConfig(kind="keep_in" if inside else "forbidden", file=str(file), layer=layer, crs=crs)
+        return _zones(fields, outlines_of(zone, frame.grid, MOST_CORNERS))
 
     return _give(of_file, where, as_json)
+
+
+def _zones(fields: dict[str, object], outlines: list[list[list[tuple[float, float]]]]) -> Iterable[ZoneOrder]:
+    """An order for each area, which are numbered if they are several."""
+    several = len(outlines) > 1 and fields["name"]
+    for number, (border, *holes) in enumerate(outlines, 1):
+        name = f"{fields['name']}-{number}" if several else fields["name"]
+        yield checked(ZoneOrder, fields | {"name": name, "polygon": border, "polygon_m": [], "holes": holes})
 
 
 @command(app)
@@ -123,7 +139,7 @@ def list_zones(where: Where, as_json: AsJson = False) -> None:
 
     swarm order zone ls
     """
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         zones, frame = Operator(bus).zones(), frame_of_run(bus, where)
     if as_json:
         typer.echo(json.dumps(_fields(zones, frame), indent=2))
@@ -139,7 +155,7 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """
-    with where.bus() as bus:
+    with where.operators_bus() as (bus, _):
         frame = frame_of_run(bus, where)
         given = [Operator(bus).zone(order) for order in list(orders_on(frame))]
     zones = given[-1][0]
@@ -185,7 +201,7 @@ def _ends(zone: Zone, frame: MapFrame) -> list[int]:
 
 
 def _kind(text: str) -> dict[str, object]:
-    if text == "lethal":
+    if text in ("lethal", "keep-in"):
         return {"kind": "lethal"}
     head, _, value = text.partition(":")
     try:
@@ -193,7 +209,7 @@ def _kind(text: str) -> dict[str, object]:
             return {"kind": "pace", "pace_s_per_m": pace}
     except ValueError:
         pass
-    raise ConfigError(f"--kind: {text!r} is neither lethal nor pace:X, with X in seconds per metre")
+    raise ConfigError(f"--kind: {text!r} is neither lethal, keep-in nor pace:X, with X in seconds per metre")
 
 
 def _lasts_s(text: str | None) -> float | None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
+from launch_scripts.parent_death import end_with_parent
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
 from swarm.runtime.health import Board, Health
@@ -67,6 +68,7 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     pipe = reports.exit_reason
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    end_with_parent(signal.SIGCONT)  # the forkserver ends with the launcher: one that is stopped then sees it, too
     _watch_launcher()
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)

@@ -14,7 +14,7 @@ from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map import NEEDED, Fetching, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
-from shared_map.terrain.terrain import build_truth
+from shared_map.terrain.terrain import build_truth, terrain_digest
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
@@ -80,7 +80,10 @@ def fetch_if_missing(
     with _locked(run_dir):
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):
-            return True
+            costs = scenario.cost
+            if here.digest == terrain_digest(here.grid, here.pace_s_per_m, costs, here.elevation_m):
+                return True
+            log.warning("the terrain in %s is not as it was written: fetching it again", run_dir)
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
         layers = (*NEEDED, "photo") if looks else NEEDED
         with open_bus(scenario.network) as bus:

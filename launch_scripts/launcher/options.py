@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import fcntl
 import hashlib
@@ -38,6 +37,7 @@ from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
 from swarm.files import writing
+from swarm.journal import digest_of
 from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 
@@ -240,16 +240,24 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)  # of two that start at once each gets a number of its own
             last = 0
-            with contextlib.suppress(ValueError):  # cut short by a full disk
-                last = min(int(os.pread(file, _DIGITS, 0) or b"0"), _HIGHEST)
+            digits, _, digest = os.pread(file, 3 * _DIGITS, 0).partition(b" ")
+            # Without a digest it is from before there were any. A changed file is made again from the clock.
+            if len(digits) == _DIGITS and digits.isdigit() and digest in (b"", _hex_digest(digits)):
+                last = min(int(digits), _HIGHEST)
             incarnation = max(time.time_ns(), last + 1)
             # Fixed-length write in place, so that a restart works on a full disk.
-            if os.pwrite(file, b"%0*d" % (_DIGITS, incarnation), 0) != _DIGITS:
+            digits = b"%0*d" % (_DIGITS, incarnation)
+            content = digits + b" " + _hex_digest(digits)
+            if os.pwrite(file, content, 0) != len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(file)
         finally:
             os.close(file)
     return incarnation
+
+
+def _hex_digest(content: bytes) -> bytes:
+    return digest_of(content).hex().encode()
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,10 @@ log = logging.getLogger(__name__)
 LEAVES_TO_OTHERS_S = 3.0
 """A launcher of a part of a swarm starts such a planner only if none has appeared for so long."""
 
+_BEGIN_AT_ONCE = 2
+_BEGINS_WITHIN_S = 10.0
+"""A planner that has not come up by then holds up no other."""
+
 
 class OrderedPlanners:
     """Starts and ends planners on this machine according to orders.
@@ -27,6 +31,7 @@ class OrderedPlanners:
     own    processes that this launcher started: of the scenario's own targets it sees to their planners only
     whole  whether this launcher started the whole swarm: then no other will start them
     say    tells the user
+    no_room  number of planners of added targets here -> reason why the machine cannot carry that number
     """
 
     def __init__(
@@ -37,6 +42,7 @@ class OrderedPlanners:
         own: Collection[ProcessSpec],
         whole: bool,
         say: Callable[[str], None],
+        no_room: Callable[[int], str | None] = lambda planners: None,
     ) -> None:
         self._scenario = scenario
         self._swarm = swarm
@@ -46,6 +52,11 @@ class OrderedPlanners:
         self._say = say
         self._missing_s: dict[str, float] = {}
         """Planner -> since when it has been missing."""
+        self._no_room = no_room
+        self._started_s: dict[str, float] = {}
+        """Planner -> when it was started here last."""
+        self._told = ""
+        """Reason why planners are not started, as the user was told last."""
         self._refused: set[str] = set()
 
     def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
@@ -60,11 +71,24 @@ class OrderedPlanners:
         for id in sorted(here):
             if job_of(id) not in targets:
                 self._swarm.dismiss(planner_spec(id))
+        due = []
         for id in sorted(wanted - here - self._refused):
             if ("planner", id) in alive:
                 self._missing_s.pop(id, None)
             elif now_s - self._missing_s.setdefault(id, now_s) >= self._wait_s:
-                self._start(id)
+                due.append(id)
+        begin = [id for id, since_s in self._started_s.items() if now_s - since_s < _BEGINS_WITHIN_S]
+        free = _BEGIN_AT_ONCE - sum(("planner", id) not in alive for id in begin)
+        for id in due[: max(free, 0)]:
+            if (reason := self._no_room(len(wanted & here) + 1)) is not None:
+                if reason != self._told:
+                    more = f" and {len(due) - 1} more" if len(due) > 1 else ""
+                    self._say(f"planner-{id}{more}: not started: {reason}")
+                self._told = reason
+                break
+            here.add(id)
+            self._started_s[id] = now_s
+            self._start(id)
         # One that the scenario has, and that was removed, is wanted again when its removal is taken back.
         for id in sorted({id for id in self._own if job_of(id) in targets} - here):
             if any(order.subject == "target" and order.name == job_of(id) for order in book):

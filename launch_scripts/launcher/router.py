@@ -8,12 +8,19 @@ restart.
 from __future__ import annotations
 
 import logging
+import resource
 import time
 from collections.abc import Callable
 
+import msgspec
+
 from launch_scripts.deploy.revocations import with_revocations
+from launch_scripts.launcher.router_door import HANDSHAKE_S, Door
+from launch_scripts.ports import free_ports
 from launch_scripts.process_table import admitting_all
+from launch_scripts.web import LOOPBACK
 from swarm.bus.bus import Bus, Event, Post
+from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -84,11 +91,25 @@ class Admission:
     """The router's session, reopened whenever the list of revoked names changes."""
 
     def __init__(self, network: NetworkConfig) -> None:
+        self._door, network = behind_door(network)
         self._network = network
         self._admitting = with_revocations(network)
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
-        self.bus = open_bus(self._admitting, mode="router")
+        try:
+            self.bus = open_bus(self._admitting, mode="router")
+        except BaseException:
+            self._close_door()
+            raise
+
+    def close(self) -> None:
+        """Leaves the network."""
+        self._close_door()
+        self.bus.close()
+
+    def _close_door(self) -> None:
+        if self._door is not None:
+            self._door.close()
 
     def reopened(self) -> ZenohBus | None:
         """The new session, if one was opened. If the list cannot be read, the previous one stays in force."""
@@ -119,8 +140,23 @@ class Admission:
                 time.sleep(0.05)
 
 
+def behind_door(network: NetworkConfig) -> tuple[Door | None, NetworkConfig]:
+    """A door at the `tls/` endpoints of a router, if it has any, and the network as the router listens then. Raises
+    BusError if it cannot listen."""
+    outside = [endpoint for endpoint in network.listen if endpoint.startswith("tls/")]
+    if not outside:
+        return None, network
+    inner = LOOPBACK, free_ports(1)[0]
+    door = Door([host_port(each) for each in outside], inner)
+    within = f"tls/{inner[0]}:{inner[1]}#tls_handshake_timeout_ms={HANDSHAKE_S * 1000:.0f}"
+    others = tuple(each for each in network.listen if each not in outside)
+    return door, msgspec.structs.replace(network, listen=(*others, within))
+
+
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     clock, inbox = MonotonicClock(), Inbox()
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each connection, silent ones included, is a file
     admission = Admission(admitting_all(setup.scenario).network)
     try:
         peer = Peer(setup.role, setup.id, setup.incarnation)
@@ -131,4 +167,4 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
             end_with(stop_when, process.stop)
         process.run()
     finally:
-        admission.bus.close()
+        admission.close()

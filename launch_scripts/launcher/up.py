@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.check.machine_check import this_machine, why_no_room
 from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
@@ -57,6 +58,7 @@ from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -217,7 +219,8 @@ class _Run:
                 self._swarm.stop(lambda: time.sleep(_TURN_S), force=self._stop_asked.force)
                 return self._stopped_early()
             log.info("the router listens")
-            with open_bus(self._scenario.network) as bus:
+            network = self._scenario.network
+            with open_bus(network, authenticator=authenticator_of(network, self._run_id)) as bus:
                 self._join(bus)
                 self._say_begin()
                 known: Recorder | OwnPart
@@ -364,8 +367,12 @@ class _Run:
     def _ordered_planners(self) -> OrderedPlanners:
         options = self._options
         whole = options.is_whole and not options.joins
+
+        def no_room(planners: int) -> str | None:
+            return why_no_room(self._scenario, self._terrain.grid.cells, planners, this_machine(self._run_dir))
+
         return OrderedPlanners(
-            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say
+            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say, no_room
         )
 
     def _is_up(self, watcher: Watcher) -> bool:

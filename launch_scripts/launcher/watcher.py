@@ -144,6 +144,7 @@ class Watcher(RunObserver):
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
         time.sleep(for_s)
+        self._bus.gather()
         for heard in self.due(self.now_ns()):
             self._inbox.post(heard)
         until_s = time.monotonic() + _READ_S
@@ -154,6 +155,7 @@ class Watcher(RunObserver):
 
     def finish(self) -> None:
         """Takes messages that have arrived and were not due yet: no further ones come."""
+        self._bus.gather()
         for heard in self.due(self.now_ns(), all=True):
             self.take(heard, self.now_ns())
 

@@ -17,6 +17,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process, Service, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.stats import Counters
 
 FRAME_HZ = 10.0
@@ -36,7 +37,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             told = {"life": "", "at_s": 0.0, "name": name, "state": "its processes have begun"}
             page = when_free(lambda: LivePage(view.web_port, lambda: told, terrain))
             stack.callback(page.server.close)
-        bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
+        network = setup.scenario.network
+        bus = stack.enter_context(
+            open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id))
+        )
 
         def load() -> _Make:
             from launch_scripts.monitor.service import load_view  # takes as long as a whole planner's start
@@ -45,7 +49,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
 
         info = setup.info(terrain.grid, terrain.digest)
         service = LoadingMonitor(Member(info, bus, inbox.post, setup.before), inbox.post, load)
-        process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health)
+        process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health, gather=bus.gather)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

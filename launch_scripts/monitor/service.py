@@ -225,7 +225,7 @@ class MonitorService:
             self._movers.draw_anew()
         if (target := self._ground.tick(now_ns, self._watched)) is not None:
             request = self._ground.samples.request
-            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
+            self._member.ask_by_name(COST, request, tag="cost", timeout_s=_ANSWER_S, target=target)
         self._movers.tick(now_ns, self._watched)
         self._draw_plots(now_ns)
         if self._watched:

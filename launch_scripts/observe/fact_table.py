@@ -281,8 +281,11 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     reached += [] if captures is None else [_many(captures, "capture")]
     reached += [] if collisions is None else [_many(collisions, "collision")]
     forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
-    alarms = [alarm for alarm in report.get("alarms") or [] if alarm["over_s"] is None]
-    serious = [alarm["text"] for alarm in alarms if alarm["kind"] in SERIOUS]
+    serious = [
+        alarm["text"] + (f" for {Duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
+        for alarm in report.get("alarms") or []
+        if alarm["kind"] in SERIOUS and (alarm["over_s"] is None or alarm["kind"] == "silent")
+    ]
     wrong = list(dict.fromkeys([*failures, *forbidden, *serious, *left_behind(report)]))
     more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
     how = f"Not all went well: {'; '.join(wrong[:_NAMED])}{more}." if wrong else WELL

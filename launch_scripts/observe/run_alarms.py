@@ -195,6 +195,8 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
     for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
         yield _of_process("silent", role, id, "is alive, but silent", _said_ns(latest, role, id, heard_ns))
+    for (role, id), (began_ns, over_ns) in sorted(latest.silences.items()):
+        yield _of_process("silent", role, id, "was silent", began_ns, over_ns)
 
 
 def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
@@ -203,9 +205,9 @@ def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
     return otherwise_ns if stats is None else stats.stamp_ns
 
 
-def _of_process(kind: str, role: str, id: str, what: str, since_ns: int) -> Told:
+def _of_process(kind: str, role: str, id: str, what: str, since_ns: int, over_ns: int | None = None) -> Told:
     name, target = f"{role}-{id}", job_of(id) if role == "planner" else None
-    return Told(kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, target=target)
+    return Told(kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, over_ns=over_ns, target=target)
 
 
 def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[Told, int]]:

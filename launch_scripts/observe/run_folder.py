@@ -123,9 +123,12 @@ def find_run(name: str, runs: Path) -> Path:
             named = path.parent / read_text(path, FileKind.RUN).strip()
             if named.is_dir():
                 return named
-    for run in registered() if runs == RUNS else ():
-        if name in (run.name, LAST):
-            return run.folder
+    known = [run.folder for run in registered() if name in (run.name, LAST)] if runs == RUNS else []
+    if name != LAST and len(known) > 1:
+        folders = ", ".join(map(str, known))
+        raise ConfigError(f"found {len(known)} runs called {name!r}, expected the folder of one: {folders}")
+    if known:
+        return known[0]
     raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}; `swarm ps -a` lists your runs")
 
 

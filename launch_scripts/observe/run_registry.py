@@ -7,12 +7,13 @@ its launcher: it goes when the folder of the run does.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 
@@ -20,9 +21,6 @@ from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError, SwarmError
 from swarm.files import write_file
 from swarm.runtime.run_secret import state_folder
-
-if TYPE_CHECKING:
-    from psutil import Process
 
 LAUNCHER_LOG = "launcher.log"
 _SAME_START_S = 0.005
@@ -61,14 +59,17 @@ class KnownRun:
         return self.folder.name
 
     def processes(self) -> dict[str, int]:
-        """Name -> pid of the processes of this run that its launchers have started and that run now."""
+        """Name -> pid of the processes of this run that are there now, also if its launchers have ended."""
+        return {name: pid for name, pid in logging_into(self.folder).items() if is_of_a_swarm(pid)}
+
+    @property
+    def is_stopped(self) -> bool:
+        """Returns True if a launcher is stopped, as by Ctrl-Z or SIGSTOP."""
         import psutil
 
-        started: list[Process] = []
-        for pid in self.launchers:
-            with suppress(psutil.Error):
-                started += psutil.Process(pid).children(recursive=True)
-        return logging_into(self.folder, started)
+        with suppress(psutil.Error):
+            return any(psutil.Process(pid).status() == psutil.STATUS_STOPPED for pid in self.launchers)
+        return False
 
 
 def registry() -> Path:
@@ -161,21 +162,30 @@ def _runs(entry: _Entry) -> bool:
     return False
 
 
-def logging_into(folder: Path, processes: Iterable[Process] | None = None) -> dict[str, int]:
-    """Name -> pid of the processes that log into a run's folder, as `open_logs` finds them; no launcher is among
-    them."""
-    found = {path.name.partition(".log")[0]: pid for pid, path in open_logs(processes) if path.parent == folder}
-    return {name: pid for name, pid in found.items() if name + ".log" != LAUNCHER_LOG}
-
-
-def open_logs(processes: Iterable[Process] | None = None) -> Iterator[tuple[int, Path]]:
-    """Yields (pid, file) for each log file that a process of this user has open for writing.
-
-    processes  the processes to search; None: all processes of this machine
-    """
+def is_of_a_swarm(pid: int) -> bool:
+    """Returns True if a process may be sent a signal: another program can log into the folder of a run, and an
+    entry of the registry can name any process."""
     import psutil
 
-    for process in psutil.process_iter() if processes is None else processes:
+    with suppress(psutil.Error):
+        return re.search("swarm|launch_scripts", " ".join(psutil.Process(pid).cmdline())) is not None
+    return False
+
+
+def logging_into(folder: Path, logs: Iterable[tuple[int, Path]] | None = None) -> dict[str, int]:
+    """Name -> pid of the processes that log into a run's folder; no launcher is among them.
+
+    logs  what `open_logs` has found; None: it searches now
+    """
+    found = (each for each in (open_logs() if logs is None else logs) if each[1].parent == folder)
+    return {path.name.partition(".log")[0]: pid for pid, path in found if not path.name.startswith(LAUNCHER_LOG)}
+
+
+def open_logs() -> Iterator[tuple[int, Path]]:
+    """Yields (pid, file) for each log file that a process of this user has open for writing."""
+    import psutil
+
+    for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
             for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
                 yield process.pid, Path(path)

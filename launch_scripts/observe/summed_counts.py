@@ -11,10 +11,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+from swarm.clock import NS_PER_S
 from swarm.liveness import job_of
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO, Histogram, merged
 from swarm.wire.messages.processes import Stats
 
+LONG_SILENCE_NS = 10 * NS_PER_S
+"""A process says its counts once a second. After a longer time without them it is named at the end of the run."""
 Number = TypeVar("Number", int, float)
 
 
@@ -33,6 +36,8 @@ class Counts:
         """Lives that are summed; None since the last that was new."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
+        self.silences: dict[tuple[str, str], tuple[int, int]] = {}
+        """(role, id) -> begin and end of the longest time without counts in one life, if that was long."""
 
     def count(self, stats: Stats) -> None:
         """Takes in what a process says."""
@@ -41,9 +46,13 @@ class Counts:
         if known is None or stats.stamp_ns >= known.stamp_ns:
             self._stats[key] = stats
             self._counting = None
-            newest = self._newest.get((stats.role, stats.id))
+            of = (stats.role, stats.id)
+            newest = self._newest.get(of)
             if newest is None or stats.incarnation >= newest.incarnation:
-                self._newest[stats.role, stats.id] = stats
+                self._newest[of] = stats
+            began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
+            if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
+                self.silences[of] = (known.stamp_ns, stats.stamp_ns)
 
     def newest_stats(self, role: str, id: str) -> Stats | None:
         """Returns the last `Stats` of a process's newest incarnation."""

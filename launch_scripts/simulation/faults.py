@@ -8,6 +8,7 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from swarm.clock import NS_PER_S
@@ -23,6 +24,8 @@ OBSERVER = "recorder-0"
 MOST_WRONG_S = 11.5 * 3600
 """No clock is further off, in any combination of steps: marks of a process whose clock is a day ahead of the
 reader's are refused, so of two that are half a day off to either side one would never accept the other's."""
+_STOPS_S = (0.02, 0.1, 0.4, 1.5, 3.0)
+"""Longest stops of a process on a machine that is far too busy: from a slice of a scheduler to a page from disk."""
 _NS_PER_MS = 1_000_000
 """A unit: plans of faults are written in milliseconds, the simulated clock counts nanoseconds."""
 
@@ -76,6 +79,21 @@ class Twin:
     node: str
 
 
+class Stop(NamedTuple):
+    """A stop of a process within a call of its service, for `lasts_ns`.
+
+    A call of a service is four steps: its inbox is read, the clock is read, it works, and its messages go out one
+    by one. Work reads nothing else, so a stop within it is one before a message.
+
+    sends  the messages that go out before the stop; None: it is stopped earlier
+    timed  the clock was read before the stop
+    """
+
+    lasts_ns: int
+    sends: int | None
+    timed: bool
+
+
 @dataclass(frozen=True, slots=True)
 class FaultPlan:
     """All faults of one run.
@@ -84,6 +102,7 @@ class FaultPlan:
     duplicate   share that arrive twice
     reorder     share that later messages overtake
     delay_ms    delay of every message; up to jitter_ms more are added by chance
+    stutter     share of calls of a service within which its process is stopped, see `Stop`
     quiet_s     from this second on no message is lost, repeated or reordered; None: never
     skews_ms    by how much each node's clock is wrong
     """
@@ -93,6 +112,7 @@ class FaultPlan:
     reorder: float = 0.0
     delay_ms: float = 0.2
     jitter_ms: float = 0.0
+    stutter: float = 0.0
     quiet_s: float | None = None
     partitions: tuple[Partition, ...] = ()
     crashes: tuple[Crash, ...] = ()
@@ -122,8 +142,37 @@ class FaultyLinks:
         self._began_ns = began_ns
         self._lease_s = lease_s
         self._last_ns: dict[tuple[str, str], int] = {}
-        faultless = not (plan.drop or plan.duplicate or plan.reorder or plan.jitter_ms or plan.partitions)
+        self._held: dict[str, tuple[int, int]] = {}
+        """Stopped node -> how many messages it sends before the stop, and until when that lasts."""
+        faultless = not (
+            plan.drop or plan.duplicate or plan.reorder or plan.jitter_ms or plan.partitions or plan.stutter
+        )
         self._always = (int(plan.delay_ms * _NS_PER_MS),) if faultless else None
+
+    def stop(self, now_ns: int) -> Stop | None:
+        """Draws whether a process is stopped in a call that begins now, and where."""
+        plan, chance = self._plan, self._chance
+        if not plan.stutter or chance.random() >= plan.stutter or self._is_quiet(now_ns):
+            return None
+        lasts_ns = int(chance.choice(_STOPS_S) * chance.uniform(0.5, 1.0) * NS_PER_S)
+        sends = chance.choice((None, chance.randrange(20)))
+        return Stop(lasts_ns, sends, chance.random() < 0.5)
+
+    def hold(self, node: str, sends: int, until_ns: int) -> None:
+        """Holds messages of a node until a time, all but the next `sends`."""
+        self._held[node] = sends, until_ns
+
+    def _is_quiet(self, now_ns: int) -> bool:
+        quiet_s = self._plan.quiet_s
+        return quiet_s is not None and (now_ns - self._began_ns) / NS_PER_S >= quiet_s
+
+    def _held_ns(self, source: str, now_ns: int) -> int:
+        """Returns the time for which a message of a node waits for the end of its stop."""
+        sends, until_ns = self._held.get(source, (0, 0))
+        if sends and until_ns > now_ns:
+            self._held[source] = sends - 1, until_ns
+            return 0
+        return max(until_ns - now_ns, 0)
 
     def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
         if self._always is not None:
@@ -137,10 +186,11 @@ class FaultyLinks:
             for each in plan.partitions
         ):
             return ()
-        quiet = plan.quiet_s is not None and at_s >= plan.quiet_s
+        quiet = self._is_quiet(now_ns)
         if not quiet and plan.drop and chance.random() < plan.drop:
             return ()
         delay_ns = int((plan.delay_ms + chance.random() * plan.jitter_ms) * _NS_PER_MS)
+        delay_ns += self._held_ns(source, now_ns)
         if not quiet and plan.reorder and chance.random() < plan.reorder:
             return (delay_ns + int((1 + chance.random() * 99) * _NS_PER_MS),)
         link = (source, destination)

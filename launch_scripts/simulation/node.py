@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from launch_scripts.process_table import ProcessSpec
@@ -176,10 +177,36 @@ class Node:
         if self.bus is not bus or self._shell is None:
             return
         if self.ticking and self._waiting is None:
-            self._shell.tick(self.now_ns())
-            for look in self._simulation.after_tick:
-                look(self)
+            self._call(bus, self._shell.tick, looks=True)
         self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
+
+    def _call(self, bus: MemoryBus, work: Callable[[int], None], *, looks: bool = False) -> None:
+        """Calls the service as `Process` does: inbox, clock, work. It may be stopped anywhere between."""
+        links, scheduler = self._simulation.links, self._simulation.scheduler
+        stop = links.stop(self._clock.now_ns())
+        bus.gather()
+        if stop is None:
+            return self._work(work, self.now_ns(), looks)
+        self.hang()
+        timed_ns = self.now_ns()
+        until_ns = self._clock.now_ns() + stop.lasts_ns
+        if stop.sends is not None:
+            links.hold(self.name, stop.sends, until_ns)
+            self._work(work, timed_ns, looks)
+
+        def go_on() -> None:
+            if self.bus is bus:
+                if stop.sends is None:
+                    self._work(work, timed_ns if stop.timed else self.now_ns(), looks)
+                self.wake()
+
+        scheduler.at(until_ns, go_on)
+        return None
+
+    def _work(self, work: Callable[[int], None], now_ns: int, looks: bool) -> None:
+        work(now_ns)
+        for look in self._simulation.after_tick if looks else ():
+            look(self)
 
     def crash(self) -> None:
         """Ends the process as kill -9 does: nothing is published or saved."""
@@ -203,16 +230,17 @@ class Node:
         if waiting:
             self._simulation.log.event(self._clock.now_ns(), "wake", self.name)
         for event in waiting:
-            self._take(event)
+            self._take(event)  # which may stop it again
 
     def _take(self, event: Event) -> None:
         if self._waiting is not None:
             self._waiting.append(event)
-        elif self._shell is not None:
-            self._shell.handle(event, self.now_ns())
+        elif self._shell is not None and self.bus is not None:
+            self._call(self.bus, partial(self._shell.handle, event))
 
     def stop(self) -> None:
-        if self._shell is not None:
+        if self._shell is not None and self.bus is not None:
+            self.bus.gather()
             self._shell.counters.gauge(ENDED, 1.0)
             self._shell.stop(self.now_ns())
 

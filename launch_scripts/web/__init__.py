@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from email.message import Message  # takes time to import, and a probe is to be quick
 
 LOOPBACK = "127.0.0.1"
+HEALTHY, READY = "/healthz", "/readyz"
+PROBED = (HEALTHY, READY)
+"""Pages of health. A server keeps places for those who ask for them."""
 
 
 class Reply(NamedTuple):

@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from launch_scripts.plain_text import plain
+from launch_scripts.web import HEALTHY, READY
 from swarm.errors import BusError, ConfigError, SwarmError
 
 NOT_READY = 1
@@ -25,7 +26,6 @@ _TIMEOUT_S = 5.0
 no answer."""
 _MOST_BYTES = 1 << 20
 """A page of health has a line for each thing that is missing, some hundred bytes: room for ten thousand of them."""
-_READY, _HEALTHY = "/readyz", "/healthz"
 _LONGEST = 300
 """Characters of a line, or of an address in an error: a few lines of a terminal. The text came from the network."""
 
@@ -56,7 +56,7 @@ def ask(url: str, *, live: bool) -> Answer:
     try:
         with socket.create_connection((host, port), _TIMEOUT_S) as connection:
             name = f"[{host}]" if ":" in host else host
-            words = f"GET {path or (_HEALTHY if live else _READY)} HTTP/1.0\r\nHost: {name}:{port}\r\n\r\n"
+            words = f"GET {path or (HEALTHY if live else READY)} HTTP/1.0\r\nHost: {name}:{port}\r\n\r\n"
             connection.sendall(words.encode("ascii"))
             reply = _read(connection)
     except TimeoutError as error:

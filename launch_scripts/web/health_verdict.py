@@ -9,11 +9,9 @@ from functools import partial
 from typing import NamedTuple
 
 from launch_scripts.plain_text import Duration
-from launch_scripts.web import Page, Reply
+from launch_scripts.web import PROBED, READY, Page, Reply
 from swarm.clock import NS_PER_S
 from swarm.runtime.health import Phase, Vitals
-
-HEALTHY, READY = "/healthz", "/readyz"
 
 
 class Process(NamedTuple):
@@ -92,4 +90,4 @@ def health_pages(processes: Callable[[], Sequence[Process]]) -> dict[str, Page]:
         found = verdict(question, processes(), time.monotonic_ns())
         return Reply(200 if found.ok else 503, "application/json", found.body)
 
-    return {question: partial(answer, question) for question in (HEALTHY, READY)}
+    return {question: partial(answer, question) for question in PROBED}

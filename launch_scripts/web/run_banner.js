@@ -13,12 +13,12 @@
   const start = document.createElement("div");
   start.id = "run-start";
   start.style.cssText =
-    "position:fixed;inset:0;z-index:9;overflow:auto;padding:32px;background:#0d1011;color:#e8eaed;" +
+    "position:fixed;inset:0;z-index:9;overflow:auto;padding:88px 32px 32px;background:#0d1011;color:#e8eaed;" +
     "font:16px/1.5 sans-serif;white-space:pre-line";
   const parts = {};
   for (const name of ["h1", "p", "img", "pre"]) start.appendChild((parts[name] = document.createElement(name)));
   parts.img.style.cssText = "display:block;max-width:min(900px,100%);max-height:60vh;border-radius:6px";
-  parts.pre.style.cssText = "font:14px/1.5 sans-serif;white-space:pre-line";
+  parts.pre.style.cssText = "font:14px/1.5 sans-serif;white-space:pre-wrap";
   document.body.appendChild(start);
   let run = null, failures = 0, late = 0;
 

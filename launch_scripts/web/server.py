@@ -5,26 +5,33 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import re
 import select
 import socket
 import socketserver
 import sys
 import threading
 import time
-import urllib.parse
 from collections.abc import Mapping
+from dataclasses import dataclass
 from email.message import Message
+from enum import IntEnum
 from http.server import BaseHTTPRequestHandler
 from typing import Any, NamedTuple, cast
 
-from launch_scripts.web import LOOPBACK, Page
+from launch_scripts.web import LOOPBACK, PROBED, Page
+from swarm.config.load import is_loopback
 from swarm.errors import BusError
 
 MOST_CONNECTIONS = 24
 """At once, of each server: a browser opens six."""
+_MOST_PEEKED = 1 << 13
+"""Bytes of a request that are looked at before its thread reads them: a browser's has 1 kB, a probe's 100 bytes."""
 SEND_WITHIN_S = 20.0
 """A reader of the stream that takes nothing for so long is cut off."""
-_HOSTS = frozenset((LOOPBACK, "localhost", "::1"))
+_AUTHORITY = r"(?:([A-Za-z0-9.]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?"
+_SAYS_HOST = {"host": re.compile(_AUTHORITY), "origin": re.compile(f"https?://{_AUTHORITY}")}
+"""A name or address and a port, and nothing else: parsers of URLs disagree about all other forms."""
 _HTTP_2 = b"PRI * HTTP/2.0\r\n"
 """The first line of HTTP/2 in the clear, which native viewers speak and no browser does."""
 _HEADERS = {
@@ -44,18 +51,16 @@ def refusal(headers: Message) -> str | None:
     """Says why a request is not served; None if it is. Any port will do: a tunnel begins where it likes."""
     for name in ("host", "origin"):
         found = headers.get_all(name, [""] if name == "host" else [])
-        if len(found) > 1 or any(_host_of(f"//{each}" if name == "host" else each) not in _HOSTS for each in found):
+        if len(found) > 1 or not all(_names_this_machine(name, each) for each in found):
             return f"{name} {', '.join(found)[:80]!r} is not this machine"
     if any(sign in value for value in headers.values() for sign in "\r\n"):
         return "a header goes on in another line"  # a server behind might read it otherwise
     return None
 
 
-def _host_of(url: str) -> str | None:
-    try:
-        return urllib.parse.urlsplit(url).hostname
-    except ValueError:
-        return None
+def _names_this_machine(header: str, value: str) -> bool:
+    match = _SAYS_HOST[header].fullmatch(value)
+    return match is not None and is_loopback((match[1] or match[2]).lower())
 
 
 class Audience(NamedTuple):
@@ -63,6 +68,37 @@ class Audience(NamedTuple):
 
     now: int
     ever: int
+
+
+class Haste(IntEnum):
+    """Speed at which a connection frees its place. Where there are too many, the slowest kind is cut first."""
+
+    ASKS = 0
+    """It has not finished its request, which may take as long as it likes."""
+    READS = 1
+    """It gets an answer, which may be long."""
+    PROBES = 2
+    """It gets an answer about health, which is short."""
+
+
+def _haste(head: bytes) -> Haste:
+    """The kind of a connection, from the bytes that it has sent."""
+    if b"\r\n\r\n" not in head:
+        return Haste.ASKS
+    path = head.split(b" ", 2)[1:2]
+    return Haste.PROBES if path and path[0].decode("latin1") in PROBED else Haste.READS
+
+
+@dataclass(slots=True)
+class _Visitor:
+    """An open connection.
+
+    until_s  when it is cut, on the monotonic clock
+    haste    as far as its thread has read it
+    """
+
+    until_s: float
+    haste: Haste = Haste.ASKS
 
 
 class Server(socketserver.ThreadingTCPServer):
@@ -75,8 +111,10 @@ class Server(socketserver.ThreadingTCPServer):
     behind   address of rerun's server, to which requests for the stream are passed
     lasts_s  a connection that does not take the stream is cut after so long
 
-    Requests are short: beyond the bound the oldest connection which has not taken the stream is closed for the new
-    one, so that no client keeps others out by holding connections open. If all have taken it, the new one is cut.
+    Requests are short: beyond the bound the slowest connection which has not taken the stream is closed for the new
+    one, so that no client keeps others out by holding connections open: first one that has not finished its
+    request, then a reader, then a probe, and of one kind the oldest. Probes therefore lose their place to probes
+    only. If all have taken the stream, the new one is cut.
 
     Raises BusError if it cannot listen there. The OSError is its cause.
     """
@@ -98,11 +136,11 @@ class Server(socketserver.ThreadingTCPServer):
         lasts_s: float = 10.0,
     ) -> None:
         self.pages, self.behind, self.lasts_s = pages, behind, lasts_s
-        self.guarded = address in _HOSTS
+        self.guarded = is_loopback(address)
         self.address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
         self._lock = threading.Lock()
-        self._open: dict[socket.socket, float] = {}
-        """Connection -> when it is cut, on the monotonic clock."""
+        self._open: dict[socket.socket, _Visitor] = {}
+        """Connections, the oldest first."""
         self._kept = 0
         """Connections that ever took the stream."""
         try:
@@ -126,26 +164,36 @@ class Server(socketserver.ThreadingTCPServer):
         """Keeps a connection open."""
         with self._lock:
             if connection in self._open:
-                self._open[connection] = math.inf
+                self._open[connection].until_s = math.inf
                 self._kept += 1
+
+    def asked(self, connection: socket.socket, path: str) -> None:
+        """Notes that a connection has finished its request."""
+        with self._lock:
+            if connection in self._open:
+                self._open[connection].haste = Haste.PROBES if path in PROBED else Haste.READS
 
     def audience(self) -> Audience:
         """The connections which `keep` lets last."""
         with self._lock:
-            return Audience(sum(until_s == math.inf for until_s in self._open.values()), self._kept)
+            return Audience(sum(each.until_s == math.inf for each in self._open.values()), self._kept)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:
-            asking = (each for each, until_s in self._open.items() if until_s != math.inf)
-            if len(self._open) >= MOST_CONNECTIONS and (oldest := next(asking, None)) is not None:
-                del self._open[oldest]
-                _cut(oldest)
+            if len(self._open) >= MOST_CONNECTIONS and (slowest := self._slowest()) is not None:
+                del self._open[slowest]
+                _cut(slowest)
             if fits := len(self._open) < MOST_CONNECTIONS:
-                self._open[request] = time.monotonic() + self.lasts_s
+                self._open[request] = _Visitor(time.monotonic() + self.lasts_s)
         if fits:
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
+
+    def _slowest(self) -> socket.socket | None:
+        """The connection that is cut for a new one. What a thread has not read yet counts, too: it may be late."""
+        short = [(each, visitor.haste) for each, visitor in self._open.items() if visitor.until_s != math.inf]
+        return min(short, key=lambda each: each[1] or _haste(_waiting(each[0])), default=(None, 0))[0]
 
     def shutdown_request(self, request: Any) -> None:
         with self._lock:
@@ -156,8 +204,8 @@ class Server(socketserver.ThreadingTCPServer):
         """Called twice a second: cuts connections whose time is over, so that their threads end."""
         now_s = time.monotonic()
         with self._lock:
-            for connection, until_s in self._open.items():
-                if now_s > until_s:
+            for connection, visitor in self._open.items():
+                if now_s > visitor.until_s:
                     _cut(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -169,6 +217,16 @@ class Server(socketserver.ThreadingTCPServer):
 def _cut(connection: socket.socket) -> None:
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
+
+
+def _waiting(connection: socket.socket) -> bytes:
+    """The bytes that a connection has sent and its thread has not read."""
+    ready = select.poll()
+    try:
+        ready.register(connection, select.POLLIN)
+        return connection.recv(_MOST_PEEKED, socket.MSG_PEEK) if ready.poll(0) else b""
+    except (OSError, ValueError):  # it has been closed meanwhile
+        return b""
 
 
 class _Visit(BaseHTTPRequestHandler):
@@ -189,6 +247,7 @@ class _Visit(BaseHTTPRequestHandler):
             return False
         if not super().parse_request():
             return False
+        self.server.asked(self.connection, self.path.partition("?")[0])
         why = refusal(self.headers) if self.server.guarded else None
         if why is not None:
             self.send_error(403, "only visitors from this machine are served", why)

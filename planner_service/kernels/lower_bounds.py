@@ -103,7 +103,7 @@ def _by_heuristic(heuristic, window, cost, starts, cheapest, bound):
         bound[i] = max(0.0, max(own - at_root, way))
 
 
-@kernel(f"(f8[::1], i8[::1], {_CHEAPEST}, UniTuple(f8, 3), {_HEURISTIC}, {_WINDOW}, f8, f8[::1])")
+@kernel(f"(f8[::1], i8[::1], {_CHEAPEST}, UniTuple(f8, 2), {_HEURISTIC}, {_WINDOW}, f8, f8[::1])")
 def bound_costs(cost, starts, cheapest, slack, heuristic, window, share, bound):
     """bound := proven lower bounds; 0 where `cost` is inf.
 
@@ -113,7 +113,7 @@ def bound_costs(cost, starts, cheapest, slack, heuristic, window, share, bound):
     window     a `WindowBound`; as above
     share      what part of any cost counts
     """
-    own, by_rounding, by_step = slack
+    own, by_rounding = slack
     if own < 0.0:
         _by_heuristic(heuristic, window, cost, starts, cheapest, bound)
     for i in range(starts.size):
@@ -122,6 +122,5 @@ def bound_costs(cost, starts, cheapest, slack, heuristic, window, share, bound):
             continue
         if own >= 0.0:
             rounding = _rounding(cheapest, cost[i])
-            over = cost[i] * (own + by_rounding * rounding) + rounding * 2.0**24 * by_step
-            bound[i] = cost[i] - min(over, cost[i])
+            bound[i] = cost[i] - cost[i] * min(own + by_rounding * rounding, 1.0)
         bound[i] *= share

@@ -80,11 +80,14 @@ COSTLIER, ALTERED = np.uint8(1), np.uint8(2)
 """Kinds of change in a tile: cells got more expensive, or lost their path; or any other change, perhaps that
 too."""
 FINEST = 2.0**-46
-"""Fraction of a cost: offers that are less by a smaller difference are not taken. Sums of the same numbers in
-another order differ by a 32nd of it; it keeps costs within so much a step of the optimum."""
+"""Fraction of a cell's own cost: offers that are less by a smaller difference are not taken. Sums of the same
+numbers in another order differ by a 32nd of it; all are sums of positive numbers, so this holds for any ratio of
+costs."""
+KEPT = 1.0 - FINEST
+"""Fraction of a cell's cost: an offer below it is taken."""
 MOST_SLACK = 8 * FINEST
-"""Fraction of the farthest cost: no cell of an exact tree is offered less than it costs by more than this. It holds
-both of these and the rounding of sums."""
+"""Fraction of a cell's own cost: no cell of an exact tree is offered less than it costs by more than this. It holds
+`FINEST`, what `partition_totals` leaves unchecked, and the rounding of sums."""
 
 
 class Tree(NamedTuple):
@@ -116,8 +119,6 @@ class Tiles(NamedTuple):
     """(n * PIECES,) names of the pieces that a tile has, as many as `many` says."""
     many: Ints
     """(n,)"""
-    span: Doubles
-    """(n,) s; no cell of a tile costs more inside it."""
     wanted: Bytes
     """(n,) pending work on a tile before the tree is right again: `CHECK` and others."""
     falls: DoubleRows
@@ -419,7 +420,7 @@ def relabel_tile(t, grid, tree, tiles, scratch):
     """Writes which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
     one that has no parent have no way."""
     piece, root = tree.piece, tree.root
-    exits, many, span, across = tiles.exits, tiles.many, tiles.span, tiles.across
+    exits, many, across = tiles.exits, tiles.many, tiles.across
     names, inner, code, name = scratch.border, scratch.inner, scratch.code, scratch.name
     _load_own(t, grid, across, scratch)
     _load_parents(t, grid, tree, across, scratch)
@@ -445,13 +446,10 @@ def relabel_tile(t, grid, tree, tiles, scratch):
             count += 1
     many[t] = count
     _follow(t, grid, across, scratch)
-    longest = 0.0
     for row in range(SIDE):
         i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(SIDE)):
             piece[i + col] = name[at + col]
-            longest = max(longest, inner[at + col] if name[at + col] != NO_PIECE else 0.0)
-    span[t] = longest
     store_offsets(t, tree, scratch)
 
 

@@ -34,7 +34,7 @@ from planner_service.kernels.partition import (
     CHECKING,
     COSTLIER,
     CUT_OFF,
-    FINEST,
+    KEPT,
     LINKING,
     NEARBY,
     NO_PIECE,
@@ -125,9 +125,9 @@ def _load_tile(t, grid, tree, tiles, scratch):
 
 
 @helper
-def _mark_improvable(cost, own, begin, end, diagonal, corners, least, less):
-    """less := 1 where a cell is offered less than it costs by more than `least`, 0 elsewhere. Without a branch,
-    so that it vectorises."""
+def _mark_improvable(cost, own, begin, end, diagonal, corners, less):
+    """less := 1 where a cell is offered less than `KEPT` of its cost, 0 elsewhere. Without a branch, so that it
+    vectorises."""
     s = np.uint64(WIDE)
     for i in range(begin, end):
         north, east, south, west = own[i - s], own[i + _ONE], own[i + s], own[i - _ONE]
@@ -141,7 +141,7 @@ def _mark_improvable(cost, own, begin, end, diagonal, corners, least, less):
         offer = cost[i - s - _ONE] + own[i - s - _ONE] * diagonal
         best = min(best, offer if corners or max(north, west) < np.inf else np.inf)
         best = best if own[i] < np.inf else np.inf
-        less[i] = 1 if best + least < cost[i] else 0
+        less[i] = 1 if best < cost[i] * KEPT else 0
 
 
 @helper
@@ -155,7 +155,7 @@ def _open(own, around, rule, corners, at, code):
 
 
 @helper
-def _relax(at, t, cell, grid, tree, tiles, scratch, least):
+def _relax(at, t, cell, grid, tree, tiles, scratch):
     """Have a cell of a tile, `at` in the scratch, take its least offer. Returns whether that is less."""
     _, _, stride, rule, corners = grid
     parent, piece = tree.parent, tree.piece
@@ -168,7 +168,7 @@ def _relax(at, t, cell, grid, tree, tiles, scratch, least):
             offer = cost[u] + step_cost(rule, own[u], code)
             if offer < best:
                 best, by = offer, code
-    if not best + least < cost[at]:
+    if not best < cost[at] * KEPT:
         return False
     cost[at] = best
     origin, _, _ = corner_of(grid, across, t)
@@ -193,12 +193,12 @@ def _relax(at, t, cell, grid, tree, tiles, scratch, least):
 
 
 @helper
-def _spread(t, grid, tree, tiles, scratch, count, least):
+def _spread(t, grid, tree, tiles, scratch, count):
     """Spread what the `count` cells of the heap cost, inside the tile, the least first: most cells are then written
     once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece = tree.parent, tree.piece
-    span, wanted, across = tiles.span, tiles.wanted, tiles.across
+    wanted, across = tiles.wanted, tiles.across
     cost, own, inner, around = scratch.cost, scratch.own, scratch.inner, scratch.around
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     first = t * CELLS
@@ -215,7 +215,7 @@ def _spread(t, grid, tree, tiles, scratch, count, least):
             offer = cost[at] + step_cost(rule, own[at], code)
             child = parent[v + offsets[code]] == (code + 4) & 7
             # A child always follows, so that the stated cost of a cell is the one driven.
-            if not offer + (0.0 if child else least) < cost[u] or not own[u] < np.inf:
+            if not offer < cost[u] * (1.0 if child else KEPT) or not own[u] < np.inf:
                 continue
             if not child and not _open(own, around, rule, corners, at, code):
                 continue
@@ -230,7 +230,6 @@ def _spread(t, grid, tree, tiles, scratch, count, least):
             cost[u] = offer
             piece[first + (down << BITS) + right] = piece[first + (row << BITS) + col]
             inner[u] = inner[at] + step_cost(rule, own[at], code)
-            span[t] = max(span[t], inner[u])
             parent[v + offsets[code]] = (code + 4) & 7
             count = heap_lower(keys, queue, spot, count, np.float32(offer), u)
 
@@ -240,21 +239,13 @@ def _improve_tile(t, grid, tree, tiles, scratch):
     """Checks a tile; returns whether a parent has changed."""
     _, _, _, rule, corners = grid
     piece = tree.piece
-    total = tree.total
-    exits, many, span, across = tiles.exits, tiles.many, tiles.span, tiles.across
+    exits, many, across = tiles.exits, tiles.many, tiles.across
     names, cost, own, less = scratch.border, scratch.cost, scratch.own, scratch.less
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     _load_tile(t, grid, tree, tiles, scratch)
     _, rows, cols = corner_of(grid, across, t)
-    farthest = 0.0
-    for j in range(many[t]):
-        one = total[t * PIECES + np.int64(exits[t * PIECES + j]), TOTAL]
-        farthest = max(farthest, one if one < np.inf else 0.0)
-    least = (farthest + span[t]) * FINEST
     diagonal = np.inf if rule == RULE_FOUR else (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-    _mark_improvable(
-        *(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, least, less)
-    )
+    _mark_improvable(*(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, less))
     count = 0
     for row in range(rows):
         first = np.uint64((row + 1) * WIDE + 1)
@@ -264,11 +255,11 @@ def _improve_tile(t, grid, tree, tiles, scratch):
         if some:
             for col in range(cols):
                 at = (row + 1) * WIDE + col + 1
-                if less[at] and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch, least)):
+                if less[at] and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch)):
                     count = heap_lower(keys, queue, spot, count, np.float32(cost[at]), at)
     if count == 0:
         return False
-    _spread(t, grid, tree, tiles, scratch, count, least)
+    _spread(t, grid, tree, tiles, scratch, count)
     store_offsets(t, tree, scratch)
     # Exits whose path leads on inside the tile by now are none any more; no piece leads over them.
     kept = 0

@@ -230,10 +230,10 @@ class CostToGoTree:
         return self.cost_grid.rests(parent, root, cells, cell_cost)
 
     @property
-    def slack(self) -> tuple[float, float, float]:
+    def slack(self) -> tuple[float, float]:
         """Returns the largest excess of a cost driven in an exact tree over the optimum, and never more than all of
-        it: a share of it, a share for each unit of the cost grid's rounding of it, and s for each of its steps."""
-        return 0.0, 2.0, 0.0
+        it: a share of it, and a share for each unit of the cost grid's rounding of it."""
+        return 0.0, 2.0
 
     def tighten(self, cells: Cells) -> None:
         """Lowers the costs of padded cells, and of all on their paths, to those driven along the parents.

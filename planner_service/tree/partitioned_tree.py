@@ -76,7 +76,6 @@ class PieceTree:
         self._tiles = Tiles(
             exits=np.zeros(count * PIECES, np.uint8),
             many=np.zeros(count, np.int32),
-            span=np.zeros(count, np.float64),
             wanted=self._wanted,
             falls=np.zeros((3, count), np.float64),
             ends=self._ends,
@@ -190,11 +189,10 @@ class PieceTree:
         return grid.rests(self.parent, grid.pad(self.root), cells, grid.time_cost)
 
     @property
-    def slack(self) -> tuple[float, float, float]:
-        """Same as in `CostToGoTree`. Cell costs are float32, a few roundings; the rest is left over step by
-        step."""
-        farthest = self._ends[1].max() + self._tiles.span.max()
-        return 2.0**-21, 0.0, float(MOST_SLACK * farthest)
+    def slack(self) -> tuple[float, float]:
+        """Same as in `CostToGoTree`. Cell costs are float32, a few roundings; each step may leave `MOST_SLACK` of
+        its cell's cost, and `Rounding` counts 2**24 for one."""
+        return 2.0**-21, MOST_SLACK * 2.0**24
 
     def tighten(self, cells: Cells) -> None:
         """Costs are those driven at all times."""

@@ -72,7 +72,7 @@ class LowerBounds:
         return bound
 
 
-_NOT_EXACT = (-1.0, 0.0, 0.0)
+_NOT_EXACT = (-1.0, 0.0)
 """In place of a tree's slack, which is 0 or more."""
 _NONE: Floats = np.empty(0, np.float32)
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)

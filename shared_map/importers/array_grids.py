@@ -1,4 +1,4 @@
-"""Grids in plain formats: ESRI ASCII, NumPy's .npz, MovingAI .map, ROS map_server's YAML with its image.
+"""Grids in plain formats: NumPy's .npz, MovingAI .map, ROS map_server's YAML with its image.
 
 numpy, PyYAML and Pillow read them. A header is checked against the file's length and the largest grid before memory
 is taken.
@@ -13,7 +13,7 @@ import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ _HEADER_BYTES = 4096
 _MOST_TABLE_BYTES = 1 << 20
 """Limit of an archive's table of contents."""
 _SHOWN_MEMBERS = 10
-_ASC_HEADER_LINES = 32
 SCALE_FACTOR = 9.0
 """ROS `scale` mode: pace grows by up to this many times between free and occupied."""
 
@@ -60,75 +59,6 @@ def check_cells(rows: int, cols: int, path: Path) -> None:
     """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
     if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
         raise TerrainError(f"terrain {path}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
-
-
-# --- ESRI ASCII ---------------------------------------------------------------------------------------------
-
-
-def read_asc(path: Path) -> PlainGrid:
-    """ESRI ASCII grid: header lines, then heights row by row from the north, however they are broken into lines.
-
-    The header says `ncols`, `nrows`, `cellsize`, `xllcorner` or `xllcenter`, `yllcorner` or `yllcenter`, and
-    `nodata_value`, -9999 unless given. Metres and degrees look alike in it: `degrees` is False.
-
-    GDAL's driver is not used: it reads text that is not a number as 0.
-
-    Raises
-    ------
-    TerrainError
-        If the file cannot be read, or its heights are not what its header says.
-    """
-    check_bytes(path, FileKind.TEXT_GRID)
-    with path.open("rb") as file:
-        header = _asc_header(file, path)
-        rows, cols, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
-        check_cells(rows, cols, path)
-        if not step > 0:
-            raise TerrainError(f"terrain {path}: cellsize is {step:g}; it must be positive")
-        try:
-            heights = np.fromfile(file, np.float32, rows * cols, sep=" ")
-        except ValueError:  # the file is left at the text that numpy could not read as a number
-            heights = np.zeros(0, np.float32)
-        at, rest = file.tell(), file.read(200).split()
-        if rest:
-            file.seek(0)
-            parts = iter(lambda: file.read(min(max(at - file.tell(), 0), 1 << 20)), b"")
-            line = 1 + sum(part.count(b"\n") for part in parts)
-            found = rest[0][:40].decode("ascii", "replace")
-            raise TerrainError(
-                f"terrain {path}, line {line}: found {found!r}; its header says {rows} rows of {cols} numbers"
-            )
-    if heights.size < rows * cols:
-        raise TerrainError(f"terrain {path} has {heights.size} heights; its header says {rows} rows of {cols}")
-    heights[heights == np.float32(header.get("nodata_value", -9999.0))] = np.nan
-    half = step / 2
-    west = header["xllcorner"] if "xllcorner" in header else header.get("xllcenter", half) - half
-    south = header["yllcorner"] if "yllcorner" in header else header.get("yllcenter", half) - half
-    return PlainGrid(heights.reshape(rows, cols), None, (step, step), west, south + rows * step)
-
-
-def _asc_header(file: IO[bytes], path: Path) -> dict[str, float]:
-    """Key -> number of the lines that begin with a word; the file is left at its first height."""
-    header: dict[str, float] = {}
-    for number in range(1, _ASC_HEADER_LINES):
-        begin = file.tell()
-        words = file.readline(_HEADER_BYTES).decode("ascii", "replace").split()
-        if len(words) != 2 or not words[0][0].isalpha() or words[0].lower() == "nan":
-            file.seek(begin)
-            break
-        key = words[0].lower()
-        try:
-            header[key] = float(words[1])
-        except ValueError as error:
-            raise TerrainError(f"terrain {path}, line {number}: {words[1][:40]!r} is no number") from error
-        if key != "nodata_value" and not math.isfinite(header[key]):
-            raise TerrainError(f"terrain {path}: its header says {key} {header[key]:g}; expected a finite number")
-        if key in ("ncols", "nrows") and header[key] % 1:
-            raise TerrainError(f"terrain {path}: its header says {key} {header[key]:g}; expected a whole number")
-    missing = [key for key in ("ncols", "nrows", "cellsize") if key not in header]
-    if missing:
-        raise TerrainError(f"terrain {path} is no ESRI ASCII grid: its header lacks {', '.join(missing)}")
-    return header
 
 
 # --- numpy's archives ---------------------------------------------------------------------------------------
@@ -278,7 +208,7 @@ def read_map(path: Path) -> PlainGrid:
 
 
 def read_ros(path: Path) -> PlainGrid:
-    """ROS map_server: a yaml that names a PGM image, its resolution, origin and thresholds.
+    """ROS map_server: a yaml that names an image, its resolution, origin and thresholds.
 
     Its `factor` is 1 on free, inf on occupied cells. Between the thresholds it is NaN in the mode `trinary`, and
     rises from 1 to 1 + `SCALE_FACTOR` in the modes `scale` and `raw`; in `raw`, values above 100 are NaN.
@@ -296,7 +226,7 @@ def read_ros(path: Path) -> PlainGrid:
         )
         west, south, *turned = map(float, values["origin"])
         mode = str(values.get("mode", "trinary")).lower()
-        negate = bool(int(values.get("negate", 0)))
+        negate = bool(int(values.get("negate", 0)))  # YAML's true and false count, too
     except KeyError as error:
         raise TerrainError(f"terrain {path} is no ROS map: {error.args[0]} is missing") from error
     except (ValueError, TypeError, OverflowError) as error:
@@ -314,7 +244,7 @@ def read_ros(path: Path) -> PlainGrid:
         )
     if not image.is_file():
         raise TerrainError(f"terrain {path} names the image {values['image']}, but there is no file {image}")
-    pixels, brightest = read_pgm(image)
+    pixels, brightest = _grey(image)
     if negate:
         pixels = brightest - pixels
     factor = np.full(pixels.shape, np.nan, np.float32)
@@ -346,31 +276,32 @@ def _yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
-    """A P2 or P5 image, comments and 16 bits included.
+def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
+    """The image of a ROS map: PGM, PNG or BMP. Colours count by their mean, as in map_server.
 
     Returns
     -------
-    pixels : int32 (rows, cols)
-        Row 0 is on top.
+    pixels : float32 (rows, cols)
+        Row 0 is on top; NaN where the image is transparent.
     brightest : int
         The value that stands for white, 255 or 65535, whatever the file says: pixels are in proportion.
 
     Raises
     ------
     TerrainError
-        If the file cannot be read, is no PGM, or is shorter than its header says.
+        If the file cannot be read, is no such image, or is shorter than its header says.
     """
     from PIL import Image
 
     check_bytes(path, FileKind.IMAGE)
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM",)) as image:
-            if image.mode not in ("L", "I", "I;16"):
-                raise TerrainError(f"image {path} is no PGM: it is in colour; convert it (magick map.png map.pgm)")
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
             check_cells(image.height, image.width, path)
-            return np.asarray(image, np.int32), 255 if image.mode == "L" else 65535
+            if image.mode in ("L", "I", "I;16"):
+                return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
+            colours = np.asarray(image.convert("RGBA"), np.float32)
     except Image.DecompressionBombError as error:
         raise TerrainError(f"image {path}: its header says more pixels than are read: {error}") from error
     except (OSError, ValueError, OverflowError, SyntaxError) as error:
-        raise TerrainError(f"image {path} is truncated or no PGM: {str(error)[:200]}") from error
+        raise TerrainError(f"image {path} is truncated or no PGM, PNG or BMP: {str(error)[:200]}") from error
+    return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan)), 255

@@ -156,6 +156,8 @@ def _shape_of(crs: Any) -> str:
 
 def crs_name(crs: Any) -> str:
     """Returns the name of a rasterio CRS for people: EPSG:32632, or +proj=..., or the beginning of its text."""
+    if is_local(crs):
+        return "a local system"
     text = str(crs.to_string())
     if not text.startswith("EPSG:") and crs.to_epsg() is None:
         known = crs.to_dict()
@@ -211,6 +213,24 @@ def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, wh
         )
     lon = np.asarray(found[0]) % 360
     return float(lon.min()), float(lon.max())
+
+
+def check_metres(step: float, west: float, what: str) -> None:
+    """Raises TerrainError where numbers without a coordinate system look like degrees."""
+    if step < 0.1 and abs(west) <= 180:
+        raise TerrainError(f"{what}: a cell of {step:g} looks like degrees; set terrain.crs = 'EPSG:4326'")
+
+
+def is_kept(width_m: float, height_m: float, cells: int, resolution_m: float | None) -> bool:
+    """Returns True if a metric grid is taken as it is: by a resampling no cell would move by more than half of one,
+    so that it would only blur. All importers ask this.
+
+    width_m, height_m  of a cell
+    cells              along the longer side
+    resolution_m       wanted side of a cell; None keeps that of the file
+    """
+    side_m = resolution_m or width_m
+    return max(abs(side_m - width_m), abs(side_m - height_m)) * cells <= width_m / 2
 
 
 def pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
@@ -286,9 +306,7 @@ def plan_grid(
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
-    # If no cell would move by more than half of one, a resampling would only blur.
-    off = max(abs((resolution_m or width) - width), abs((resolution_m or width) - height)) * max(rows, cols)
-    if target == crs and north_up and off <= width / 2:
+    if target == crs and north_up and is_kept(width, height, max(rows, cols), resolution_m):
         check_size(rows, cols, what)
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
         return grid, None, notes

@@ -53,6 +53,16 @@ _NOISY = 0.28
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
 _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
+_SCALES = {2: 2.6, 3: 3.6, 4: 2.6, 6: 3.6}
+"""Every n-th cell -> by what factor second differences at n cells must exceed those at half of that (rounded down)
+for the file to be resampled from cells so coarse. On a surface that a filter made they grow by up to 4 from one
+cell to two, on surveyed ground by 2.3 to 2.8 (three real models)."""
+_FOUND = 0.8
+"""Share of a lake that was found at a finer scale, with its shore to the cell: then it is left as it is."""
+_MUCH_WATER = 0.05
+_LEAST_SIDE, _SOME_ROWS = 16, 256
+_ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
+"""Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +71,7 @@ class LevelGround:
 
     mask       bool (rows, cols)
     patches    (height in m, cells) of each, the largest first
-    uncertain  share of the cells that is as level and as low, but among other level ground, as rounding makes it
+    uncertain  share of the cells in other large level patches, or in those which rounding may have made
     """
 
     mask: Bools
@@ -71,6 +81,9 @@ class LevelGround:
 
 def level_ground(elevation_m: Floats) -> LevelGround:
     """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
+
+    A file may have been resampled finer than its survey. Its shores then have ripples and slopes that no survey
+    has, so patches are looked for at every scale up to that of its information.
 
     Parameters
     ----------
@@ -82,26 +95,76 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     LevelGround
         Of patches that a rounding of heights does not explain.
     """
+    from scipy import ndimage
+
     with np.errstate(invalid="ignore"):
         known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
     if not known.all():
         elevation_m = np.where(known, elevation_m, np.float32(np.nan))
-    elevation_m = np.ascontiguousarray(elevation_m)
+    mask, patches, level = _at_one_scale(np.ascontiguousarray(elevation_m))
+    rows, cols = elevation_m.shape
+    for every, smooth in _SCALES.items():
+        if min(rows, cols) < every * _LEAST_SIDE or _bend_m(elevation_m, every) <= smooth * _bend_m(
+            elevation_m, every // 2
+        ):
+            continue
+        first = (every - 1) // 2  # a cell stands for those around it
+        coarse, at_scale, _ = _at_one_scale(np.ascontiguousarray(elevation_m[first::every, first::every]))
+        if sum(cells for _, cells in at_scale) * every**2 > sum(cells for _, cells in patches):
+            patches = [(height_m, cells * every**2) for height_m, cells in at_scale]
+        wide = coarse.repeat(every, axis=0).repeat(every, axis=1)[:rows, :cols]
+        wide = np.pad(wide, [(0, most - has) for most, has in zip(mask.shape, wide.shape, strict=True)])
+        lakes, many = ndimage.label(wide)
+        had = np.bincount(lakes[mask], minlength=many + 1)
+        mask |= (had < _FOUND * np.bincount(lakes.reshape(-1)))[lakes] & wide
+    patches.sort(key=lambda patch: -patch[1])
+    return LevelGround(mask, tuple(patches), float(np.count_nonzero(level & ~mask) / elevation_m.size))
+
+
+def _bend_m(elevation_m: Floats, cells: int) -> float:
+    """Mean second difference of heights at a distance, of some rows and columns, where they differ."""
+    bends = []
+    for heights in (elevation_m, elevation_m.T):
+        some = heights[:: max(heights.shape[0] // _SOME_ROWS, 1)].astype(np.float64)
+        bend = np.abs(some[:, 2 * cells :] - 2 * some[:, cells:-cells] + some[:, : -2 * cells])
+        bend = bend[bend > 0]
+        bends.append(float(bend.mean()) if bend.size else 0.0)
+    return sum(bends)
+
+
+def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], Bools]:
+    """Returns (mask of water, (height in m, cells) of each patch of it, mask of large level patches)."""
     step_m = _step_m(elevation_m)
-    coarse = step_m >= _COARSE_M
-    found = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE, step_m)
+    least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
+    found = level_patches(elevation_m, _SAME_M, least, step_m)
+    rounded_m = _rounded_m(found)
+    if rounded_m > step_m:
+        step_m = rounded_m
+        least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
+        found = level_patches(elevation_m, _SAME_M, least, step_m)
     water, unsure = _judged(found, _STILL_M)
     mask: Bools = water[found.labels]
+    large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
+    large[0] = False
     rippled = water & (found.ripple > _LEAST_RIPPLES * found.differ)
     if rippled.any():
         _add_ripples(elevation_m, found, rippled, mask)
-    numbers = np.flatnonzero(water)
-    patches = [(float(found.height_m[n]), int(found.cells[n])) for n in numbers.tolist()]
-    uncertain = float(found.cells[unsure].sum() / elevation_m.size)
+    patches = [(float(found.height_m[n]), int(found.cells[n])) for n in np.flatnonzero(water).tolist()]
     if step_m < _ROUGH_M / _BLOCK_CELLS:
         patches += _rough_water(elevation_m, mask)
-    patches.sort(key=lambda patch: -patch[1])
-    return LevelGround(mask, tuple(patches), uncertain)
+    return mask, patches, large[found.labels]
+
+
+def _rounded_m(found: Patches) -> float:
+    """Returns what the heights of patches are rounded to, m, or 0: a resampling hides it between the patches."""
+    heights, cells = found.height_m[1:].astype(np.float64), found.cells[1:]
+    if np.unique(np.round(heights, 2)).size < _LEAST_HEIGHTS:
+        return 0.0
+    for step_m in _ROUNDINGS_M:
+        off_m = np.abs(heights - np.rint(heights / step_m) * step_m)
+        if cells[off_m < 2 * _SAME_M].sum() > _MOSTLY * cells.sum():
+            return step_m
+    return 0.0
 
 
 def _judged(found: Patches, still_m: float) -> tuple[Bools, Bools]:
@@ -212,14 +275,17 @@ def _said_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
         taken = f"is taken for {config.level_is}, as terrain.level_is says"
         if config.level_is == "water":
             taken = "is taken for water where no photo shows it; of dry ground say terrain.level_is = 'ground'"
+        # Filled sinks are many small lakes; they close much of a map.
+        share = float(found.mask.mean())
+        filled = share > _MUCH_WATER and 4 * cells < share * found.mask.size and config.level_is == "water"
         yield (
-            f"level ground: {found.mask.mean():.1%} of the file in {many} patch{'es' * (many > 1)}, the largest"
-            f" {cells} cells at {height_m:g} m, {taken}"
+            f"{'! ' * filled}level ground: {share:.1%} of the file in {many} patch{'es' * (many > 1)},"
+            f" the largest {cells} cells at {height_m:g} m, {taken}"
         )
-    if found.uncertain > _TOLD_SHARE:
+    if found.uncertain > _TOLD_SHARE and config.level_is == "water":
         yield (
-            f"level ground: {found.uncertain:.1%} of the file is low and level among steps of the heights, which"
-            " are rounded, and is taken for ground; of water say terrain.water_below_m"
+            f"! level ground: {found.uncertain:.1%} of the file is dead level, too, and taken for ground, as its"
+            " shore is not that of water or its heights are rounded; of water say terrain.water_below_m"
         )
 
 

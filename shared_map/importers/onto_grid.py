@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from dataclasses import dataclass
@@ -11,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
-from shared_map.importers.georeference import bounds_in, crs_name, crs_of, equidistant, metres_per_degree, pixel_m
+from shared_map.importers.georeference import (
+    bounds_in,
+    crs_name,
+    crs_of,
+    equidistant,
+    is_kept,
+    metres_per_degree,
+    pixel_m,
+)
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -67,17 +76,25 @@ class Placed:
         """
         import rasterio
         from rasterio.transform import Affine
+        from rasterio.vrt import WarpedVRT
         from rasterio.warp import Resampling, reproject
 
         place = {"src_crs": self.crs, "dst_crs": self.target, "dst_transform": transform_of(self.grid, row0)}
-        if isinstance(source, int):
-            source = rasterio.band(self.dataset, source)
-        else:
-            rows, cols = source.shape
-            stretch = Affine.scale(self.dataset.width / cols, self.dataset.height / rows)
-            place["src_transform"] = self.transform @ stretch
-        threads = os.cpu_count() or 1
-        reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=threads)
+        with contextlib.ExitStack() as files:
+            dataset = self.dataset
+            if (dataset.crs, dataset.transform) != (self.crs, self.transform):
+                # Of a band, GDAL takes the file's own place, whatever it is told.
+                frame = {"transform": self.transform, "width": dataset.width, "height": dataset.height}
+                said = {"src_crs": self.crs, "src_transform": self.transform, "crs": self.crs}
+                dataset = files.enter_context(WarpedVRT(dataset, **said, **frame))
+            if isinstance(source, int):
+                source = rasterio.band(dataset, source)
+            else:
+                rows, cols = source.shape
+                stretch = Affine.scale(dataset.width / cols, dataset.height / rows)
+                place["src_transform"] = self.transform @ stretch
+            threads = os.cpu_count() or 1
+            reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=threads)
         return onto
 
 
@@ -170,6 +187,8 @@ def from_metres(
     TerrainError
         If no cell fits, or more than `MAX_CELLS` do.
     """
+    if is_kept(*step, max(heights.shape), resolution_m):
+        resolution_m, step = step[0], (step[0], step[0])
     resolution_m = resolution_m or float(f"{math.sqrt(step[0] * step[1]):.4g}")
     col_step, row_step = resolution_m / step[0], resolution_m / step[1]
     rows, cols = int(heights.shape[0] / row_step + 1e-6), int(heights.shape[1] / col_step + 1e-6)
@@ -178,7 +197,7 @@ def from_metres(
     if rows * cols > MAX_CELLS:
         raise TerrainError(f"{what} would be {rows} x {cols} cells; set a larger terrain.resolution_m")
     grid = GridSpec(rows, cols, resolution_m, west, north, crs)
-    if abs(col_step - 1) < 1e-9 and abs(row_step - 1) < 1e-9:
+    if col_step == row_step == 1:
         return heights, grid, f"{rows} x {cols} cells of {resolution_m:g} m"
     note = f"resampled from {step[1]:.1f} x {step[0]:.1f} m to {resolution_m:g} m"
     return resample(heights, rows, cols, row_step, col_step), grid, note

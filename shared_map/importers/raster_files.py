@@ -6,8 +6,12 @@ rasterio is imported where it is used: agents never need it.
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import itertools
 import lzma
+import math
+import re
 import stat
 import warnings
 import zipfile
@@ -15,7 +19,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from xml.etree import ElementTree
 
 import numpy as np
@@ -40,18 +44,34 @@ _DRIVERS = {
     b"EHFA_HEADER_TAG": "HFA",
     b"CDF\x01": "netCDF",
     b"CDF\x02": "netCDF",
+    b"\x89HDF\r\n\x1a\n": "netCDF",
     b"UHL1": "DTED",
+    b"DSBB": "GSBG",
+    b"DSRB": "GS7BG",
+    b"DSAA": "GSAG",
+    **dict.fromkeys((b"ncols", b"nrows", b"xll", b"yll", b"cellsize", b"dx ", b"dy "), "AAIGrid"),
+    **dict.fromkeys((b"north:", b"south:", b"east:", b"west:", b"rows:", b"cols:"), "GRASSASCIIGrid"),
 }
-"""First bytes -> GDAL's driver. GDAL knows 150 formats, most of which have not been tested against malicious
-files."""
+"""First bytes, of text in small letters -> GDAL's driver. GDAL knows 150 formats, most of which have not been
+tested against malicious files."""
+_HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGNORECASE)
+"""A line of a word and a value, in the header of a grid as text. Surfer's has lines of numbers."""
+_SURFER_LINES = 5
+_HEADER_LINE_BYTES = 4096
+_TEXT_PIECE_BYTES = 4 << 20
+_HEAD_BYTES = 16
 _DRIVERS_BY_ENDING = {
     ".hgt": "SRTMHGT",
     ".bil": "EHdr",
     ".flt": "EHdr",
     ".dem": "USGSDEM",
+    ".asc": "AAIGrid",
 }
 """Endings of formats without a beginning of their own; a header lies beside most of these files."""
-_IN_ARCHIVES = (".tif", ".tiff", ".img", *_DRIVERS_BY_ENDING)
+_IN_ARCHIVES = (".tif", ".tiff", ".img", ".hgt", ".bil", ".flt", ".dem")
+_TEXT_DRIVERS = ("AAIGrid", "GRASSASCIIGrid", "GSAG")
+AS_TEXT = "AS_TEXT"
+"""Tag of grids as text: few of these files say in which coordinate system they are."""
 BAD_ARCHIVE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
     KeyError, OverflowError,
@@ -78,8 +98,7 @@ def is_raster(path: Path) -> bool:
     if path.suffix.lower() in (*_DRIVERS_BY_ENDING, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:
-        head = file.read(16)
-        return any(head.startswith(magic) for magic in _DRIVERS)
+        return _magic_driver(file.read(_HEAD_BYTES)) is not None
     return False
 
 
@@ -105,9 +124,8 @@ def opened(path: Path, what: str) -> Iterator[Any]:
             # A .vrt names other files: none of them may be somewhere on the network.
             with (
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
-                rasterio.open(name, driver=driver) as dataset,
+                _georeferenced(name, driver, path, f"{what} {path}") as dataset,
             ):
-                _check_size(dataset, f"{what} {path}")
                 yield dataset
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
@@ -116,12 +134,110 @@ def opened(path: Path, what: str) -> Iterator[Any]:
         raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
 
 
+@contextmanager
+def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iterator[Any]:
+    """A dataset of a size that fits and of real numbers. Where control points place it, it is warped by them."""
+    import rasterio
+    from rasterio.vrt import WarpedVRT
+
+    with contextlib.ExitStack() as files:
+        dataset = files.enter_context(rasterio.open(name, driver=driver))
+        _check_size(dataset, what)
+        if driver in _TEXT_DRIVERS:
+            dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), files)
+        if dataset.transform.is_identity and dataset.gcps[0]:
+            dataset = files.enter_context(WarpedVRT(dataset))
+        yield dataset
+
+
+def _in_memory(dataset: Any, numbers: NDArray[Any], nodata: float | None, files: contextlib.ExitStack) -> Any:
+    """The same raster with other numbers."""
+    from rasterio import MemoryFile
+
+    memory = files.enter_context(MemoryFile())
+    profile = {"count": 1, "height": dataset.height, "width": dataset.width, "dtype": numbers.dtype}
+    place = {"crs": dataset.crs, "transform": dataset.transform, "nodata": nodata}
+    with memory.open(driver="GTiff", BIGTIFF="YES", **profile, **place) as copy:
+        copy.write(numbers, 1)
+        copy.update_tags(**{AS_TEXT: dataset.driver})
+    return files.enter_context(memory.open())
+
+
+def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], float | None]:
+    """The numbers of a grid as text, int32 if all are whole, else float32, and which of them states a void.
+
+    GDAL reads its header only: its drivers read text that is no number, and numbers that are missing, as 0, and its
+    first 100 kB decide whether all of it is whole.
+    """
+    numbers = np.empty(dataset.height * dataset.width, np.float32)
+    expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
+    with path.open("rb") as file:
+        lines, void = _skip_header(file, dataset.driver)
+        count, rest, last = 0, b"", False
+        while not last:
+            piece = file.read(_TEXT_PIECE_BYTES)
+            last = not piece
+            end = len(piece) if last else piece.rfind(b"\n") + 1 or piece.rfind(b" ") + 1
+            text, rest = rest + piece[:end], piece[end:] if end else rest + piece
+            words = text.replace(b",", b".").split()
+            fits = words[: numbers.size - count]
+            try:
+                numbers[count : count + len(fits)] = np.array(
+                    [each if each != void else "nan" for each in fits], np.float64
+                )
+                wrong = len(fits)
+            except ValueError:
+                wrong = next(n for n, each in enumerate(fits) if each != void and not _is_number(each))
+            if wrong < len(words):
+                at = next(itertools.islice(re.finditer(rb"\S+", text), wrong, None)).start()
+                shown = words[wrong][:40].decode("ascii", "replace")
+                line = lines + text.count(b"\n", 0, at)
+                raise TerrainError(f"{what}, line {line}: found {shown!r}; {expected}")
+            count += len(fits)
+            lines += text.count(b"\n")
+    if count < numbers.size:
+        raise TerrainError(f"{what} has {count} numbers; {expected}")
+    whole = bool((np.abs(numbers) < 2**24).all() and (numbers == np.rint(numbers)).all())
+    nodata = math.nan if void is not None and not _is_number(void) else dataset.nodata
+    grid = numbers.reshape(dataset.height, dataset.width)
+    grid = grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
+    return (grid.astype(np.int32) if whole else grid), None if whole and nodata != nodata else nodata
+
+
+def _skip_header(file: BinaryIO, driver: str) -> tuple[int, bytes | None]:
+    """Returns the number of the first line behind the header, and the word that stands for a void, if one does."""
+    void, number = None, 1
+    while line := file.readline(_HEADER_LINE_BYTES):
+        words = line.replace(b":", b" ").split()
+        is_header = number <= _SURFER_LINES if driver == "GSAG" else _HEADER_LINE.match(line)
+        if not is_header:
+            file.seek(-len(line), 1)
+            break
+        if words and words[0].lower() in (b"nodata_value", b"nodata", b"null"):
+            void = words[-1]
+        number += 1
+    return number, void
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _check_size(dataset: Any, what: str) -> None:
     """Refuses what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
     if dataset.count == 0:
         held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
         raise TerrainError(
             f"{what} holds several rasters ({', '.join(held)}), expected one: gdal_translate takes one out"
+        )
+    if any(dtype.startswith("complex") for dtype in dataset.dtypes):
+        raise TerrainError(
+            f"{what} holds complex numbers ({dataset.dtypes[0]}), expected real ones: gdal_calc --calc 'A.real'"
+            " makes such a file"
         )
     rows, cols = dataset.height, dataset.width
     most = _MAX_PIXELS if dataset.driver in _BY_ROWS else MAX_CELLS
@@ -148,24 +264,35 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
     if path.suffix.lower() == ".zip":
         return _in_archive(path, what)
     with path.open("rb") as file:
-        driver = _driver(file.read(16), path.suffix.lower(), f"{what} {path}")
+        head = file.read(_HEAD_BYTES)
+    driver = _driver(head, path.suffix.lower(), f"{what} {path}")
     length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
         raise TerrainError(
             f"{what} {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
             f" {_HGT_BYTES[0]}, one of 3601 has {_HGT_BYTES[1]}"
         )
+    if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
+        raise TerrainError(f"{what} {path}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
         _check_virtual(path, f"{what} {path}", {})
+    if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
+        return f"/vsisubfile/3,{path}", driver
     header = path.with_suffix(".hdr")
     if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
     return path, driver
 
 
+def _magic_driver(head: bytes) -> str | None:
+    text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    return next(
+        (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic)), None
+    )
+
+
 def _driver(head: bytes, ending: str, what: str) -> str:
-    found = next((driver for magic, driver in _DRIVERS.items() if head.startswith(magic)), None)
-    found = found or _DRIVERS_BY_ENDING.get(ending)
+    found = _magic_driver(head) or _DRIVERS_BY_ENDING.get(ending)
     if found is None:
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
         raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
@@ -244,7 +371,7 @@ def _in_archive(path: Path, what: str) -> tuple[str, str]:
                     f"{what} {path}: {member.filename} has {size(member.file_size)}; unpack it, and crop it"
                 )
             with archive.open(member) as file:
-                head = file.read(16)
+                head = file.read(_HEAD_BYTES)
     except BAD_ARCHIVE as error:
         raise TerrainError(f"{what} {path} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
     driver = _driver(head, Path(member.filename).suffix.lower(), f"{what} {path}: {member.filename}")

@@ -20,10 +20,10 @@ from shared_map.importers.cover import cover_meaning
 from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
 from shared_map.importers.cover.land_cover import read_cover
 from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
-from shared_map.importers.georeference import crs_of, overruled, plan_grid
+from shared_map.importers.georeference import check_metres, crs_of, overruled, plan_grid
 from shared_map.importers.level_ground import MOST_SAMPLED, looked_at, without
 from shared_map.importers.onto_grid import Placed, nearest
-from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
+from shared_map.importers.raster_files import AS_TEXT, READ_ROWS, middle_of, opened, thinned
 from shared_map.importers.sources import Source
 from shared_map.terrain.row_bands import Progress, bands
 from swarm.config.ground import TerrainConfig
@@ -194,6 +194,9 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
     from rasterio.transform import from_origin
 
     coded = holds.is_cover or holds.encoding is not None
+    if AS_TEXT in dataset.tags() and not dataset.crs and config.crs is None:
+        check_metres(dataset.transform.a, dataset.transform.c, f"terrain {path}")
+        return _Place(rasterio.CRS.from_wkt(_METRES), dataset.transform)
     has_place = bool(dataset.crs) or not dataset.transform.is_identity
     if has_place or not (coded or path.suffix.lower() == ".png"):
         crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
@@ -277,6 +280,14 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
+    axes = [
+        axis
+        for part in crs.to_dict(projjson=True).get("components", [])
+        for axis in part["coordinate_system"]["axis"]
+    ]
+    if any(axis["direction"] == "down" for axis in axes):  # a vertical system such as EPSG:5715
+        factor, offset = -factor, -offset
+        notes.append("the file states depths; heights are their negatives")
     text = str(dataset.units[0] or "").lower()
     # [m], US_survey_foot and ft (US) without their brackets and signs.
     unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())

@@ -23,6 +23,8 @@ JACKSBORO_RESOLUTION_M = 75.0
 """Its heights are 3 arc seconds apart, at 36.6 degrees north 74.5 m from west to east and 92.5 m from north to
 south: cells as fine as the closer of the two."""
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
+_SOME = 7
+"""Every n-th height is shown in an error."""
 SYNTHETIC_RESOLUTION_M = 30.0
 """The resolution of the elevation models that cover the world, Copernicus GLO-30 and SRTM."""
 
@@ -163,11 +165,11 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """Heights in a text or an archive of arrays."""
-    from shared_map.importers.array_grids import read_asc, read_npz
+    from shared_map.importers.array_grids import read_npz
     from shared_map.importers.xyz_grids import read_text_grid
 
     suffix = path.suffix.lower()
-    plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
+    plain = read_npz(path) if suffix == ".npz" else read_text_grid(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config)
@@ -176,10 +178,10 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
         step = (config.resolution_m, config.resolution_m)
     degrees = plain.degrees or _geographic(config.crs)
-    if suffix != ".npz" and not degrees and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
-        raise TerrainError(
-            f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
-        )
+    if suffix != ".npz" and not degrees and config.crs is None:
+        from shared_map.importers.georeference import check_metres
+
+        check_metres(step[0], plain.west, f"terrain {path}")
     place = (heights, step, plain.west, plain.north, config.resolution_m, str(path))
     heights, grid, note = from_degrees(*place) if degrees else from_metres(*place, config.crs or "local")
     if photo is not None and photo.shape[:2] != heights.shape:
@@ -239,8 +241,9 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".dem": _raster,
     ".nc": _raster,
     ".dt2": _raster,
+    ".asc": _raster,
+    ".grd": _raster,
     ".zip": _raster,
-    ".asc": _heights,
     ".npz": _heights,
     ".csv": _heights,
     ".xyz": _heights,
@@ -263,15 +266,22 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.level_ground import fill_voids, voids_of
+    from shared_map.importers.level_ground import HIGHEST_M, fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
         elevation_m = elevation_m.copy()
+    some_m = elevation_m[::_SOME, ::_SOME].copy()
     count = voids_of(elevation_m)
     if count == 0:
         return replace(source, elevation_m=elevation_m)
     share = count / elevation_m.size
+    if share == 1.0 and np.isfinite(some_m).any():
+        found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
+        raise TerrainError(
+            f"terrain {config.source} has heights of {found} m, expected at most {HIGHEST_M:g}: of centimetres set"
+            " terrain.height_scale = 0.01"
+        )
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
     if config.nodata == "fill":

@@ -14,9 +14,9 @@ from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
 from swarm.places import cell_of
-from swarm.runtime.order_book import OrderBook, judged
+from swarm.runtime.order_book import FreshOrders, OrderBook, judged
 from swarm.wire.messages import Nothing
-from swarm.wire.messages.orders import GiveOrder, Order, Orders
+from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, ORDERS
 
 _PUBLISH_NS = NS_PER_S
@@ -43,12 +43,15 @@ class KeptOrders:
         self._post = post
         self._added: set[str] = set()
         """Agents that have appeared and are not in the scenario: how many vehicles they have is theirs to know."""
+        self._fresh: FreshOrders | None = None
+        """None where certificates authenticate orders."""
         self._publish_due_ns = 0
         self._unsaved: list[Order] = []
         """Orders heard of another keeper that are not on our disk yet."""
 
     def start(self, now_ns: int) -> None:
         self.book.merge(self._store.orders(), now_ns)
+        self._fresh = FreshOrders(now_ns) if self._scenario.network.tls is None else None
         self._bus.watch_alive(self._post, role="agent")
         self._bus.serve(GIVE_ORDER, self._post, keeper=self._id)
         self._bus.serve(ORDERS, self._post, role="keeper", id=self._id)
@@ -88,6 +91,13 @@ class KeptOrders:
                 return order
             case _:
                 return False
+
+    def stale(self, asked: Asked, now_ns: int) -> str | None:
+        """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
+        match asked.request:
+            case (GiveOrder() | ZoneOrder()) as order if order.changes and self._fresh is not None:
+                return self._fresh.fault(order.stamp_ns, now_ns)
+        return None
 
     def tick(self, now_ns: int) -> None:
         if now_ns < self._publish_due_ns:

@@ -139,6 +139,11 @@ class KeeperService:
                 self._roster.appeared(peer)
             case Disappeared(peer):
                 self._roster.gone(peer)
+        if isinstance(event, Asked) and (fault := self._orders.stale(event, now_ns)) is not None:
+            self.counters.count("orders_refused")
+            event.refuse(fault)
+            event.end()
+            return
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return

@@ -185,10 +185,12 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
         corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
     side_m = grid.resolution_m
     inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
+    for hole in order.holes:
+        inside &= ~polygon_mask([(col * side_m, row * side_m) for row, col in hole], grid)
     covered = int(inside.sum())
     if not covered:
         return f"polygon: it covers no cell of the terrain of {grid.rows} x {grid.cols} cells"
-    fault = shapely.is_valid_reason(shapely.Polygon(corners))
+    fault = shapely.is_valid_reason(shapely.Polygon(corners, order.holes))
     if fault != "Valid Geometry":
         return f"polygon: its edges cross or touch each other at row and column [{fault.partition('[')[2]}"
     if order.kind == "pace":

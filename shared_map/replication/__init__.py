@@ -13,7 +13,8 @@
 4. Sets are published when they change (`replica_sync`). A process that starts asks for all held sets (*late join*).
    Losses are found by *anti-entropy*: each replica publishes the numbers that it holds as a *digest* (`digest`),
    and a replica that misses a set asks its author and the keepers for it. A digest of late changes goes out between
-   the whole ones.
+   the whole ones. A digest has 64 KiB at most: a larger one goes out in parts, one at each tick, and the work of
+   comparing in one tick is bounded. Only keepers name the sets of others, and a sender is a keeper by its name.
 5. A keeper shrinks what dead authors left (`shared_map.keeper.compaction`). A set without any mark left becomes a
    *tombstone*: an empty set with a number between two of the author's, at which replicas drop the author's set and
    remember the number for a while (`held_sets`), so that a late copy is not accepted again. An author that is alive

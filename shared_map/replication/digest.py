@@ -4,7 +4,8 @@ received digests that still have to be compared with the held sets (`PendingDige
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +13,15 @@ from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Newest
-from swarm.wire.messages.map_data import DIGEST_ROW, Digest
+from swarm.wire.messages.map_data import DIGEST_ROW, DIGEST_ROW_BYTES, Digest
 
 _FEW = 64
 """Rows up to which tuples are compared faster than arrays: digests of late changes come several times a second."""
 
 Held = Mapping[str, bytes]
 """Author -> rows of DIGEST_ROW, as in the message `Digest`."""
+Place = tuple[str, int]
+"""An author and a tile, in whose order sets are named."""
 
 
 _NONE = (-1, -1)
@@ -74,11 +77,22 @@ class Ledger:
                 found.append((author, sorted(set(tiles))))
         return found
 
-    def ahead(self, theirs: Held, authors: list[str]) -> list[tuple[str, list[int]]]:
-        """(author, tiles) of these authors of which we hold a newer set than they."""
+    def ahead(
+        self, theirs: Held, authors: list[str], after: Place | None = None, until: Place | None = None
+    ) -> list[tuple[str, list[int]]]:
+        """(author, tiles) of these authors of which we hold a newer set than they.
+
+        after, until  range which `theirs` covers, as in `Digest`
+        """
         found = []
         for author in authors:
+            if (after is not None and author < after[0]) or (until is not None and author > until[0]):
+                continue
             rows = self._sorted(author)
+            if after is not None and author == after[0]:
+                rows = rows[rows["tile"] > after[1]]
+            if until is not None and author == until[0]:
+                rows = rows[rows["tile"] <= until[1]]
             rows = rows[_newer(rows, np.sort(np.frombuffer(theirs.get(author, b""), DIGEST_ROW)))]
             if len(rows):
                 found.append((author, rows["tile"].tolist()))
@@ -123,6 +137,32 @@ def fingerprint(held: Held) -> str:
     return hashed.hexdigest()
 
 
+_NAME_BYTES = 80
+"""Most bytes of an author in a message, beside its rows."""
+
+
+def parts_of(held: Held, most_bytes: int) -> Iterator[tuple[dict[str, bytes], Place | None, Place | None]]:
+    """The rows of a digest in parts, with the range of each as in `Digest`. One part if all fit.
+
+    held        in order of author, its rows in order of tile
+    most_bytes  of the rows and names in one part
+    """
+    part: dict[str, bytes] = {}
+    left, after, last = most_bytes, None, None
+    for author, rows in held.items():
+        at = 0
+        while at < len(rows):
+            if left < _NAME_BYTES + DIGEST_ROW_BYTES:
+                yield part, after, last
+                part, left, after = {}, most_bytes, last
+            taken = rows[at : at + (left - _NAME_BYTES) // DIGEST_ROW_BYTES * DIGEST_ROW_BYTES]
+            at += len(taken)
+            left -= _NAME_BYTES + len(taken)
+            part[author] = taken
+            last = author, int(np.frombuffer(taken[-DIGEST_ROW_BYTES:], DIGEST_ROW)["tile"][0])
+    yield part, after, None
+
+
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it names: missing sets are requested only this long after it came."""
 _RETRY_NS = NS_PER_S * 15 // 100
@@ -130,8 +170,19 @@ _RETRY_NS = NS_PER_S * 15 // 100
 _MAX_TRIES = 10
 """After these the sender has sent its next whole digest, which starts again."""
 _MAX_SENDERS = 4096
+_MAX_PARTS = 128
+"""Most that wait of one sender: a keeper's digest of every tile of a map of 16,384 x 16,384 cells has 85."""
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""
+_FORGET_NS = 60 * NS_PER_S
+"""A sender that was silent for so long loses its place in the order."""
+_AT_ONCE = 1024
+"""Authors, and every `_ROWS` rows, that are compared in one tick: some 5 ms."""
+_ROWS = 16
+
+
+_LAST = (1 << 62, 0)
+"""In place of what is known of a sender that was forgotten."""
 
 
 @dataclass(slots=True)
@@ -150,35 +201,77 @@ class PendingDigest:
         """Bytes in memory, about."""
         return 1000 + sum(map(len, self.digest.held.values())) + 100 * len(self.digest.held)
 
+    @property
+    def cost(self) -> int:
+        """Work of one comparison, in the unit of `_AT_ONCE`."""
+        rows = sum(map(len, self.digest.held.values())) // DIGEST_ROW_BYTES
+        return len(self.digest.held) + rows // _ROWS + 1
+
 
 class PendingDigests:
-    """The newest digest of each sender until nothing that it names is missing. Bounded in senders and bytes."""
+    """The newest digest of each sender until nothing that it names is missing. Bounded in senders and bytes.
+
+    The digests that are due are compared by turns of their senders, in each turn that of the sender first which was
+    heard first. Senders with names that were made up later therefore delay none that was there before.
+    """
 
     def __init__(self) -> None:
-        # A sender here is (author, whole): a digest of late changes does not replace the last whole one.
-        self._pending: dict[tuple[str, bool], PendingDigest] = {}
+        # By sender and what it covers: a digest of late changes does not replace the last whole one.
+        self._pending: dict[tuple[str, bool, Place | None], PendingDigest] = {}
+        self._of = Counter[str]()  # sender -> how many of these are its
         self._bytes = 0  # sum of `size` of what is pending
         self._newest = Newest(_MAX_SENDERS)  # of the digests whose senders count them
+        self._senders: dict[str, tuple[int, int]] = {}  # sender -> its number in order of appearance, when heard
+        self._appeared = 0  # the last of these numbers
+        self._forget_due_ns = 0
 
     def add(self, digest: Digest, now_ns: int) -> bool:
-        """Takes in a digest; false if a newer one of the same sender overtook it."""
-        sender = (digest.author, digest.whole)
-        if digest.seq and not self._newest.is_news(sender, (0, digest.seq), now_ns):
+        """Takes in a digest; false if a newer one of its sender overtook it, or if there is no space for it."""
+        sender, stream = digest.author, _stream(digest)
+        if digest.seq and not self._newest.is_news(stream, (0, digest.seq), now_ns):
+            return False
+        if not self._knows(sender, now_ns):
             return False
         due_ns = now_ns + _GRACE_NS
-        replaced = self._pending.get(sender)
+        replaced = self._pending.get(stream)
         if replaced is not None:
             due_ns = min(replaced.due_ns, due_ns)
             self._drop(replaced)
         new = PendingDigest(digest, due_ns)
-        if self._bytes + new.size <= _MAX_BYTES and len(self._pending) < _MAX_SENDERS:
-            self._pending[sender] = new
+        if self._bytes + new.size <= _MAX_BYTES and self._of[sender] < _MAX_PARTS:
+            self._pending[stream] = new
+            self._of[sender] += 1
             self._bytes += new.size
         return True
 
-    def due(self, now_ns: int) -> list[PendingDigest]:
-        """Those to compare now."""
-        return [each for each in self._pending.values() if now_ns >= each.due_ns]
+    def _knows(self, sender: str, now_ns: int) -> bool:
+        """Returns True if a sender is known, now at least."""
+        known = self._senders.get(sender)
+        if known is None:
+            if len(self._senders) >= _MAX_SENDERS and now_ns >= self._forget_due_ns:
+                self._forget_due_ns = now_ns + NS_PER_S
+                heard = self._senders.items()
+                self._senders = {name: of for name, of in heard if now_ns - of[1] < _FORGET_NS}
+            if len(self._senders) >= _MAX_SENDERS:
+                return False
+            self._appeared += 1
+        self._senders[sender] = (self._appeared if known is None else known[0], now_ns)
+        return True
+
+    def due(self, now_ns: int) -> Iterator[PendingDigest]:
+        """Those to compare in this tick."""
+        turns: list[tuple[int, int, PendingDigest]] = []
+        taken = Counter[str]()
+        for (sender, *_), each in self._pending.items():
+            if now_ns >= each.due_ns:
+                turns.append((taken[sender], self._senders.get(sender, _LAST)[0], each))
+                taken[sender] += 1
+        left = _AT_ONCE
+        for _, _, each in sorted(turns, key=lambda turn: turn[:2]):
+            if left <= 0:
+                break
+            left -= each.cost
+            yield each
 
     def compared(self, pending: PendingDigest, complete: bool, now_ns: int) -> None:
         """It was compared: done if all that it names is held, else due again soon, ten times at most."""
@@ -194,5 +287,13 @@ class PendingDigests:
             pending.due_ns = now_ns
 
     def _drop(self, pending: PendingDigest) -> None:
-        del self._pending[pending.digest.author, pending.digest.whole]
+        del self._pending[_stream(pending.digest)]
+        self._of[pending.digest.author] -= 1
+        if not self._of[pending.digest.author]:
+            del self._of[pending.digest.author]
         self._bytes -= pending.size
+
+
+def _stream(digest: Digest) -> tuple[str, bool, Place | None]:
+    """The digests of which only the newest counts."""
+    return digest.author, digest.whole, digest.after

@@ -8,7 +8,7 @@ import numpy as np
 
 from shared_map.learning.measurements import measurements_in
 from shared_map.replication.author_limits import Capacity
-from shared_map.replication.digest import Held, Ledger, fingerprint
+from shared_map.replication.digest import Held, Ledger, Place, fingerprint
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import MOST_CLASSES
@@ -164,8 +164,10 @@ class HeldSets:
         that came after it."""
         if len(rows) % DIGEST_ROW_BYTES:
             return []
-        numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
         newer = [tile for _, tiles in self.ledger.missing({author: rows}) for tile in tiles]
+        if not newer or not len(self.tombstones):
+            return newer
+        numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
         return [tile for tile in newer if not self.tombstones.above(tile, author, numbers[tile])]
 
     def _could_hold(self, author: str, tile: int) -> bool:
@@ -178,9 +180,11 @@ class HeldSets:
         """16 hex digits, equal for replicas that hold the same."""
         return fingerprint(self.ledger.held())
 
-    def ahead_of(self, theirs: Held, authors: list[str]) -> list[MarkSet]:
-        """The sets of these authors that we hold newer than they."""
-        newer = self.ledger.ahead(theirs, authors)
+    def ahead_of(
+        self, theirs: Held, authors: list[str], after: Place | None = None, until: Place | None = None
+    ) -> list[MarkSet]:
+        """The sets of these authors that we hold newer than they, in the range that `theirs` covers."""
+        newer = self.ledger.ahead(theirs, authors, after, until)
         return [self._tiles[tile][author] for author, tiles in newer for tile in tiles]
 
     def answer(self, request: MarksRequest, author: str | None = None) -> list[MarkSet]:

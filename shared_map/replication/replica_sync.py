@@ -7,10 +7,13 @@ replica tells by digests what it holds, and a replica that misses something asks
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
+from msgspec.structs import replace
+
 from shared_map.replication.author_limits import Quota
-from shared_map.replication.digest import Held, PendingDigest, PendingDigests
+from shared_map.replication.digest import PendingDigest, PendingDigests, Place, parts_of
 from shared_map.replication.marks import packed, unpacked
 from shared_map.replication.regions_of_interest import DigestInterest
 from shared_map.replication.replica import MapReplica, Merged
@@ -19,7 +22,16 @@ from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, P
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import Digest, MarkSet, MarkSets, MarksRequest, owner_of
+from swarm.wire.messages.map_data import (
+    MOST_DIGEST_BYTES,
+    MOST_TILES_ASKED,
+    Digest,
+    MarkSet,
+    MarkSets,
+    MarksRequest,
+    is_keeper,
+    owner_of,
+)
 from swarm.wire.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)
@@ -41,9 +53,11 @@ _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
 """A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
-"""Sets given to a keeper for one digest; the next digest shows what it still lacks."""
-_TILES_AT_ONCE = 1 << 16
-"""Named in one question: the tiles of all classes on a large map are more than a message has room for."""
+"""Sets given to keepers in a period of digests; the next ones show what they still lack."""
+_TILES_AT_ONCE = MOST_TILES_ASKED
+"""Named in one question: the tiles of a large map are more than a message has room for."""
+_PART_BYTES = MOST_DIGEST_BYTES - 512
+"""Rows and names of authors in one digest, without its other fields."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
 _MANY = "-"
@@ -110,6 +124,9 @@ class MapSync:
         self._digest_due_ns = 0
         self._changes_due_ns = 0
         self._digest_seq = 0
+        # Parts of the whole digest that are not published yet, as `parts_of` gives them.
+        self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
+        self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
@@ -339,11 +356,14 @@ class MapSync:
     # --- digests --------------------------------------------------------------------------------------------
 
     def _receive_digest(self, digest: Digest, now_ns: int) -> None:
+        if not is_keeper(digest.author):  # names its own sets only
+            held = {digest.author: rows} if (rows := digest.held.get(digest.author)) else {}
+            digest = replace(digest, held=held)
         if digest.author == self._name or not self._digests.add(digest, now_ns):
             return
         if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
             self._heard_ns[digest.author] = now_ns
-        if digest.role == "keeper" and digest.whole:
+        if is_keeper(digest.author) and digest.complete:
             self._digest_interest.keeper_spoke(digest.author, now_ns)
 
     def _choose_digests(self, now_ns: int) -> None:
@@ -366,14 +386,21 @@ class MapSync:
         set within a fraction of a second."""
         if self._name is None:
             return
-        if now_ns >= self._digest_due_ns:
+        if now_ns >= self._digest_due_ns and not self._parts:
             self._digest_due_ns = now_ns + self._digest_ns
-            held, whole = self._committed(), True
+            self._parts.extend(parts_of(self._committed(), _PART_BYTES))
+        author = self.replica.author
+        after: Place | None = None
+        until: Place | None = None
+        whole = False
+        if self._parts:  # one message at a tick, as a reader takes the newest of each key
+            held, after, until = self._parts.popleft()
+            whole = after is None and until is None
+        elif author is not None and self._changed and now_ns >= self._changes_due_ns:
+            changes = {author: self.replica.held.ledger.rows_of(author, self._changed)}
+            held = next(parts_of(changes, _PART_BYTES))[0]
         else:
-            author = self.replica.author
-            if author is None or not self._changed or now_ns < self._changes_due_ns:
-                return
-            held, whole = {author: self.replica.held.ledger.rows_of(author, self._changed)}, False
+            return
         self._changes_due_ns = now_ns + _CHANGES_EVERY_NS
         for tile, until_ns in list(self._changed.items()):
             if until_ns is None:
@@ -381,7 +408,15 @@ class MapSync:
             elif now_ns >= until_ns:
                 del self._changed[tile]
         self._digest_seq += 1
-        digest = Digest(author=self._name, role=self._role, held=held, whole=whole, seq=self._digest_seq)
+        digest = Digest(
+            author=self._name,
+            role=self._role,
+            held=held,
+            whole=whole,
+            seq=self._digest_seq,
+            after=after,
+            until=until,
+        )
         self._bus.publish(DIGEST, digest, author=self._name)
 
     def _compare(self, pending: PendingDigest, now_ns: int) -> None:
@@ -392,8 +427,8 @@ class MapSync:
         for author, tiles in missing:
             if owner_of(author) not in throttled:  # else its sets wait here already
                 self._fetch(author, tiles, now_ns)
-        if digest.role == "keeper" and digest.whole and not self._serves_all and pending.tries == 0:
-            self._offer(digest.held, now_ns)
+        if is_keeper(digest.author) and digest.complete and not self._serves_all and pending.tries == 0:
+            self._offer(digest, now_ns)
         self._digests.compared(pending, not missing, now_ns)
 
     def _fetch(self, author: str, tiles: list[int], now_ns: int) -> None:
@@ -403,17 +438,20 @@ class MapSync:
         again = asked_ns is not None and now_ns - asked_ns >= _ASK_AGAIN_NS
         if again or (asked_ns is None and len(self._asked_ns) < _MAX_ASKS):
             self._asked_ns[author] = now_ns
-            request = MarksRequest(authors=[author], tiles=tiles, bulk=True)
+            request = MarksRequest(authors=[author], tiles=tiles[:_TILES_AT_ONCE], bulk=True)
             self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
 
-    def _offer(self, kept: Held, now_ns: int) -> None:
+    def _offer(self, kept: Digest, now_ns: int) -> None:
         """Puts again what a keeper never got, and its author, being gone, cannot put again."""
         silent = [author for author in self.replica.held.ledger.authors if self._silent(author, now_ns)]
-        lost = self.replica.held.ahead_of(kept, silent)
-        for mark_set in lost[:_OFFERS_AT_ONCE]:
+        if now_ns >= self._offers_due_ns:
+            self._offers_left, self._offers_due_ns = _OFFERS_AT_ONCE, now_ns + self._digest_ns
+        lost = self.replica.held.ahead_of(kept.held, silent, kept.after, kept.until)[: self._offers_left]
+        self._offers_left -= len(lost)
+        for mark_set in lost:
             self._put(mark_set)
         if lost:
-            log.info("gave the keeper %d sets of authors that are gone", min(len(lost), _OFFERS_AT_ONCE))
+            log.info("gave the keeper %d sets of authors that are gone", len(lost))
 
     def _silent(self, author: str, now_ns: int) -> bool:
         since_ns = self._digest_interest.since_ns(author)

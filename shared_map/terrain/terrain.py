@@ -186,7 +186,7 @@ def finished(
     climb = climb_of(grid, elevation_m, cost)
     if climb is not None:
         notes = (*notes, climb.note)
-    digest = _digest(grid, pace, cost, elevation_m if cost.directional else None)
+    digest = terrain_digest(grid, pace, cost, elevation_m)
     return Terrain(
         grid=grid,
         elevation_m=elevation_m,
@@ -218,11 +218,12 @@ def _check_passable(pace: Floats, elevation_m: Floats, classes: Bytes, cost: Cos
     )
 
 
-def _digest(grid: GridSpec, pace: Floats, cost: CostConfig, elevation_m: Floats | None) -> str:
+def terrain_digest(grid: GridSpec, pace: Floats, cost: CostConfig, elevation_m: Floats) -> str:
+    """The digest of a terrain with these arrays."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"{FORMAT} {grid}".encode())
     digest.update(np.ascontiguousarray(pace).data)
-    if elevation_m is not None:
+    if cost.directional:
         digest.update(np.ascontiguousarray(elevation_m).data)
     # The location of a file differs between machines; its effect is in the pace.
     zones = tuple(

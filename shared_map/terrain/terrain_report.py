@@ -20,6 +20,8 @@ _JOINED_SIDE = 1024
 """On larger terrains one-way steps are followed in a square of this side in cells: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
+_DOUBT = "! "
+_SEA_FLOOR_M, _MUCH_FLOOR = -0.5, 0.01
 _LOWEST_LAND_M = -450.0
 """The shore of the Dead Sea is at -430 m."""
 
@@ -48,6 +50,10 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
         for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
             facts[name] = round(float(np.nanpercentile(slopes, share)), 1)
     lethal = np.isinf(pace)
+    with np.errstate(invalid="ignore"):
+        low = (elevation_m < _SEA_FLOOR_M) & ~lethal
+    border = np.concatenate((low[0], low[-1], low[:, 0], low[:, -1]))
+    facts["low_border_share"] = round(float(border.mean()), 4)
     facts["lethal_share"] = round(float(lethal.mean()), 4)
     counts = np.bincount(terrain.classes.reshape(-1), minlength=max(TerrainClass) + 1)
     facts["class_shares"] = {
@@ -147,6 +153,11 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
             f"heights go down to {facts['lowest_m']:g} m, where no dry land is: a sea floor is ground here, unless"
             " terrain.water_below_m = 0"
         )
+    elif facts.get("low_border_share", 0.0) > _MUCH_FLOOR:
+        doubts.append(
+            f"{facts['low_border_share']:.0%} of the border is ground below sea level: if it is a sea floor, set"
+            " terrain.water_below_m = 0"
+        )
     if facts.get("lowest_m") == facts.get("highest_m") and facts["voids"] < facts["rows"] * facts["cols"]:
         doubts.append("all heights are the same: slopes cost nothing here")
     return doubts
@@ -160,6 +171,16 @@ def said_of(terrain: Terrain) -> list[str]:
     return [
         f"terrain: {size}, {lethal:.1%} lethal, {water:.1%} water",
         *([] if grid.crs == "local" else [f"terrain: {extent_of(MapFrame(grid), 'latlon')}"]),
-        *(f"- {note}" for note in terrain.notes),
-        *(f"! {doubt}" for doubt in doubts_about(facts_of(terrain))),
+        *lines_of(*notes_and_doubts(terrain, facts_of(terrain))),
     ]
+
+
+def notes_and_doubts(terrain: Terrain, facts: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Returns what was done to a terrain, and what looks wrong with it. Notes of importers which begin with `!` are
+    doubts."""
+    doubts = [note.removeprefix(_DOUBT) for note in terrain.notes if note.startswith(_DOUBT)]
+    return [note for note in terrain.notes if not note.startswith(_DOUBT)], [*doubts, *doubts_about(facts)]
+
+
+def lines_of(notes: list[str], doubts: list[str]) -> list[str]:
+    return [*(f"- {note}" for note in notes), *(f"{_DOUBT}{doubt}" for doubt in doubts)]

@@ -68,7 +68,7 @@ class ZoneFacts:
         if file.bridges:
             parts[0] += f" ({file.bridges} bridge{'s' * (file.bridges > 1)})"
         parts.append(text)
-        left_out = [f"{file.outside} outside of the terrain, or without a shape"] if file.outside else []
+        left_out = [f"{file.outside} outside of the terrain"] if file.outside else []
         for why, count in file.skipped.most_common(6):
             names = file.named.get(why, [])
             left_out.append(f"{count} {why}" + (f" (feature {', '.join(names)})" if names else ""))
@@ -76,7 +76,9 @@ class ZoneFacts:
             parts.append(f"left out: {', '.join(left_out)}")
         if file.mended:
             shown = ", ".join(file.mended[:5]) + (" ..." if len(file.mended) > 5 else "")
-            parts.append(f"{len(file.mended)} that cross themselves were repaired: feature {shown}")
+            parts.append(
+                f"{len(file.mended)} that cross themselves or are not closed were repaired: feature {shown}"
+            )
         return "; ".join(parts)
 
     def as_json(self, cells: int) -> dict[str, Any]:
@@ -176,10 +178,14 @@ class _Painter:
             facts.file = burnt.facts
             return _Painted(zone, facts, burnt.values, burnt.lethal, burnt.bridges)
         inside = zone_mask(zone, self._grid, where)
+        if zone.kind == "keep_in":
+            inside = ~inside
+            if not inside.any():
+                return _Painted(zone, facts)
         window = _around(inside)
         inside = inside[_part(window)].copy()
         facts.cells = int(inside.sum())
-        if zone.kind in ("forbidden", "water"):
+        if zone.kind in ("forbidden", "keep_in", "water"):
             return _Painted(zone, facts, lethal=(window, inside))
         values = np.where(inside, np.float32(zone.value or 1.0), np.float32(np.nan))
         return _Painted(zone, facts, values=(window, values))
@@ -209,7 +215,7 @@ class _Painter:
                 after[inside] = self._possible(values[inside])
             case "road":
                 self._lay(window, after, values, inside, from_file)
-            case "forbidden":
+            case "forbidden" | "keep_in":
                 pass  # painted last
             case _:
                 assert_never(zone.kind)
@@ -261,7 +267,7 @@ class _Painter:
 
     def forbidden(self, painted: _Painted) -> None:
         """Forbidden zones are lethal, on top of any other zone; so are roads of a lethal class."""
-        if painted.zone.kind in ("forbidden", "road"):
+        if painted.zone.kind in ("forbidden", "keep_in", "road"):
             self._close(painted)
 
     def _close(self, painted: _Painted) -> None:

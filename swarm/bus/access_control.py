@@ -10,11 +10,13 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from swarm.config.setting_types import RESERVED_GROUPS
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
+from swarm.wire.access import MEMBERS, ROLES, Grant
 from swarm.wire.fields import check_id
-from swarm.wire.topics import ALIVE_KEY, TOPICS
+from swarm.wire.messages.map_data import KEEPERS
+from swarm.wire.topics import ALIVE_KEY, TOPICS, asker_of
 
 ROUTER = "router"
 _EVERYTHING = (
@@ -29,7 +31,8 @@ class Bearer:
     """The name to which a certificate was issued.
 
     name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
-    author  what its ids as an author begin with: the group and id of an agent or rover, else the id
+    author  what its ids as an author begin with: the group and id of an agent or rover, of a keeper "keeper" and
+            its id, else the id
     """
 
     name: str
@@ -40,6 +43,7 @@ class Bearer:
     def own(self, field: str) -> str:
         """Required value of a key's field where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
+        own["asker"] = asker_of(self.role, self.id)
         return own.get(field, self.id)
 
 
@@ -57,10 +61,13 @@ def bearer(name: str) -> Bearer:
             f"{name!r} is no name of a process: write ROLE.ID or agent.GROUP.ID, such as planner.t0; the roles are"
             f" {roles}"
         )
-    if role == "agent" and group.split(".")[0] == OPERATOR:
+    first = author.split(".")[0]
+    if role in ("agent", "rover") and first in RESERVED_GROUPS:
         raise ConfigError(
-            f"{name!r} is no name of a process: no group is called {OPERATOR!r}, as zones are its marks"
+            f"{name!r} is no name of a process: no group is called {first!r}, as {RESERVED_GROUPS[first]}"
         )
+    if role == "keeper":
+        return Bearer(name, role, author, f"{KEEPERS}.{author}")
     return Bearer(name, role, id if role in ("agent", "rover") else author, author)
 
 
@@ -74,6 +81,18 @@ def common_name(name: str, revoked: Collection[str]) -> str:
     return candidate
 
 
+def patterned(key: str) -> str:
+    """A key expression of a subscription or queryable, so that it begins with a wildcard: routers number no part of
+    such a one, and so can confuse none (docs/design/misrouted-keys.md). It also matches in each namespace which
+    ends as that of the key: its owner compares the namespace of what comes."""
+    return f"$*{key}"
+
+
+def _declared(keys: list[str]) -> list[str]:
+    """Key expressions which a process may declare in order to hear or serve these: as they are, and patterned."""
+    return keys + [patterned(key) for key in keys]
+
+
 def access_control(namespace: str, names: Iterable[str], revoked: Collection[str] = ()) -> dict[str, Any]:
     """Returns the value of a router's `access_control`: each name may do what the table of topics grants to its
     role, and any other name is denied everything. Links over tcp/ have no names; they stay open, as
@@ -81,7 +100,8 @@ def access_control(namespace: str, names: Iterable[str], revoked: Collection[str
 
     revoked  common names that are denied everything from now on
     """
-    rules = [_rule("everything", flow, _EVERYTHING, [f"{namespace}/**"]) for flow in ("ingress", "egress")]
+    all_keys = _declared([f"{namespace}/**"])
+    rules = [_rule("everything", flow, _EVERYTHING, all_keys) for flow in ("ingress", "egress")]
     everything = [rule["id"] for rule in rules]
     subjects: list[dict[str, Any]] = [{"id": _LOOPBACK, "link_protocols": ["tcp"]}]
     policies = [{"rules": everything, "subjects": [_LOOPBACK]}]
@@ -109,11 +129,12 @@ def _rules(namespace: str, who: Bearer) -> list[dict[str, Any]]:
     wide = {name: list(_keys(namespace, who, name, own=False)) for name in ("serve", "ask")}
     rows = (
         ("ingress", ("put",), table["put"]),
-        ("ingress", ("declare_queryable", "reply"), table["serve"]),
+        ("ingress", ("declare_queryable",), _declared(table["serve"])),
+        ("ingress", ("reply",), table["serve"]),
         ("ingress", ("query",), table["ask"]),
-        ("ingress", ("declare_subscriber",), table["hear"]),
+        ("ingress", ("declare_subscriber",), _declared(table["hear"])),
         ("ingress", ("liveliness_token",), [token] if who.role in MEMBERS.split() else []),
-        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), [tokens]),
+        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), _declared([tokens])),
         ("egress", ("put",), table["hear"]),
         ("egress", ("query",), wide["serve"]),
         ("egress", ("reply",), wide["ask"]),

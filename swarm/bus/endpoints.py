@@ -42,6 +42,18 @@ def listening(endpoint: str) -> bool:
         return False
 
 
+def keeps_open(endpoint: str) -> bool:
+    """Returns True if a process accepts a connection there and does not end it at once, as a proxy does that has no
+    router behind it."""
+    try:
+        with socket.create_connection(host_port(endpoint), timeout=_KNOCK_S) as connection:
+            return bool(connection.recv(1))
+    except TimeoutError:
+        return True
+    except OSError:
+        return False
+
+
 def wait_for_router(endpoints: Sequence[str]) -> None:
     """Block until something listens at one of the endpoints, however long it takes; say once that it waits.
 
@@ -66,9 +78,9 @@ def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
 def why_not_listening(error: Exception) -> str:
     """Returns the reason why no process can listen there, from the library's message."""
     found = _OS_ERROR.search(str(error))
-    if found is None:
+    number = error.errno if isinstance(error, OSError) else int(found[1]) if found is not None else None
+    if number is None:
         return "the network library refuses; its own words are in the log (is the port taken?)"
-    number = int(found[1])
     hint = _HINTS.get(number)
     return os.strerror(number) + (f" ({hint})" if hint else "")
 

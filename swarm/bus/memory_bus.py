@@ -7,9 +7,10 @@ run. Only collected samples are buffered: a handler takes no simulated time, and
 
 from __future__ import annotations
 
+import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -25,6 +26,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
     check_subscription,
+    counter_of,
     new_counts,
     newest_of,
 )
@@ -34,8 +36,9 @@ from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
+from swarm.wire.meant import SHARED, check_meant, meant_for
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import TOPICS, Topic, check_size
 
 # One query on the simulated network: which queryables have not ended yet, and how their answers travel.
 
@@ -115,9 +118,9 @@ class MemoryAnswerer:
         named = asking.topic.one({**self.queryable.narrow, **fields})
         if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
-        payload = encode(message)
-        bus.sent(payload)
         key = asking.topic.below(named)
+        payload = meant_for(key, encode(message))
+        bus.sent(payload)
         code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
         parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
 
@@ -125,9 +128,10 @@ class MemoryAnswerer:
             if asking.over:
                 return
             try:
+                check_size(payload, asking.topic.answer_bytes)
                 check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
-            except ProtocolError:
-                asking.bus.counts["payloads_dropped"] += 1
+            except ProtocolError as error:
+                asking.bus.counts[counter_of(error)] += 1
                 return
             asking.bus.received(payload)
             asking.replies += 1
@@ -177,12 +181,14 @@ class MemoryAnswerer:
 class Declaration:
     """One subscription or queryable of one bus.
 
+    prefix    its key expression up to the first wildcard
     narrow    the fields of its key that are no wildcard
     post      a subscription without one keeps its samples until they are collected
     together  it posts a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone
     """
 
     bus: MemoryBus
+    prefix: str
     narrow: dict[str, str]
     post: Post | None
     together: bool = False
@@ -193,6 +199,14 @@ class Declaration:
             if fields[name] not in (chunk, "*"):
                 return False
         return True
+
+
+def declared(
+    bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post | None, together: bool = False
+) -> Declaration:
+    """A subscription or queryable with these fields. Raises as `narrowed`."""
+    prefix = topic.below(topic.every(fields)).partition("*")[0]
+    return Declaration(bus, prefix, narrowed(topic, fields), post, together)
 
 
 def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
@@ -218,6 +232,10 @@ class Subscriptions:
         self._all = [
             each for each in self._all if each.bus is not bus or (narrow is not None and each.narrow != narrow)
         ]
+
+    def of(self, bus: MemoryBus) -> list[Declaration]:
+        """Returns the subscriptions of a bus."""
+        return [each for each in self._all if each.bus is bus]
 
     def find(self, fields: Mapping[str, str]) -> list[Declaration]:
         """Returns the subscribers that a value with these fields reaches: those with wildcards first, then the
@@ -290,6 +308,26 @@ Trace = Callable[[int, str, str, str, bytes], None]
 """Called at each delivery with time in ns, source node, destination node, topic and payload."""
 
 
+MOST_SWAPPED = 300
+"""Messages to one bus that come under a wrong key after a reconnect."""
+SWAPPED_NS = NS_PER_S // 4
+"""No message comes under a wrong key later than this after a reconnect."""
+
+
+@dataclass(eq=False, slots=True)
+class Swap:
+    """A router's fault, which this network has at every reconnect: it takes the prefix of one of a bus's key
+    expressions for that of another (docs/design/misrouted-keys.md).
+
+    prefixes  each one and its substitute
+    left      messages that still go astray
+    """
+
+    prefixes: Mapping[str, str]
+    left: int
+    until_ns: int
+
+
 class MemoryNetwork:
     """Simulated counterpart of a Zenoh router: connects the buses of all nodes.
 
@@ -319,9 +357,22 @@ class MemoryNetwork:
         """Makes nodes notice that their link came up or went down, and all nodes which tokens they see now."""
         for bus in list(self.buses):
             if bus.node in nodes:
+                bus.swap = self._swapped(bus) if up else None
                 for post in bus.link_watchers:
                     bus.later(TOKEN_NS, post, LinkChanged(up))
         self.compare_tokens()
+
+    def _swapped(self, bus: MemoryBus) -> Swap | None:
+        """Draws which two prefixes of a bus stand for each other for a while after a reconnect."""
+        now_ns = self.scheduler.clock.now_ns()
+        chance = random.Random(f"swap/{bus.node}/{now_ns}")
+        subscribed = [each for every in list(self.subscriptions.values()) for each in every.of(bus)]
+        served = [each for every in bus.queryables.values() for each in every]
+        prefixes = sorted({each.prefix for each in subscribed + served})
+        if len(prefixes) < 2:
+            return None
+        one, other = chance.sample(prefixes, 2)
+        return Swap({one: other, other: one}, chance.randint(1, MOST_SWAPPED), now_ns + SWAPPED_NS)
 
     def compare_tokens(self) -> None:
         """Makes every watcher notice tokens that it sees since the last time, or no longer."""
@@ -354,12 +405,15 @@ class MemoryBus:
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self._kept: dict[str, deque[_Sample]] = {}
-        """Topic -> samples that wait for `collected`."""
+        """Topic -> samples that wait for `gather`."""
+        self._gathered: dict[str, deque[_Sample]] = {}
+        self.swap: Swap | None = None
+        """Two prefixes of this bus that are confused at present."""
         self.tokens: list[Peer] = []
         """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        self.publish_bytes(topic, encode(message), fields)
+        self.publish_bytes(topic, meant_for(topic.value(fields)[1], encode(message)), fields)
 
     def publish_bytes(
         self, topic: Topic, payload: bytes, fields: Mapping[str, str | int], *, in_json: bool = False
@@ -384,8 +438,34 @@ class MemoryBus:
     def _arrive(self, reached: Sequence[Declaration], sample: _Sample) -> None:
         """Makes a sample arrive at subscriptions which it reaches at one time, in the order of `find`."""
         for subscription in reached:
-            if subscription.bus.traced(self, sample.topic.name, sample.payload):
-                subscription.bus.arrived(sample, subscription)
+            to = subscription.bus
+            if not to.traced(self, sample.topic.name, sample.payload):
+                continue
+            astray = to.astray(subscription, sample.key)
+            if astray is None:
+                to.arrived(sample, subscription)
+                continue
+            for topic, fields in to.named(astray):
+                wrong = replace(sample, topic=topic, fields=fields, key=astray, checked_by=None, parsed=False)
+                for each in self.network.subscriptions[self.namespace, topic.name].find(fields):
+                    if each.bus is to:
+                        to.arrived(wrong, each)
+
+    def astray(self, declaration: Declaration, key: str) -> str | None:
+        """The wrong key under which a message to this declaration comes; None if it comes under its own."""
+        swap = self.swap
+        if swap is None or declaration.prefix not in swap.prefixes:
+            return None
+        swap.left -= 1
+        if swap.left < 0 or self.network.scheduler.clock.now_ns() > swap.until_ns:
+            self.swap = None
+            return None
+        return swap.prefixes[declaration.prefix] + key.removeprefix(declaration.prefix)
+
+    def named(self, key: str) -> list[tuple[Topic, Mapping[str, str]]]:
+        """The topics of a key below the namespace, with its fields."""
+        found = ((topic, topic.parse(self.namespace, f"{self.namespace}/{key}")) for topic in TOPICS)
+        return [(topic, fields) for topic, fields in found if fields is not None]
 
     def subscribe(
         self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
@@ -393,20 +473,25 @@ class MemoryBus:
         check_subscription(topic, together, every_s)
         if every_s:
             post = sampled(self, post, int(every_s * NS_PER_S))
-        self._declare(topic, Declaration(self, narrowed(topic, fields), post, together))
+        self._declare(topic, declared(self, topic, fields, post, together))
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        self._declare(topic, Declaration(self, narrowed(topic, fields), None))
+        self._declare(topic, declared(self, topic, fields, None))
 
     def _declare(self, topic: Topic, subscription: Declaration) -> None:
         self.network.subscriptions[self.namespace, topic.name].add(subscription)
 
+    def gather(self) -> None:
+        for name, kept in self._kept.items():
+            self._gathered.setdefault(name, deque(maxlen=kept.maxlen)).extend(kept)
+        self._kept.clear()
+
     def collected(self, topic: Topic) -> list[Heard]:
-        kept = self._kept.pop(topic.name, ())
+        kept = self._gathered.pop(topic.name, ())
         return newest_of(topic, [(sample.key, sample) for sample in kept], self._heard)
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        kept = self._kept.pop(topic.name, ())
+        kept = self._gathered.pop(topic.name, ())
         return [(sample.key, heard.message) for sample in kept if (heard := self._heard(sample, together=True))]
 
     def arrived(self, sample: _Sample, subscription: Declaration) -> None:
@@ -424,8 +509,9 @@ class MemoryBus:
         together  the reader compares key and message
         """
         heard = sample.heard(self, together)
-        if heard is None:
-            self.counts["payloads_dropped"] += 1
+        if isinstance(heard, ProtocolError):
+            self.counts[counter_of(heard)] += 1
+            return None
         return heard
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
@@ -434,7 +520,7 @@ class MemoryBus:
     def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
-        self.queryables.setdefault(topic.name, []).append(Declaration(self, narrowed(topic, fields), post))
+        self.queryables.setdefault(topic.name, []).append(declared(self, topic, fields, post))
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         narrow = narrowed(topic, fields)
@@ -459,7 +545,7 @@ class MemoryBus:
         if self.closed:
             scheduler.after(0, asking.finish)
             return
-        payload = encode(request)
+        payload = meant_for(topic.below(wanted), encode(request))
         self.sent(payload)
         queryables = [
             queryable
@@ -483,15 +569,33 @@ class MemoryBus:
 
     def _arrive_asked(self, queryable: Declaration, payload: bytes, code: bytes | None, event: Asked) -> None:
         to, topic = queryable.bus, event.topic
-        assert queryable.post is not None
         if not to.traced(self, topic.name, payload):
             return
         to.received(payload)
+        key = topic.below(event.fields)
+        astray = to.astray(queryable, key)
+        if astray is None:
+            to.take_asked(queryable, key, payload, code, event)
+            return
+        for topic, fields in to.named(astray):
+            for each in to.queryables.get(topic.name, ()):
+                if each.meets(fields):
+                    to.take_asked(each, astray, payload, code, replace(event, topic=topic, fields=fields))
+                    return
+        event.end()
+
+    def take_asked(
+        self, queryable: Declaration, key: str, payload: bytes, code: bytes | None, event: Asked
+    ) -> None:
+        """Posts a question that has come under a key, or refuses it."""
+        assert queryable.post is not None
         try:
-            check_code(to.authenticator, code, topic, topic.below(event.fields), payload)
+            check_size(payload, event.topic.ask_bytes)
+            check_meant(key, payload)
+            check_code(self.authenticator, code, event.topic, key, payload)
         except ProtocolError as error:
-            to.counts["payloads_dropped"] += 1
-            event.refuse(f"{topic.name}: {error}")
+            self.counts[counter_of(error)] += 1
+            event.refuse(f"{event.topic.name}: {error}")
             event.end()
         else:
             queryable.post(event)
@@ -567,14 +671,17 @@ class _Watcher:
         self.visible = now
 
 
+_UNPARSED = ProtocolError("not parsed yet")
+
+
 @dataclass(eq=False, slots=True)
 class _Sample:
     """One put, parsed and checked once: when the first subscription is reached. All share the result.
 
     checked_by  the authenticator that accepted its code; None before, and for a bus without codes
     parsed      whether it was parsed
-    parses      its event; None if the payload is no message of the topic
-    fits        the same; None if the message says that it is of another sender than the key, too
+    parses      its event, or why the payload is no message of the topic, or is meant for another key
+    fits        the same, or why its fields say that it is of another sender than the key
     """
 
     topic: Topic
@@ -585,32 +692,39 @@ class _Sample:
     in_json: bool
     checked_by: Authenticator | None = None
     parsed: bool = False
-    parses: Heard | None = None
-    fits: Heard | None = None
+    parses: Heard | ProtocolError = _UNPARSED
+    fits: Heard | ProtocolError = _UNPARSED
 
-    def heard(self, bus: MemoryBus, together: bool) -> Heard | None:
-        """The event, as a bus takes it; None if it is rejected.
+    def heard(self, bus: MemoryBus, together: bool) -> Heard | ProtocolError:
+        """The event, as a bus takes it, or why it is rejected.
 
         together  the reader compares the message with its key
         """
-        if self.checked_by is not bus.authenticator:
-            try:
-                check_code(bus.authenticator, self.code, self.topic, self.key, self.payload)
-            except ProtocolError:
-                return None
-            self.checked_by = bus.authenticator
         if not self.parsed:
             self.parsed = True
             self.parse()
+        if self.checked_by is not bus.authenticator and not isinstance(self.parses, ProtocolError):
+            try:
+                check_code(bus.authenticator, self.code, self.topic, self.key, self.payload)
+            except ProtocolError as error:
+                return error
+            self.checked_by = bus.authenticator
         return self.parses if together else self.fits
 
     def parse(self) -> None:
         payload, kind = self.payload, self.topic.message
         try:
-            if self.in_json and may_be_json(payload):
+            check_size(payload, self.topic.put_bytes)
+            in_json = self.in_json and may_be_json(payload)
+            if in_json:
                 payload = packed_json(payload, kind, self.fields)
-            self.parses = Heard(self.topic, self.fields, decode(payload, kind))
-            self.topic.check_key(self.fields, self.parses.message)
-        except ProtocolError:
+            check_meant(self.key, payload, must=in_json and kind in SHARED)
+            heard = Heard(self.topic, self.fields, decode(payload, kind))
+        except ProtocolError as error:
+            self.parses = self.fits = error
             return
-        self.fits = self.parses
+        self.parses = self.fits = heard
+        try:
+            self.topic.check_key(self.fields, heard.message)
+        except ProtocolError as error:
+            self.fits = error

@@ -12,12 +12,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import zenoh
 
+from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
@@ -31,9 +34,10 @@ from swarm.bus.bus import (
     Post,
     Replied,
     Undecoded,
+    asker_in,
     check_subscription,
 )
-from swarm.bus.endpoints import listening, wait_for_router, why_not_listening, why_unreachable
+from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_intake import (
     Arrivals,
@@ -50,6 +54,7 @@ from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
+from swarm.wire.meant import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
@@ -79,14 +84,14 @@ class ZenohAnswerer:
         """Returns the query, decoded; None if it is rejected, which ends the query."""
         intake, topic, query = self._bus.intake, self._topic, self._query
         assert query is not None
-        assert topic.request is not None
         key = str(query.key_expr)
         intake.received(self._asked)
         try:
             if self._fault is not None:
                 raise self._fault
-            intake.check(topic, key, query, self._asked)
-            request = intake.request(topic.request, query, self._asked, self._parameters)
+            if query.payload is None and topic.trusted and intake.authenticator is not None:
+                raise ProtocolError("its fields are no payload, which alone a code can cover")
+            request = intake.request(topic, query, self._asked, self._parameters)
         except ProtocolError as error:
             intake.drop(key, error)
             self.refuse(f"{topic.name}: {error}")
@@ -95,6 +100,11 @@ class ZenohAnswerer:
         # A tool may ask with `**`, which no key template parses: all that we serve is meant.
         asked = topic.parse(self._bus.namespace, key) or {**dict.fromkeys(topic.fields, "*"), **self._concrete}
         return Asked(topic, asked, request, self)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        return len(self._asked)
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
@@ -108,7 +118,8 @@ class ZenohAnswerer:
         key = topic.keyed(bus.namespace, **{**self._concrete, **fields})
         if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        payload = encode_json(message) if self._as_json else encode(message)
+        below = bus.intake.below(key)
+        payload = encode_json(message, below) if self._as_json else meant_for(below, encode(message))
         bus.intake.sent(payload)
         if self._as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
@@ -152,23 +163,30 @@ def open_bus(
 
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
-    patient        wait until a process listens: a process may be started before its router
+    patient        wait until a router listens: a process may be started before it, and a proxy be between
     authenticator  signs messages on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
-    if patient:
-        wait_for_router(endpoints)
-    try:
-        return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
-    except zenoh.ZError as error:
-        if patient and not any(map(listening, endpoints)):
-            return open_bus(network, patient=True, authenticator=authenticator)
-        log.info("zenoh says: %s", error)
-        if mode == "router":
-            what, reason = "listen on", why_not_listening(error)
-        else:
-            what, reason = "reach a router at", why_unreachable(endpoints, encrypted=network.tls is not None)
-        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason}") from error
+    said = False
+    while True:
+        if patient:
+            wait_for_router(endpoints)
+        try:
+            return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
+        except zenoh.ZError as error:
+            if not patient or any(map(keeps_open, endpoints)):
+                raise _why_not(error, network, mode) from error
+            if not said:
+                log.warning("no router behind %s yet: waiting for one (Ctrl-C ends this)", ", ".join(endpoints))
+            said = True
+
+
+def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError:
+    log.info("zenoh says: %s", error)
+    if mode == "router":
+        return BusError(f"cannot listen on {', '.join(network.listen)}: {why_not_listening(error)}")
+    reason = why_unreachable(network.connect, encrypted=network.tls is not None)
+    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {reason}")
 
 
 class ZenohBus:
@@ -182,7 +200,6 @@ class ZenohBus:
     def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
         self._session = session
         self._namespace = namespace
-        self.authenticator = authenticator
         self.intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
@@ -190,8 +207,8 @@ class ZenohBus:
         """Entities that are declared and not yet undeclared, in order; `close` undeclares them in reverse."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
-        self._collecting: dict[str, list[Any]] = {}
-        """Topic -> its subscribers, which are read by `collected` only."""
+        self._collecting: dict[str, list[tuple[Any, deque[zenoh.Sample]]]] = {}
+        """Topic -> each subscription that is collected, and what was gathered of it."""
         self._queryables: dict[str, list[Any]] = {}
         """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
@@ -206,6 +223,15 @@ class ZenohBus:
     @property
     def counts(self) -> Mapping[str, int]:
         return self.intake.counts
+
+    @property
+    def authenticator(self) -> Authenticator | None:
+        """Signs messages on trusted topics, and checks them."""
+        return self.intake.authenticator
+
+    def trust(self, authenticator: Authenticator | None) -> None:
+        """Signs and checks from now on: a client learns only from the swarm which run it is."""
+        self.intake.authenticator = authenticator
 
     @property
     def closed(self) -> bool:
@@ -225,7 +251,8 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self.closed:
             return
-        key, payload = topic.keyed(self._namespace, **fields), encode(message)
+        below = topic.value(fields)[1]
+        key, payload = f"{self._namespace}/{below}", meant_for(below, encode(message))
         self.intake.sent(payload)
         self._session.put(
             key,
@@ -263,28 +290,42 @@ class ZenohBus:
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
         self._entities.append(subscriber)
-        self._collecting.setdefault(topic.name, []).append(subscriber)
+        self._collecting.setdefault(topic.name, []).append((subscriber, deque(maxlen=topic.buffer)))
+
+    def gather(self) -> None:
+        for collecting in self._collecting.values():
+            for subscriber, gathered in collecting:
+                gathered += taken_from(subscriber.handler, gathered.maxlen or 0)
 
     def collected(self, topic: Topic) -> list[Heard]:
         heard: list[Heard] = []
-        for subscriber in self._collecting.get(topic.name, ()):
-            heard += self.intake.newest(topic, taken_from(subscriber.handler, topic.buffer))
+        for samples in self._gathered(topic):
+            heard += self.intake.newest(topic, samples)
         return heard
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        samples: list[zenoh.Sample] = []
-        for subscriber in self._collecting.get(topic.name, ()):
-            samples += taken_from(subscriber.handler, topic.buffer)
+        samples = list(chain.from_iterable(self._gathered(topic)))
         return self.intake.together(topic, samples) if samples else []
 
+    def _gathered(self, topic: Topic) -> Iterator[list[zenoh.Sample]]:
+        """Takes the gathered samples of each subscription to a topic, where there are any."""
+        for _, gathered in self._collecting.get(topic.name, ()):
+            if gathered:
+                yield list(gathered)
+                gathered.clear()
+
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
+        subscribers = self._subscribers.pop(self._pattern(topic, fields), ())
         collecting = self._collecting.get(topic.name, ())
-        self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
+        self._collecting[topic.name] = [each for each in collecting if each[0] not in subscribers]
         self._undeclare_all(subscribers)
 
+    def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:
+        """The key expression of a subscription or queryable."""
+        return patterned(topic.expression(self._namespace, **fields))
+
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
@@ -295,17 +336,18 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            asked = ZenohAnswerer(self, topic, concrete, query).decoded()
-            if asked is not None:
+            answerer = ZenohAnswerer(self, topic, concrete, query)
+            if not self.intake.concerns(query):
+                answerer.end()
+            elif undecoded:
+                asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+                post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
+            elif (asked := answerer.decoded()) is not None:
                 post(asked)
 
-        def leave(query: zenoh.Query) -> None:
-            answerer = ZenohAnswerer(self, topic, concrete, query)
-            post(Undecoded(topic, answerer, answerer.decoded))
-
-        expression = topic.expression(self._namespace, **fields)
+        expression = self._pattern(topic, fields)
         arrivals = Arrivals(_QUERY_BUFFER)
-        into = zenoh.handlers.Callback(guarded(leave), indirect=False) if undecoded else _into(arrivals)
+        into = zenoh.handlers.Callback(guarded(arrive), indirect=False) if undecoded else _into(arrivals)
         queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
         if undecoded:
@@ -314,7 +356,7 @@ class ZenohBus:
             self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
-        self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
+        self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
 
     def ask(
         self,
@@ -328,7 +370,8 @@ class ZenohBus:
     ) -> None:
         replies = 0
         failure: str | None = None
-        expression, asked = topic.expression(self._namespace, **fields), encode(request)
+        expression = topic.expression(self._namespace, **fields)
+        asked = meant_for(self.intake.below(expression), encode(request))
         began_s = time.monotonic()
 
         def arrive(reply: zenoh.Reply) -> None:
@@ -341,6 +384,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
+                check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
                 named = self.intake.fields(topic, key)
@@ -376,6 +420,8 @@ class ZenohBus:
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
+            if not str(sample.key_expr).startswith(f"{self._namespace}/"):
+                return
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
@@ -388,7 +434,7 @@ class ZenohBus:
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
         arrivals = Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._namespace}/{key}", _into(arrivals), history=True
+            patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
         )
         self._read(subscriber, arrive, "alive", arrivals.take)
 

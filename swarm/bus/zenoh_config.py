@@ -24,8 +24,8 @@ def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/unicast/max_sessions": 8192,
-        "transport/unicast/accept_pending": 2048,
-        "transport/unicast/accept_timeout": 20_000,
+        "transport/unicast/accept_pending": 20_000,  # silent connections, which end after the timeout
+        "transport/unicast/accept_timeout": 2_000,
         "transport/link/tx/lease": int(network.lease_s * 1000),
         "transport/link/tx/keep_alive": 4,
         "transport/link/rx/max_message_size": MAX_PAYLOAD_BYTES + (1 << 16),

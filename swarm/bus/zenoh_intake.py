@@ -15,12 +15,29 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S, Heard, new_counts, newest_of
+from swarm.bus.bus import (
+    LONGEST_TIMEOUT_S,
+    TIMEOUT_PARAMETER,
+    USUAL_TIMEOUT_S,
+    Heard,
+    counter_of,
+    new_counts,
+    newest_of,
+)
 from swarm.errors import ProtocolError
 from swarm.wire.access import Authenticator, check_code
-from swarm.wire.codec import JSON_ENCODING, decode, decode_many, decode_parameters, may_be_json, packed_json
+from swarm.wire.codec import (
+    JSON_ENCODING,
+    KEY_FIELD,
+    decode,
+    decode_many,
+    decode_parameters,
+    may_be_json,
+    packed_json,
+)
+from swarm.wire.meant import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
-from swarm.wire.topics import Topic
+from swarm.wire.topics import Topic, check_size
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""
@@ -143,27 +160,25 @@ _LOGGED_KEYS = 10_000
 class Intake:
     """The messages of one session, of any topic below its namespace. Any thread may use it.
 
-    counts  of messages and bytes both ways, and of payloads that were dropped
+    authenticator  of the run; None: no code is checked
+    counts         of messages and bytes both ways, and of payloads that were dropped
     """
 
     def __init__(self, namespace: str, authenticator: Authenticator | None) -> None:
-        self._namespace = namespace
-        self._authenticator = authenticator
+        self._namespace, self._start = namespace, f"{namespace}/"
+        self.authenticator = authenticator
         self.counts = new_counts()
         self._counting = threading.Lock()
         """Held to add to `counts`."""
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
 
-    def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
+    def _heard(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
-        key = str(sample.key_expr)
         try:
             named = self.fields(topic, key)
-            self.check(topic, key, sample, payload)
-            if says_json(sample, payload):
-                payload = packed_json(payload, topic.message, named)
-            message = decode(payload, topic.message)
+            packed = self._checked(topic, key, sample, payload)
+            message = decode(packed, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
             self.drop(key, error)
@@ -180,43 +195,75 @@ class Intake:
             if isinstance(message, ProtocolError):
                 self.drop(key, message)
             else:
-                heard.append((key[len(self._namespace) + 1 :], message))
+                heard.append((self.below(key), message))
         return heard
 
     def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
         """The events of the newest sample under each key, without those that are rejected."""
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        if samples:
-            self.received(*payloads)
-        keyed = ((str(each[0].key_expr), each) for each in zip(samples, payloads, strict=True))
+        keyed = ((each[0], each) for each in self._own(samples))
         return newest_of(topic, keyed, lambda waited: self._heard(topic, *waited))
+
+    def _own(self, samples: list[zenoh.Sample]) -> list[tuple[str, zenoh.Sample, bytes]]:
+        """Keys, samples and payloads of those in our namespace: `patterned` hears others, too."""
+        keyed = ((str(sample.key_expr), sample) for sample in samples)
+        own = [(key, sample, sample.payload.to_bytes()) for key, sample in keyed if key.startswith(self._start)]
+        if own:
+            self.received(*(payload for _, _, payload in own))
+        return own
+
+    def concerns(self, query: zenoh.Query) -> bool:
+        """Returns True if a query asks for a key in our namespace."""
+        key = str(query.key_expr)
+        return key.startswith(self._start) or zenoh.KeyExpr(f"{self._start}**").intersects(query.key_expr)
 
     def _packed(self, topic: Topic, samples: list[zenoh.Sample]) -> Iterator[tuple[str, bytes]]:
         """Keys and payloads as MessagePack, without those that are broken JSON."""
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        self.received(*payloads)
-        for sample, payload in zip(samples, payloads, strict=True):
-            key = str(sample.key_expr)
+        for key, sample, payload in self._own(samples):
             try:
-                if says_json(sample, payload):
-                    payload = packed_json(payload, topic.message, self.fields(topic, key))
+                payload = self._checked(topic, key, sample, payload)
             except ProtocolError as error:
                 self.drop(key, error)
             else:
                 yield key, payload
 
-    def request(
-        self, wanted: type[Message], query: zenoh.Query, asked: bytes, parameters: dict[str, str]
-    ) -> Message:
+    def request(self, topic: Topic, query: zenoh.Query, asked: bytes, parameters: dict[str, str]) -> Message:
         """Decodes a query with the payload `asked`. Raises ProtocolError."""
+        key, wanted = str(query.key_expr), topic.request
+        assert wanted is not None
+        check_size(asked, topic.ask_bytes)
         if query.payload is None:
+            check_named(self.below(key), parameters.pop(KEY_FIELD, None))
+            self.check(topic, key, query, asked)
             return decode_parameters(parameters, wanted)
-        return decode(packed_json(asked, wanted) if says_json(query, asked) else asked, wanted)
+        packed = packed_json(asked, wanted) if says_json(query, asked) else asked
+        check_meant(self.below(key), packed)
+        self.check(topic, key, query, asked)
+        return decode(packed, wanted)
 
-    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
-        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code."""
+    def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
+        """A payload as MessagePack, which is meant for its key and has the code that its topic needs. Raises
+        ProtocolError."""
+        check_size(payload, topic.put_bytes)
+        in_json = says_json(sample, payload)
+        packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
+        check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
+        self.check(topic, key, sample, payload)
+        return packed
+
+    def below(self, key: str) -> str:
+        """A key below the namespace."""
+        return key.removeprefix(self._start)
+
+    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes | None = None) -> None:
+        """Raises ProtocolError where a trusted topic's sample, query or reply has no right code, or a reply is too
+        long.
+
+        asked  the payload of the question, where this is an answer
+        """
+        if asked is not None:
+            check_size(payload, topic.answer_bytes)
         if topic.trusted:
-            check_code(self._authenticator, attached(carrier), topic, key, payload, asked)
+            check_code(self.authenticator, attached(carrier), topic, key, payload, asked or b"")
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""
@@ -239,7 +286,7 @@ class Intake:
 
     def drop(self, key: str, error: ProtocolError) -> None:
         with self._counting:
-            self.counts["payloads_dropped"] += 1
+            self.counts[counter_of(error)] += 1
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > _LOGGED_KEYS:

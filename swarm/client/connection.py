@@ -48,11 +48,14 @@ class Swarm:
         session: Session,
         stop: Callable[[], None] = lambda: None,
         open_trusted: Callable[[], Bus] | None = None,
+        trust: Callable[[], None] = lambda: None,
     ) -> None:
         self._session = session
         self._stop = stop
         self._open_trusted = open_trusted or (lambda: session.bus)
         """Opens a bus whose words count in right of way."""
+        self._trust = trust
+        """Makes orders of the session count."""
         self._guests: list[GuestSession] = []
 
     def __enter__(self) -> Swarm:
@@ -168,7 +171,9 @@ class Swarm:
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
     def orders(self) -> Orders:
-        """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""
+        """Orders to the swarm: pause, close areas, add targets ... For the user of the swarm, or with certificates
+        for `operator.NAME` only."""
+        self._trust()
         return Orders(self._session)
 
     def observer(self, *, every_s: float = EVERY_S) -> Observer:
@@ -249,7 +254,10 @@ def connect(
     def open_trusted() -> Bus:
         return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
 
-    return Swarm(session, stop, open_trusted)
+    def trust() -> None:
+        bus.trust(authenticator_of(network, session.run.run_id))
+
+    return Swarm(session, stop, open_trusted, trust)
 
 
 def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tuple[RunInfo, int]:

@@ -23,7 +23,7 @@ from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import ROUTE, RUN, Topic
+from swarm.wire.topics import NAMED_SINCE, NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -177,8 +177,12 @@ class Session:
         self.bus.ask(topic, request, self.post, tag=tag, timeout_s=timeout_s, **fields)
         return waiting
 
-    def ask_route(self, target: str, cell: int, vehicle_class: str, timeout_s: float) -> Future[Route]:
+    def ask_route(
+        self, target: str, cell: int, vehicle_class: str, timeout_s: float, vehicle: str | None = None
+    ) -> Future[Route]:
         """The best route of a class of vehicles from a cell. Its failure is a BusError.
+
+        vehicle  id of the vehicle which asks; without one the question shares the turn of nameless askers
 
         Raises ConfigError if the target's id is none.
         """
@@ -197,8 +201,16 @@ class Session:
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
-        self.ask(ROUTE, request, timeout_s, target=target).add_done_callback(finish)
+        self.ask_planner(request, timeout_s, target, vehicle).add_done_callback(finish)
         return found
+
+    def ask_planner(
+        self, request: RouteRequest, timeout_s: float, target: str, vehicle: str | None
+    ) -> Future[list[Any]]:
+        """All answers of a planner, asked under the name of a vehicle."""
+        if vehicle is None or self.run.wire_version < NAMED_SINCE:
+            return self.ask(NAMELESS_ROUTE, request, timeout_s, target=target)
+        return self.ask(ROUTE, request, timeout_s, target=target, asker=asker_of("rover", vehicle))
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
         """Waits for the replies to a query. Raises BusError; ConfigError on the thread that would have to bring

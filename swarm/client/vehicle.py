@@ -18,7 +18,7 @@ from swarm.errors import ConfigError
 from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
-from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE
+from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE
 
 if TYPE_CHECKING:
     from swarm.right_of_way.guest_session import GuestSession
@@ -155,7 +155,7 @@ class Vehicle(Reported):
 
     def route_soon(self, target: str, timeout_s: float = _TIMEOUT_S) -> Future[Route]:
         """Like `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
-        return self._session.ask_route(target, self.cell, self.vehicle_class, timeout_s)
+        return self._session.ask_route(target, self.cell, self.vehicle_class, timeout_s, self.id)
 
     def follow(self, target: str) -> Stream[Route]:
         """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
@@ -199,7 +199,7 @@ class Vehicle(Reported):
         request = RouteRequest(
             cells=[self.cell], vehicles=[self.id], force=ran_out, vehicle_class=self.vehicle_class
         )
-        asked = self._session.ask(ROUTE, request, _TIMEOUT_S, target=target)
+        asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
         self._asking = True
 
         def finish(done: Future[list[Any]]) -> None:

@@ -44,15 +44,15 @@ class WayConfig(Section, frozen=True, kw_only=True):
 class ZoneConfig(Section, frozen=True, kw_only=True):
     """A part of the terrain with a cost of its own. Give one of `polygon`, `polygon_m`, `mask` and `file`.
 
-    kind          forbidden is lethal; water is lethal or slow, by its class, and bridges cross it; road sets the
-                  road pace; pace sets the pace of open ground; factor multiplies it; preferred halves it; rough
-                  doubles it
+    kind          forbidden is lethal; keep_in makes all else lethal; water is lethal or slow, by its class, and
+                  bridges cross it; road sets the road pace; pace sets the pace of open ground; factor multiplies
+                  it; preferred halves it; rough doubles it
     polygon       corners as places: "46.81,9.85" (latitude, longitude), "xy:779600,190400" in metres of the map,
                   "cell:40,200"
     polygon_m     [east, south] corners in metres from the north-west corner of the terrain
     mask          an image file with as many pixels as the terrain has cells: the zone is where it is not 0
-    file          a GeoJSON, GeoPackage or Shapefile (or a .zip of one), in any coordinate system; for pace and
-                  factor also a raster of them
+    file          a GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, KMZ, GPX or OSM XML (or a .zip of one), in any
+                  coordinate system; a fence as .plan or .waypoints; for pace and factor also a raster of them
     layer         which layer of a file that has several
     crs           coordinate system of the file, where it does not say it; "local": metres of the terrain's own map
     attribute     column of the file with the pace, the factor, or the class of each feature; of roads and water
@@ -64,7 +64,7 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
     name          how messages call the zone; its kind if empty
     """
 
-    kind: Literal["forbidden", "water", "road", "pace", "factor", "preferred", "rough"]
+    kind: Literal["forbidden", "keep_in", "water", "road", "pace", "factor", "preferred", "rough"]
     polygon: Annotated[tuple[PlaceText, ...], Meta(min_length=3, max_length=10_000)] | None = None
     polygon_m: Polygon | None = None
     mask: str | None = None

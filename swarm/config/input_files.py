@@ -48,6 +48,7 @@ class FileKind(Enum):
     RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
+    LIVES = ("lives", 1 << 20, StoreError)
     RECORDING = ("recording", 256 << 20, StoreError)
 
     def __init__(self, what: str, most_bytes: int, error: type[SwarmError]) -> None:
@@ -63,8 +64,8 @@ class FileKind(Enum):
         return self.refusal(path, error.strerror or str(error))
 
 
-def check_bytes(path: Path, kind: FileKind) -> int:
-    """Bytes of a file. Raises the kind's error if it is larger than is read, no file, or cannot be looked at."""
+def check_file(path: Path, kind: FileKind) -> int:
+    """Bytes of a file. Raises the kind's error if it is no file, or cannot be looked at."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
@@ -73,9 +74,15 @@ def check_bytes(path: Path, kind: FileKind) -> int:
     if not stat.S_ISREG(found.st_mode):
         what = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
         raise kind.refusal(path, f"it is {what}, not a file")
-    if found.st_size > kind.most_bytes:
-        raise kind.refusal(path, f"it has {size(found.st_size)}; at most {size(kind.most_bytes)} are read")
     return found.st_size
+
+
+def check_bytes(path: Path, kind: FileKind) -> int:
+    """Bytes of a file. Raises the kind's error as `check_file` does, and if it is larger than is read."""
+    count = check_file(path, kind)
+    if count > kind.most_bytes:
+        raise kind.refusal(path, f"it has {size(count)}; at most {size(kind.most_bytes)} are read")
+    return count
 
 
 def read_bytes(path: Path, kind: FileKind) -> bytes:

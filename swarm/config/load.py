@@ -18,7 +18,7 @@ from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
-from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUP
+from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
 from swarm.config.vehicle_classes import aloft_classes, class_faults, with_class_costs
 from swarm.errors import ConfigError
 from swarm.liveness import split_rank
@@ -168,8 +168,9 @@ def _complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
 def _group_faults(scenario: Scenario, source: str) -> Iterator[str]:
     ids, names = scenario.target_ids, [group.name for group in scenario.groups]
     for name in names:
-        if name.split(".")[0] == RESERVED_GROUP:
-            yield f"{source}: groups: {name!r} is not free: zones of operators are marks of that name"
+        reason = RESERVED_GROUPS.get(name.split(".")[0])
+        if reason is not None:
+            yield f"{source}: groups: {name!r} is not free: {reason}"
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
             yield f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
@@ -218,7 +219,9 @@ def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
     """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
     if match is None:
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
+        why = ": quic/ is not offered, as strangers could keep members out" if endpoint.startswith("quic/") else ""
+        such = "expected one such as tcp/127.0.0.1:7447 or tls/host:7447"
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint{why}; {such}")
     if int(match[3]) > 65535:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
     protocol, host = match[1], match[2].strip("[]")

@@ -25,6 +25,11 @@ PlaceText = str
 
 RESERVED_GROUP = "operator"
 """No group is called so: zones are marks of this one, which every group hears."""
+RESERVED_GROUPS = {
+    RESERVED_GROUP: "zones of operators are marks of that name",
+    "keeper": "digests of keepers have that name",
+}
+"""Groups that there are not, as an author's name begins with its group: name -> reason."""
 MOST_PER_AGENT = 1000
 """Vehicles of one agent process."""
 MOST_TARGETS = 1000

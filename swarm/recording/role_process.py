@@ -39,7 +39,9 @@ def run_role(
         recorded(setup, terrain) as boundary,
     ):
         service = make(boundary, boundary.bus(bus), lambda: process.stop())
-        process = Process(boundary.service(service), inbox, MonotonicClock(), tick_hz, phase, setup.health)
+        process = Process(
+            boundary.service(service), inbox, MonotonicClock(), tick_hz, phase, setup.health, bus.gather
+        )
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

@@ -117,6 +117,9 @@ class BoundaryBus:
         self._says("collect", topic, fields)
         self._bus.collect(topic, **fields)
 
+    def gather(self) -> None:
+        self._bus.gather()
+
     def collected(self, topic: Topic) -> list[Heard]:
         def collect() -> list[tuple[list[str], Message]]:
             return [(list(each.fields.values()), each.message) for each in self._bus.collected(topic)]

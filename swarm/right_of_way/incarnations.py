@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
 from swarm.clock import NS_PER_S
-from swarm.errors import StoreError
-from swarm.files import write_file
+from swarm.config.input_files import FileKind
+from swarm.files import writing
+from swarm.journal import Journal
 
 BEAT_NS = NS_PER_S // 5
 """Period at which an unchanged statement is repeated: by it members know of a warden, and a warden of its hosts."""
@@ -31,8 +31,9 @@ def is_far_ahead(life: int, known: int) -> bool:
     return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
 
 
-_MOST_BYTES = 1 << 16
-"""A file of lives has 32 numbers (`LIVES_KEPT`); more of it is not read."""
+_SIZE_BYTES = 1 << 13
+"""Space for some 30 starts of a guest before its file is written again."""
+_LIFE = struct.Struct("<Q")
 
 
 class MemoryLives:
@@ -54,33 +55,43 @@ class MemoryLives:
 
 
 class LifeFile(MemoryLives):
-    """A file, locked for as long as the process lives: so an earlier life that ran on it has ended.
+    """A journal of lives, locked for as long as the process lives: so an earlier life that ran on it has ended.
 
-    Raises StoreError if the file is in use, is not ours or cannot be written.
+    Raises StoreError if the file is in use, is damaged or cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._path = path
-        try:
+        with writing(path):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._lock = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            text = path.read_bytes()[:_MOST_BYTES] if path.exists() else b""
-        except BlockingIOError as error:
-            raise StoreError(f"{path} is in use: this vehicle has right of way here already") from error
-        except OSError as error:
-            raise StoreError(f"cannot open {path}: {error.strerror}") from error
-        try:
-            self.lives = [int(line) for line in text.split()]
-        except ValueError as error:
-            raise StoreError(f"{path} is damaged: expected one number a line, found {text[:40]!r}") from error
+        self._journal = Journal(
+            path,
+            FileKind.LIVES,
+            lambda: [_encoded(self.lives)],
+            _older,
+            size=_SIZE_BYTES,
+            in_use="by this vehicle, which has right of way here already",
+        )
+        for body in self._journal.found:
+            self.lives = [number for (number,) in _LIFE.iter_unpack(body)]
+        self._journal.begin()
 
     def save(self, lives: Sequence[int]) -> None:
         super().save(lives)
-        write_file(self._path, "".join(f"{life}\n" for life in lives).encode())
+        self._journal.append(_encoded(lives))
+        self._journal.sync()
 
     def close(self) -> None:
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
+        self._journal.close()
+
+
+def _encoded(lives: Sequence[int]) -> bytes:
+    return b"".join(map(_LIFE.pack, lives))
+
+
+def _older(data: bytes) -> list[bytes]:
+    """The lives in a file from before journals: one number a line."""
+    lives = [int(line) for line in data.decode("ascii").splitlines()]
+    if not lives or not all(0 < life < 1 << 63 for life in lives):
+        raise ValueError(repr(data[:40]))
+    return [_encoded(lives)]

@@ -6,18 +6,28 @@ import threading
 from collections import OrderedDict
 from collections.abc import Hashable
 
-from swarm.bus.bus import Event, Heard, HeardMany, Question, Undecoded
+from swarm.bus.bus import Asked, Event, Heard, HeardMany, Question, Undecoded
+from swarm.runtime.fair_queue import FairQueue
+from swarm.wire.topics import is_own
 
 CAPACITY = 4096
-"""Unread samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
+"""Unread samples per topic, or questions: more than a process gets in a second. Beyond it the oldest goes."""
+PER_ASKER = CAPACITY // 4
+"""Unread questions per asker, or per topic where the key names no asker."""
+_BASE_PRICE = 64
+"""Price of a question without content, in bytes."""
 LATE_S = 0.5
-"""Once the oldest question of a topic has waited this long, or half of its asker's timeout, the newest is taken
+"""Once the oldest question of an asker has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""
 
 _UNREAD_BATCHES = 2
 """Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
 _KEPT = ""
 """Name of the queue of items that are never dropped."""
+_ASKED = "?"
+"""In `_queues`, the name of the queue of questions."""
+_NAMELESS = "?"
+"""Asker of all questions of costly topics that name none."""
 
 _Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
 """Key -> (number, event), in the order of arrival. The key is the number, or what only the newest counts of."""
@@ -28,14 +38,15 @@ class Inbox:
 
     Samples    `CAPACITY` per topic, then the oldest goes. On topics whose samples each carry the whole state of
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
-    Questions  `CAPACITY` per topic, then the oldest is refused. One whose asker has left is refused, too. One that
-               is `Undecoded` is decoded in its turn.
+    Questions  `CAPACITY` in all, and a quarter of that per asker, then the oldest is refused. One whose asker has
+               left is refused, too. One that is `Undecoded` is decoded in its turn. Askers take turns, and pay by
+               bytes; on a costly topic agents come before others, and askers without a name share one turn.
     Batches    (`HeardMany`) are bounded by blocking their poster.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
-    Events are taken in the order of their arrival. While a question comes late (`LATE_S`), queues take turns, and
-    of late questions the newest is taken (adaptive LIFO): under overload the newest are answered in time and the
-    others expire, instead of all being answered too late.
+    Events are taken in the order of their arrival, if only one asker asks. While a question comes late (`LATE_S`),
+    queues take turns, and of an asker's late questions the newest is taken (adaptive LIFO): under overload the
+    newest are answered in time and the others expire, instead of all being answered too late.
     """
 
     def __init__(self) -> None:
@@ -55,6 +66,8 @@ class Inbox:
         """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
         """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
+        self._asked: FairQueue[tuple[int, Question]] = FairQueue(CAPACITY, PER_ASKER)
+        """Unread questions. The queue `_ASKED` stands for them in the order of turns, and is empty."""
         self._unread = 0
         """Events in all queues."""
         self._next = 0
@@ -75,9 +88,9 @@ class Inbox:
             newest = tuple(event.fields.values()) if event.topic.newest else None
             self._put(event, event.topic.name, newest)
         elif isinstance(event, Question):
-            dropped = self._put(event, f"? {event.topic.name}")
-            if isinstance(dropped, Question):
-                _refuse(dropped, "too many questions wait")
+            dropped = self._put_question(event)
+            if dropped is not None:
+                _refuse(dropped, f"too many questions wait{f' of {dropped.asker}' if dropped.asker else ''}")
         elif isinstance(event, HeardMany):
             with self._lock:
                 self._unread_batches += 1
@@ -122,6 +135,23 @@ class Inbox:
             self._ring()
         return dropped
 
+    def _put_question(self, question: Question) -> Question | None:
+        """Adds a question. Returns the one that has to go for it."""
+        costly = question.topic.costly
+        asker = question.asker or (_NAMELESS if costly else question.topic.name)
+        rank = 1 if costly and not is_own(asker) else 0
+        with self._lock:
+            self._next += 1
+            self._queues.setdefault(_ASKED, OrderedDict())
+            price = _BASE_PRICE + question.size
+            dropped = self._asked.put(asker, (self._next, question), price=price, rank=rank)
+            if dropped is None:
+                self._unread += 1
+            else:
+                self.counts["events_dropped"] += 1
+            self._ring()
+        return None if dropped is None else dropped[1]
+
     def take(self, timeout_s: float) -> Event | None:
         """The next event; None if there is none within the timeout, or if it is a question that is rejected. Raises
         the error that `fail` was given, in its turn. Called by the owner only."""
@@ -149,41 +179,34 @@ class Inbox:
     def _pop(self, expired: list[Question]) -> Event | BaseException | None:
         """Removes the next event. Questions whose time is over are removed on the way, into `expired`."""
         while self._unread:
-            name, newest_first = self._choose(expired)
+            name = self._choose(expired)
             if name is None:
                 break
-            _, (_, event) = self._queues[name].popitem(last=newest_first)
             self._unread -= 1
-            if not (isinstance(event, Question) and event.expired):
-                return event
-            self._expire(event, expired)  # newer than the oldest, but its asker had less time
+            if name != _ASKED:
+                return self._queues[name].popitem(last=False)[1][1]
+            taken = self._asked.take(newest=lambda oldest: _is_late(oldest[1]))
+            assert taken is not None
+            if not taken[1].expired:
+                assert isinstance(taken[1], Asked | Undecoded)
+                return taken[1]
+            self._expire(taken[1], expired)  # newer than the oldest, but its asker had less time
         return None
 
-    def _choose(self, expired: list[Question]) -> tuple[str | None, bool]:
-        """The queue whose turn it is, and whether its newest event is to be taken instead of its oldest."""
-        oldest: str | None = None
-        oldest_number = 0
-        late: set[str] | None = None
-        for name, queue in self._queues.items():
-            while queue:
-                number, event = next(iter(queue.values()))
-                if isinstance(event, Question):
-                    waited_s, timeout_s = event.waited_s, event.timeout_s
-                    if waited_s >= timeout_s:
-                        queue.popitem(last=False)
-                        self._unread -= 1
-                        self._expire(event, expired)
-                        continue
-                    if waited_s >= min(LATE_S, timeout_s / 2):
-                        late = {name} if late is None else late | {name}
-                if oldest is None or number < oldest_number:
-                    oldest, oldest_number = name, number
-                break
-        if late is None:
-            return oldest, False
-        turn = next(name for name, queue in self._queues.items() if queue)
-        self._queues.move_to_end(turn)
-        return turn, turn in late
+    def _choose(self, expired: list[Question]) -> str | None:
+        """The queue whose turn it is; None if all are empty."""
+        while (oldest := self._asked.oldest()) is not None and oldest[1].expired:
+            self._asked.drop_oldest()
+            self._unread -= 1
+            self._expire(oldest[1], expired)
+        firsts = {name: next(iter(queue.values()))[0] for name, queue in self._queues.items() if queue}
+        if oldest is not None:
+            firsts[_ASKED] = oldest[0]
+            if _is_late(oldest[1]):
+                turn = next(name for name in self._queues if name in firsts)
+                self._queues.move_to_end(turn)
+                return turn
+        return min(firsts, key=firsts.__getitem__, default=None)
 
     def _expire(self, asked: Question, expired: list[Question]) -> None:
         self.counts["asks_expired"] += 1
@@ -206,6 +229,10 @@ class Inbox:
 
     def __len__(self) -> int:
         return self._unread
+
+
+def _is_late(asked: Question) -> bool:
+    return asked.waited_s >= min(LATE_S, asked.timeout_s / 2)
 
 
 def _refuse(asked: Question, why: str) -> None:

@@ -14,9 +14,9 @@ from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
 from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
-from swarm.wire.messages import Nothing
+from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
-from swarm.wire.topics import NOTE, RUN, STATS
+from swarm.wire.topics import NAMED_SINCE, NAMELESS, NOTE, RUN, STATS, Topic, asker_of
 from swarm.wire.versions import are_neighbours
 
 _MOST_STANDING, _MOST_OVER = 40, 20
@@ -129,6 +129,8 @@ class Member:
         self._asked_all = self._confirmed
         """True if a round of replies has ended in which no other run was alone."""
         self._needs: list[tuple[str, Callable[[], bool]]] = []
+        self._older = False
+        """True if a process of the run was heard which does not know the names of askers."""
         # The first differing reply of the current round, in words.
         self._differs: RunMismatchError | None = None
         # Processes which were named already, and sentences that the next tick publishes.
@@ -247,6 +249,17 @@ class Member:
                 self.alarms.end("behind", self._name, now_ns)
         self._rate_ns, self._rate_of, self._dropped = now_ns, sent, dropped
 
+    def ask_by_name(self, topic: Topic, request: Message, *, tag: str, timeout_s: float = 2.0, **of: str) -> None:
+        """Asks under our name, so that our questions have a turn of their own.
+
+        of  fields of the key, beside the asker
+        """
+        if self._older:
+            topic = NAMELESS[topic.name]
+        else:
+            of["asker"] = asker_of(self.info.role, self.info.id)
+        self._bus.ask(topic, request, self._post, tag=tag, timeout_s=timeout_s, **of)
+
     @property
     def _name(self) -> str:
         return f"{self.info.role}-{self.info.id}"
@@ -289,6 +302,7 @@ class Member:
                     self._to_name.append(str(error))
         else:
             self._confirmed = True
+            self._older |= other.wire_version < NAMED_SINCE
 
     def _ask(self) -> None:
         self._bus.ask(RUN, Nothing(), self._post, tag=_TAG, timeout_s=2.0)

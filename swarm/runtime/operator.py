@@ -11,11 +11,14 @@ import threading
 import time
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
+
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.errors import BusError, ConfigError
 from swarm.liveness import Roster, job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.map_data import DIGEST_ROW_BYTES
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
@@ -29,6 +32,9 @@ _ORDER_S = 5.0
 """Longest wait for a keeper, which answers once the order is on its disk."""
 OBEY_S = 3.0
 """Longest wait for all to obey. An order reaches who misses it with the next word of a keeper, a second later."""
+_MOST_SETS = DIGEST_ROW_BYTES << 13
+"""Most bytes of a zone's sets that are asked about, so that a process looks for them within a tick: those of 8,192
+tiles, the others of a larger zone come with them."""
 _LEAVE_S = 0.3
 """After the last answer, time for tokens of those who leave to fall: Zenoh takes 3 to 8 ms for a killed process."""
 _MOST_REPLIES = 1 << 16
@@ -79,7 +85,7 @@ class Operator:
         keeper, began_s = self._keeper(members), time.monotonic()
         zones = self._order_zone(order, keeper)
         author = f"operator.{zones.changed}"
-        return zones, self._obeyed(Obey(author=author, sets=zones.sets), members, began_s)
+        return zones, self._obeyed(Obey(author=author, sets=zones.sets[:_MOST_SETS]), members, began_s)
 
     def orders(self) -> Orders:
         """Returns the orders in force. Raises BusError without a keeper."""
@@ -94,7 +100,7 @@ class Operator:
         """
         members = self._members()
         keeper, began_s = self._keeper(members), time.monotonic()
-        reply = self._order(GIVE_ORDER, order, keeper)
+        reply = self._order(GIVE_ORDER, replace(order, stamp_ns=time.time_ns()), keeper)
         assert isinstance(reply, Orders)
         given = reply.given
         assert given is not None
@@ -122,7 +128,7 @@ class Operator:
         return keepers[0]
 
     def _order_zone(self, order: ZoneOrder, keeper: str) -> Zones:
-        reply = self._order(ZONES, order, keeper)
+        reply = self._order(ZONES, replace(order, stamp_ns=time.time_ns()), keeper)
         assert isinstance(reply, Zones)
         return reply
 

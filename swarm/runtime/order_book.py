@@ -20,6 +20,9 @@ MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
 MOST_ORDERS = 1999
 """Beside a pause, for which there is always room."""
 
+FRESH_NS = 60 * NS_PER_S
+"""An authenticated order counts for so long before and after its timestamp: a copy of it must not count again."""
+
 Key = tuple[Subject, str]
 
 
@@ -113,6 +116,30 @@ class OrderBook:
             return ordered
         chosen = known if order is not None and not order.targets else usual or known
         return [id for id in chosen if id in known]
+
+
+class FreshOrders:
+    """Judge of whether authenticated orders are new: a stranger may copy one with its code, and give it again.
+
+    since_ns  orders before this time are refused: which of them counted is not known any more
+    """
+
+    def __init__(self, since_ns: int) -> None:
+        self._since_ns = since_ns
+        self._taken: set[int] = set()
+        """Timestamps that counted and that are not too old yet."""
+
+    def fault(self, stamp_ns: int, now_ns: int) -> str | None:
+        """Reason why an order of this timestamp does not count; None if it does, which it will not do again."""
+        self._taken = {each for each in self._taken if each > now_ns - FRESH_NS}
+        if not max(now_ns - FRESH_NS + 1, self._since_ns) <= stamp_ns < now_ns + FRESH_NS:
+            return (
+                f"stamp_ns is {stamp_ns}, expected the time of the order, {now_ns}, within {FRESH_NS // NS_PER_S} s"
+            )
+        if stamp_ns in self._taken:
+            return "this order was given before, and counts once"
+        self._taken.add(stamp_ns)
+        return None
 
 
 def target_of(order: Order) -> TargetConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
@@ -9,11 +10,14 @@ from swarm.clock import NS_PER_S
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages import Nothing
+from swarm.wire.messages.map_data import DIGEST_ROW_BYTES
 from swarm.wire.messages.orders import Obey, Obeyed, Orders
 from swarm.wire.topics import OBEYED, ORDERS
 
 _MOST_WAITING = 64
 """Operators that wait here at once. Each waits for seconds at most, so more of them are no operators."""
+_ROWS_AT_ONCE = 1 << 14
+"""Rows of waiting questions that are compared in one tick, beyond which the others wait for the next."""
 _TAG = "orders"
 _ASK_AGAIN_NS = NS_PER_S // 4
 """Time between two questions for the book: a process that starts stands still until it has one."""
@@ -49,7 +53,7 @@ class OrderClient:
         self._bus = bus
         self._post = post
         self._obeys = obeys
-        self._waiting: list[Asked] = []
+        self._waiting: deque[Asked] = deque()
         self._asks = 0
         self._asking = False
         self._ask_due_ns = 0
@@ -79,9 +83,8 @@ class OrderClient:
                 if len(self._waiting) >= _MOST_WAITING:
                     event.refuse(f"{_MOST_WAITING} orders wait here already")
                     event.end()
-                else:
+                elif not self._answered(event):
                     self._waiting.append(event)
-                    self._answer()
             case _:
                 return False
         return True
@@ -90,21 +93,25 @@ class OrderClient:
         """Repeats the query for orders if there was no reply, and replies to orders that are obeyed by now."""
         if not self.known and not self._asking and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
-        self._answer()
-
-    def _answer(self) -> None:
-        """Answers those whose order is obeyed now, and drops those who ask no more."""
-        left: list[Asked] = []
-        for asked in self._waiting:
+        rows = 0
+        for _ in range(len(self._waiting)):
+            asked = self._waiting.popleft()
             assert isinstance(asked.request, Obey)
-            if asked.expired:
-                asked.end()
-            elif self._knows(asked.request) and self._obeys(asked.request):
-                asked.answer(self._obeyed)
-                asked.end()
-            else:
-                left.append(asked)
-        self._waiting = left
+            rows += 1 + len(asked.request.sets) // DIGEST_ROW_BYTES
+            if not self._answered(asked):
+                self._waiting.append(asked)
+            if rows > _ROWS_AT_ONCE:
+                break  # the others have the next turn
+
+    def _answered(self, asked: Asked) -> bool:
+        """Answers a process whose order is obeyed now. Returns True if it does not wait any more."""
+        assert isinstance(asked.request, Obey)
+        if not asked.expired:
+            if not (self._knows(asked.request) and self._obeys(asked.request)):
+                return False
+            asked.answer(self._obeyed)
+        asked.end()
+        return True
 
     def _knows(self, order: Obey) -> bool:
         return order.subject is None or self.book.knows(order.subject, order.name, order.stamp_ns)

@@ -74,7 +74,10 @@ class Service(Protocol):
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Does all work that is due. Called `tick_hz` times a second, less often under load."""
+        """Does all work that is due. Called `tick_hz` times a second, less often under load.
+
+        now_ns  read after everything that this tick can receive had arrived (`Bus.gather`)
+        """
         ...
 
     def stop(self, now_ns: int) -> None:
@@ -155,6 +158,11 @@ class Process:
              these and those that come later than half a period after they were due
     phase    where in the clock's periods all ticks but the first fall, from 0 to 1; if None, where that falls
     health   receives the health of the loop and the missing needs of the service; None: no reports
+    gather   of the service's bus, called before each call of the service; None: the service collects nothing
+
+    **The clock is read after the inbox.** Every event is taken, and every sample gathered, before the clock is read
+    for it. A process may be stopped between any two steps: what it states at a time rests on nothing newer. Another
+    process that acts on the statement reads its own clock later still, so stamps on one machine follow causes.
     """
 
     def __init__(
@@ -165,8 +173,10 @@ class Process:
         tick_hz: float,
         phase: float | None = None,
         health: Health | None = None,
+        gather: Callable[[], None] | None = None,
     ) -> None:
         self._service = service
+        self._gather = gather or (lambda: None)
         self._inbox = inbox
         self._clock = clock
         self._health = health
@@ -219,7 +229,12 @@ class Process:
                 self._health.ends()
             self._inbox.close()
             counters.set_counts(self._inbox.counts)
-            self._service.stop(self._clock.now_ns())
+            self._service.stop(self._after_inbox_ns())
+
+    def _after_inbox_ns(self) -> int:
+        """Returns the time of the service's next call."""
+        self._gather()
+        return self._clock.now_ns()
 
     def _loop(self, counters: Counters) -> None:
         due_ns = events_until_ns = self._clock.now_ns()
@@ -241,6 +256,7 @@ class Process:
                     import psutil
 
                     counters.gauge(RSS_BYTES, float(psutil.Process().memory_info().rss))
+                now_ns = self._after_inbox_ns()
                 self._service.tick(now_ns)
                 if self._health is not None:
                     self._health.turned(self._service.lacks())
@@ -253,7 +269,7 @@ class Process:
             wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
             event = self._inbox.take(wait_s)
             if event is not None:
-                self._service.handle(event, self._clock.now_ns())
+                self._service.handle(event, self._after_inbox_ns())
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from swarm.grid import REGION_CELLS, GridSpec
 from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages import WIRE_VERSION
+from swarm.wire.messages.map_data import KEEPERS
 from swarm.wire.messages.processes import RunInfo, Stats
 
 
@@ -73,4 +74,5 @@ class RoleSetup:
     @property
     def author(self) -> str:
         """Name under which this incarnation writes marks. No other process or incarnation has the same."""
-        return f"{self.id}.{self.incarnation:x}"
+        name = f"{self.id}.{self.incarnation:x}"
+        return f"{KEEPERS}.{name}" if self.role == "keeper" else name

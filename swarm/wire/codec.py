@@ -41,6 +41,10 @@ MAX_ITEMS = 1 << 18
 """Most items that the lists and maps of one payload may hold together. An empty map takes one byte on the wire and
 64 bytes of memory, so a payload of 8 MiB could otherwise take half a gigabyte."""
 
+KEY_FIELD = "key"
+"""The field of every payload which names the key for which it is meant (`swarm.wire.meant`). No message has a field
+of that name."""
+
 M = TypeVar("M", bound=Message)
 N = TypeVar("N", bound=Message)
 
@@ -270,8 +274,10 @@ def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str,
         if name in hints and name not in given:
             given[name] = int(chunk) if taken_apart(hints[name])[0] is int and chunk.isdecimal() else chunk
     schema = given.pop("schema", schema_of_type(message_type))
+    meant = {KEY_FIELD: given.pop(KEY_FIELD)} if KEY_FIELD in given else {}
     try:
-        packed: bytes = msgpack.packb({"schema": schema} | _turned(given, message_type, "", _packed_column))
+        fields = _turned(given, message_type, "", _packed_column)
+        packed: bytes = msgpack.packb({"schema": schema} | fields | meant)
     except ProtocolError:
         raise
     except Exception as error:  # an integer of more than 64 bits, a lone surrogate
@@ -279,14 +285,18 @@ def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str,
     return packed
 
 
-def encode_json(message: Message) -> bytes:
-    """A message as JSON for people. Routes are listed one by one, with the cells that they pass."""
+def encode_json(message: Message, key: str = "") -> bytes:
+    """A message as JSON for people. Routes are listed one by one, with the cells that they pass.
+
+    key  for which it is meant, below the namespace
+    """
     fields = _plain(message)
     if isinstance(message, RouteReply):
         fields["routes"] = [
             {**_plain(each), "cells_row_col": _cells_row_col(each, message.cols)} for each in message.routes
         ]
-    return msgspec.json.encode({"schema": schema_of_type(type(message))} | fields)
+    meant = {KEY_FIELD: key} if key else {}
+    return msgspec.json.encode({"schema": schema_of_type(type(message))} | fields | meant)
 
 
 def _plain(struct: msgspec.Struct) -> Any:

@@ -24,6 +24,12 @@ class Priority(Enum):
     BACKGROUND = "background"
 
 
+_SHORT, _USUAL, _LONG, _FILE = 1 << 12, 1 << 16, 1 << 18, 8 << 20
+"""Limits of payloads in bytes: of one thing; of what 1,000 vehicles, an agent's most, take 60 bytes each of, or a
+digest (`MOST_DIGEST_BYTES`); of the same with names and columns of the longest kind, or a route over 100,000 cells;
+and of files and of marks that were asked for."""
+
+
 @dataclass(frozen=True)
 class Topic:
     """One topic.
@@ -35,11 +41,14 @@ class Topic:
     access     which roles may put, serve, ask and hear it
     request    for a queryable: the query; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
+    costly     for a queryable: askers take turns, by the field `asker` of the key; agents come before all others
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
     newest     each value carries the whole state of its key, so a reader may skip to the newest
     echoed     whether a process that puts and subscribes hears what it has put itself
     buffer     samples that wait for a slow reader; the oldest are dropped first
+    put_bytes  limit of a published payload; a longer one is rejected unread, as are questions and answers
+    ask_bytes, answer_bytes  the same of a question, and of each of its answers
     fields     names of the chunks in `key`, in order
     """
 
@@ -51,12 +60,16 @@ class Topic:
     access: Access
     request: type[Message] | None = None
     bulk: type[Message] | None = None
+    costly: bool = False
     published: bool = True
     trusted: bool = False
     newest: bool = True
     echoed: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
+    put_bytes: int = _USUAL
+    ask_bytes: int = _USUAL
+    answer_bytes: int = _USUAL
     fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
     _repeated: tuple[str, ...] = field(init=False, repr=False, compare=False)
@@ -135,6 +148,12 @@ class Topic:
                 raise ProtocolError(f"{name} is {stated[:80]!r} in the message and {fields[name]!r} in its key")
 
 
+def check_size(payload: bytes, most_bytes: int) -> None:
+    """Raises ProtocolError on a payload which is longer than its topic allows, before anything reads it."""
+    if len(payload) > most_bytes:
+        raise ProtocolError(f"payload of {len(payload):,} bytes, at most {most_bytes:,}")
+
+
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")
 _MOST_VALUES = 1 << 14
 """Keys of a topic that are remembered."""
@@ -159,6 +178,7 @@ OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
 RUN = Topic(
     "run", "run/{role}/{id}", processes.RunInfo, "which run and terrain a process belongs to",
     "asked at every start", access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing, published=False,
+    ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", map_data.MarkSet,
@@ -169,6 +189,7 @@ MARKS = Topic(
         hear=f"{_REPLICAS} rover:author",
     ),
     request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192,
+    answer_bytes=2 * _LONG,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", map_data.Digest, "which sets a replica holds", "1 Hz, and on change",
@@ -180,28 +201,33 @@ BASE_MAP = Topic(
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
     request=Nothing, published=False, priority=Priority.BACKGROUND,
+    ask_bytes=_SHORT, answer_bytes=_FILE,
 )  # fmt: skip
 BASE_TILES = Topic(
     "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain itself, by layer and region",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
     request=map_data.BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+    ask_bytes=_LONG, answer_bytes=_FILE,
 )  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", vehicles.Fleet, "where the vehicles of an agent are; newest only",
     "every tick", access(put="agent:author", hear="targets monitor planner"),
+    put_bytes=_LONG,
 )  # fmt: skip
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", vehicles.Chasers,
     "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
     "when a vehicle takes or leaves the target or has driven past the published cell; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
+    put_bytes=_LONG,
 )  # fmt: skip
 SHARED_COSTS = Topic(
     "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts,
     "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
     "only where `groups[].assignment` asks for it",
     access(put="agent:author", hear="agent"), echoed=False,
+    put_bytes=2 * _LONG,
 )  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", traffic.Standing,
@@ -209,6 +235,7 @@ STANDING = Topic(
     "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
+    put_bytes=_LONG,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{member}/{agent}", traffic.Table,
@@ -216,55 +243,65 @@ TABLE = Topic(
     "epoch and answers with what it has stored", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=traffic.Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 GRANTED = Topic(
     "granted", "granted/{plot}/{host}/{agent}", traffic.Granted,
     "which cells of a plot its warden has granted to one host, on file with its members", "on change, else 5 Hz",
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
+    put_bytes=_LONG,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
     "per table by one member, 5 Hz by the other; 5 Hz by the warden, instead of a table that both have on file",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    put_bytes=_SHORT,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", traffic.Known,
     "what an agent has on file about another, or a guest, for a new life of that", "asked at a start",
     access(serve="agent:agent", ask="agent rover"),
     request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 LEAVE = Topic(
     "leave", "leave/{agent}", vehicles.Removed,
     "vehicles that have left, for an operator who asked an agent to remove them", "asked",
     access(serve="agent:agent"),
     request=vehicles.RemoveVehicles, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    ask_bytes=_LONG, answer_bytes=_LONG,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", vehicles.Followed, "the route that a vehicle has begun",
     "per new route",
     access(put="agent:agent", hear="monitor"),
     priority=Priority.BACKGROUND,
+    put_bytes=_LONG,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", planning.PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
     access(put="planner", hear="agent:agent rover:agent"),
+    put_bytes=_LONG,
 )  # fmt: skip
 POSE = Topic(
     "pose", "target/{target}/pose", planning.TargetPose,
     "where a target is, by a tracker of it; each counts, as one tracker must not hide another's words",
     "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
+    put_bytes=_SHORT,
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", planning.TargetPose,
     "position of an untracked target: for simulated sensors, not for planners", "as poses",
     access(put="targets", hear="agent targets"),
+    put_bytes=_SHORT,
 )  # fmt: skip
 SIGHTED = Topic(
     "sighted", "sighted/{target}/{author}", planning.Sighted, "where a vehicle of this author saw a target",
     "while it is in sight, at most 2 Hz",
     access(put="agent:author", hear="agent planner keeper monitor"),
+    put_bytes=_SHORT,
 )  # fmt: skip
 BODY = Topic(
     "body", "body/{id}", vehicles.Body,
@@ -273,76 +310,121 @@ BODY = Topic(
     "10 Hz while it moves, else once a second at least",
     access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
     priority=Priority.INTERACTIVE,
+    put_bytes=_SHORT,
 )  # fmt: skip
 ROUTE = Topic(
-    "route", "target/{target}/route", planning.RouteReply, "routes from cells to the target", "asked",
-    access(serve="planner:target", ask="agent rover"),
-    request=planning.RouteRequest, published=False,
+    "route", "target/{target}/route/{asker}", planning.RouteReply, "routes from cells to the target", "asked",
+    access(serve="planner:target", ask="agent:asker rover:asker"),
+    request=planning.RouteRequest, published=False, costly=True,
+    ask_bytes=_LONG, answer_bytes=_FILE,
 )  # fmt: skip
 COST = Topic(
-    "cost", "target/{target}/cost", planning.CostReply, "cost-to-go of a batch of cells", "asked",
+    "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
+    access(serve="planner:target", ask="agent:asker targets:asker monitor:asker rover:asker"),
+    request=planning.CostRequest, published=False, costly=True,
+    ask_bytes=_LONG, answer_bytes=2 * _LONG,
+)  # fmt: skip
+NAMELESS_ROUTE = Topic(
+    "nameless-route", "target/{target}/route", planning.RouteReply,
+    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
+    access(serve="planner:target", ask="agent rover"),
+    request=planning.RouteRequest, published=False, costly=True,
+    ask_bytes=_LONG, answer_bytes=_FILE,
+)  # fmt: skip
+NAMELESS_COST = Topic(
+    "nameless-cost", "target/{target}/cost", planning.CostReply,
+    "the same for askers that are not named: people, and earlier versions; they share one turn", "asked",
     access(serve="planner:target", ask="agent targets monitor rover"),
-    request=planning.CostRequest, published=False,
+    request=planning.CostRequest, published=False, costly=True,
+    ask_bytes=_LONG, answer_bytes=2 * _LONG,
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", planning.PlannerStatus, "how a planner is doing", "2 Hz",
     access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
+    put_bytes=_SHORT,
 )  # fmt: skip
 BELIEVED = Topic(
     "believed", "target/{target}/believed", planning.Believed, "where a target may be that is searched for",
     "1 Hz during a search",
     access(put="planner:target", hear="monitor"),
     priority=Priority.BACKGROUND,
+    put_bytes=_USUAL // 4,
 )  # fmt: skip
 LEAD = Topic(
     "lead", "lead/{role}/{id}", processes.Beat, "which of the processes with one job are ready, and which leads",
     "10 Hz, where there are standbys",
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
+    put_bytes=_SHORT,
 )  # fmt: skip
 ZONES = Topic(
     "zones", "order/{keeper}/zones", orders.Zones, "adds, removes and lists zones: areas that operators close",
     "asked by people", access(serve="keeper:keeper"),
-    request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+    request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    answer_bytes=_FILE,
 )  # fmt: skip
 GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders,
     "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
-    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False, priority=Priority.INTERACTIVE,
+    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False, trusted=True,
+    priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 ORDERS = Topic(
     "orders", "orders/{role}/{id}", orders.Orders,
     "orders in force: of keepers, and of all processes to a starting one without a keeper", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
     request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+    put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
 OBEYED = Topic(
     "obeyed", "obeyed/{role}/{id}", orders.Obeyed, "that a process obeys an order, as soon as it does",
     "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
     request=orders.Obey, published=False, priority=Priority.INTERACTIVE,
+    ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", processes.Stats,
     "what a process has counted; keepers answer with the last words of processes that are gone", "1 Hz",
     access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
     request=Nothing, priority=Priority.BACKGROUND,
+    put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 NOTE = Topic(
     "note", "note/{role}/{id}", processes.Note, "something worth telling a person", "as it happens",
     access(put=MEMBERS_OWN, hear="monitor"),
     newest=False, priority=Priority.BACKGROUND,
+    put_bytes=_USUAL // 4,
 )  # fmt: skip
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
-    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, BELIEVED, LEAD, ZONES,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST,
+    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
 """Liveliness tokens, one per process, which raises no other than its own. All roles may watch them."""
 _TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64})/([0-9]{1,19})")
+
+
+NAMELESS = {ROUTE.name: NAMELESS_ROUTE, COST.name: NAMELESS_COST}
+"""Topic -> the one of the same questions without the name of an asker."""
+NAMED_SINCE = 9
+"""Wire version from which on planners answer questions with the name of an asker."""
+NO_ASKER = "-"
+"""In the key of an answer, the asker of a question under many names."""
+
+
+def asker_of(role: str, id: str) -> str:
+    """The name under which a process asks."""
+    return f"{role}.{id}"
+
+
+def is_own(asker: str) -> bool:
+    """Returns True if an asker is an agent of the run: its questions come before those of others."""
+    return asker.startswith("agent.")
 
 
 def peer_of(key: str) -> Peer:

@@ -1,5 +1,5 @@
 """A mark that a keeper acknowledged, and that was not taken back, reaches all replicas in the end. This holds
-through cuts, false deaths, kills, restarts and compaction.
+through cuts, false deaths, kills, restarts, rebuilt stores and compaction.
 
 By hand, with more examples: `PYTHONPATH=.:tests python tests/laws/test_acknowledged_marks.py 2000`"""
 
@@ -44,6 +44,7 @@ def steps() -> st.SearchStrategy[Step]:
         st.tuples(st.just("cut"), st.sets(st.sampled_from(CUT_OFF), max_size=3)),
         st.tuples(st.just("run"), st.sampled_from([0.1, 1.0, 3.0, 15.0])),
         st.tuples(st.just("run"), st.just(15.0)),
+        st.tuples(st.just("rebuild"), st.sampled_from(KEEPERS)),
     )
 
 
@@ -88,6 +89,15 @@ class History:
         running = self.keepers.pop(name, None) or self.authors.pop(name, None)
         if running is not None:
             self.swarm.kill(f"{name}.{self.lives[name]}")
+
+    def rebuild(self, name: str) -> None:
+        """A keeper's store is damaged, and it begins an empty one: the other has had time for the same marks."""
+        if not self.cut and self.keepers.keys() == set(KEEPERS):
+            self.swarm.run(3)
+            self.kill(name)
+            self.stores[name] = KeeperStore(":memory:")
+            self.start(name)
+            self.swarm.run(3)
 
     def start(self, name: str) -> None:
         if name in self.authors or name in self.keepers:

@@ -149,7 +149,7 @@ def test_a_set_of_one_who_is_not_listened_to_is_not_taken_for_one_of_the_dead_an
     def put_by_here(seconds: int) -> int:
         since = len(swarm.deliveries)
         for _ in range(seconds):
-            forgetful.publish(DIGEST, Digest(author="k.1", role="keeper", held={}), author="k.1")
+            forgetful.publish(DIGEST, Digest(author="keeper.k.1", role="keeper", held={}), author="keeper.k.1")
             swarm.run(1)
         return sum(
             each[1] == "here.1" and each[3] == "marks" and bool(each[4]) for each in swarm.deliveries[since:]

@@ -206,24 +206,26 @@ def test_the_version_before_reads_every_message_of_this_one(tmp_path: Path) -> N
         check_same(line, answer)
 
 
-@pytest.mark.parametrize("upgraded", [True, False], ids=["upgrade", "way back"])
-def test_what_one_version_leaves_on_disk_the_other_reads(tmp_path: Path, upgraded: bool) -> None:
-    script, old, folder = ROOT / "tests" / "support" / "stored_by.py", neighbour_tree(tmp_path), tmp_path / "run"
-    folder.mkdir()
-    writer, reader = (old, ROOT) if upgraded else (ROOT, old)
-    found = [
-        subprocess.run(
-            [sys.executable, str(script), what, str(folder)], env=environment_of(tree), capture_output=True,
-            text=True, timeout=120, check=True,
-        ).stdout
-        for what, tree in (("write", writer), ("read", writer), ("read", reader))
-    ]  # fmt: skip
-    left, again = ([json.loads(line) for line in each.splitlines()] for each in found[1:])
+def test_files_of_the_version_before_are_read_and_it_refuses_ours_in_a_sentence(tmp_path: Path) -> None:
+    script, old = ROOT / "tests" / "support" / "stored_by.py", neighbour_tree(tmp_path)
+
+    def stored(what: str, tree: Path, folder: str) -> subprocess.CompletedProcess[str]:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        command = [sys.executable, str(script), what, str(tmp_path / folder)]
+        return subprocess.run(
+            command, env=environment_of(tree), capture_output=True, text=True, timeout=120, check=False
+        )
+
+    stored("write", old, "older")
+    found = [stored("read", tree, "older").stdout for tree in (old, ROOT)]
+    left, again = ([json.loads(line) for line in each.splitlines()] for each in found)
     assert len(left) == len(again) >= 6
     for meant, heard in zip(left, again, strict=True):
         both = meant.keys() & heard.keys()
         assert len(both) >= 2
         assert {name: heard[name] for name in both} == {name: meant[name] for name in both}
+    stored("write", ROOT, "newer")
+    assert "StoreError: cannot open the store" in stored("read", old, "newer").stderr
 
 
 def check_same(line: str, answer: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import random
 import typing
 from collections.abc import Iterator
@@ -217,7 +218,8 @@ class Lied(SwarmModel):
         return heard
 
     def take_back(self) -> None:
-        """Any client of the router may give orders, so an operator takes back the orders."""
+        """Takes back the orders, which any client of a router may give where no code is asked for."""
+        stamps_ns = itertools.count(self.now_ns)
         heard: list[Event] = []
         self.ear.ask(GIVE_ORDER, GiveOrder(), heard.append, tag="o", keeper="0")
         self.ear.ask(ZONES, ZoneOrder(), heard.append, tag="z", keeper="0")
@@ -225,16 +227,21 @@ class Lied(SwarmModel):
         for event in heard:
             match event:
                 case Replied(message=Orders(orders=orders)):
-                    for order in orders:
-                        given = GiveOrder(subject=order.subject, name=order.name, off=True)
+                    for stamp_ns, order in zip(stamps_ns, orders, strict=False):
+                        given = GiveOrder(subject=order.subject, name=order.name, off=True, stamp_ns=stamp_ns)
                         if order.subject == "target":
                             given = GiveOrder(
-                                subject="target", name=order.name, new=order.off, cell=80, walk="still"
+                                subject="target",
+                                name=order.name,
+                                new=order.off,
+                                cell=80,
+                                walk="still",
+                                stamp_ns=stamp_ns,
                             )
                         self.ear.ask(GIVE_ORDER, given, ignore, tag="o", keeper="0")
                 case Replied(message=Zones(zones=zones)):
-                    for zone in zones:
-                        removal = ZoneOrder(action="remove", name=zone.name)
+                    for stamp_ns, zone in zip(stamps_ns, zones, strict=False):
+                        removal = ZoneOrder(action="remove", name=zone.name, stamp_ns=stamp_ns)
                         self.ear.ask(ZONES, removal, ignore, tag="z", keeper="0")
         self.run(0.2)
 

@@ -38,7 +38,7 @@ class Chase:
         self.rng = rng = np.random.default_rng(seed)
         rows, cols = (int(side) for side in rng.integers(max(most // 8, 1), most, 2))
         self.rules = RULES[seed % 5]
-        ratio, walls = (1.0, 3.0, 30.0, 1000.0)[seed // 5 % 4], (0.0, 0.1, 0.25, 0.4)[seed // 3 % 4]
+        ratio, walls = (1.0, 30.0, 1000.0, 1e12)[seed // 5 % 4], (0.0, 0.1, 0.25, 0.4)[seed // 3 % 4]
         self.pace = random_pace(rng, rows, cols, ratio, walls)
         if seed % 4 == 3:
             self.pace[:] = np.where(np.isfinite(self.pace), np.float32(1.1), np.inf)  # many ways cost the same

@@ -6,6 +6,8 @@ table, its own and those of others, and the successful attempts are compared wit
 
 from __future__ import annotations
 
+import socket
+import ssl
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -19,8 +21,11 @@ from support.processes import eventually
 from support.zenohd import Zenohd
 
 from launch_scripts.deploy.certificates import issue
+from launch_scripts.launcher.router import Admission
+from launch_scripts.launcher.router_door import FREE_TRIES
 from launch_scripts.ports import free_ports
 from swarm.bus.access_control import ROUTER, Bearer, bearer, common_name
+from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_config import session_config
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.wire.access import MEMBERS, ROLES
@@ -61,6 +66,10 @@ FORBIDDEN = [
     ("agent", "serve", "run/agent/zz"),
     ("agent", "serve", "run/keeper/0"),
     ("agent", "serve", "target/t0/route"),
+    ("agent", "ask", "target/t0/route/agent.a1"),
+    ("agent", "ask", "target/t0/cost/rover.a0"),
+    ("agent", "ask", "target/t0/route/*"),
+    ("rover", "ask", "target/t0/cost/agent.r1"),
     ("agent", "hear", "vehicle/a1/*/route"),
     ("agent", "hear", "**"),
     ("agent", "raise", "alive/agent/zz/1"),
@@ -146,6 +155,7 @@ def allows(who: Bearer | None, topic: Topic, operation: str, key: str) -> bool:
     for grant in getattr(topic.access, operation):
         if grant.role == who.role:
             own = {"role": who.role, "author": f"{who.author}.1", "target": who.id.removesuffix(".r1")}
+            own["asker"] = f"{who.role}.{who.id}"
             return all(fields[field] == own.get(field, who.id) for field in grant.own)
     return False
 
@@ -261,9 +271,12 @@ def replies(session: zenoh.Session, selector: str) -> set[str]:
 class Stage:
     """A router with access control, and sessions with certificates of their own."""
 
+    admission: Admission
+    """The session of our own router, if it is that."""
+
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
-        self._stack = stack
+        self.stack = stack
         self.endpoint = f"tls/localhost:{free_ports(1)[0]}"
         issue(folder, "router.0", ["localhost"], 2)
 
@@ -286,7 +299,7 @@ class Stage:
 
     def open(self, name: str, mode: str = "client", **changes: object) -> zenoh.Session:
         session = zenoh.open(session_config(self.network(name, **changes), mode))
-        self._stack.callback(session.close)
+        self.stack.callback(session.close)
         return session
 
 
@@ -298,8 +311,9 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
 
 @pytest.fixture(scope="module")
 def routed(stage: Stage) -> Stage:
-    """With our own router."""
-    stage.open("router.0", "router")
+    """With our own router, behind its door."""
+    stage.admission = Admission(stage.network("router.0"))
+    stage.stack.callback(stage.admission.close)
     return stage
 
 
@@ -351,6 +365,36 @@ def test_the_matrix_tries_every_topic_both_ways_where_there_are_two() -> None:
     for topic in TOPICS:
         assert {("put", topic.name), ("hear", topic.name)} <= allowed or not topic.published
         assert {("serve", topic.name), ("ask", topic.name)} <= allowed or topic.request is None
+
+
+@pytest.mark.parametrize("said", [b"", b"\x16\x03\x01\x00\x04\x01\x00\x00\x00"], ids=["silent", "hello"])
+def test_strangers_who_hang_up_keep_no_member_out(routed: Stage, said: bytes) -> None:
+    """Without a door each of them would cost the router 0.1 s, so members would join after 40 s."""
+    host, port = host_port(routed.endpoint)
+    for _ in range(400):
+        with socket.create_connection((host, port), 10) as stranger:
+            stranger.sendall(said)
+    members = [routed.open(NAMES["agent"]) for _ in range(3)]
+    for each in members:
+        each.close()
+
+
+def test_who_fails_often_is_kept_out_and_nobody_else(routed: Stage) -> None:
+    """A handshake without a certificate from 127.0.0.3, again and again; members come from 127.0.0.1."""
+    host, port = host_port(routed.endpoint)
+    context = ssl.create_default_context(cafile=str(routed.folder / "ca.pem"))
+    refused = failed = 0
+    for _ in range(2 * FREE_TRIES):
+        with socket.create_connection((host, port), 10, source_address=("127.0.0.3", 0)) as stranger:
+            try:
+                with context.wrap_socket(stranger, server_hostname="localhost") as link:
+                    link.recv(1)
+            except (ConnectionResetError, ssl.SSLEOFError):
+                refused += 1
+            except ssl.SSLError:  # the router requires a certificate
+                failed += 1
+    assert FREE_TRIES <= failed < 2 * FREE_TRIES == failed + refused
+    routed.open(NAMES["agent"]).close()
 
 
 def test_a_revoked_name_is_admitted_again_with_its_next_certificate(routed: Stage) -> None:

@@ -112,6 +112,7 @@ def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int 
         bus.collect(FLEET)
 
         def enough() -> bool:
+            bus.gather()
             for each in bus.collected(FLEET):
                 heard.update(id for id in each.message.ids if id.startswith(agent))  # type: ignore[attr-defined]
             return len(heard) >= count

@@ -42,6 +42,7 @@ class Member:
         """After everything that has come by now."""
         while (event := self.inbox.take(0.0)) is not None:
             self.sync.on_map_event(event, time.time_ns())
+        self.bus.gather()
         self.sync.tick(time.time_ns())
         return bool(np.isinf(self.cost_map.ground_s_per_m.reshape(-1)[cell]))
 

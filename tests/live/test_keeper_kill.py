@@ -54,7 +54,8 @@ def keeper_process(endpoint: str, path: str) -> None:
     terrain = terrain_of_pace(np.ones((SIDE, SIDE), np.float32), GRID.resolution_m)
     with KeeperStore(path) as store, open_bus(network) as bus:
         inbox = Inbox()
-        Process(KeeperService(setup, terrain, bus, inbox.post, store), inbox, MonotonicClock(), tick_hz=50).run()
+        service = KeeperService(setup, terrain, bus, inbox.post, store)
+        Process(service, inbox, MonotonicClock(), tick_hz=50, gather=bus.gather).run()
 
 
 class Load:

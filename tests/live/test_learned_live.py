@@ -45,7 +45,7 @@ def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
         with KeeperStore(tmp_path / "map.sqlite") as store, open_bus(network) as bus:
             inbox = Inbox()
             service = KeeperService(setup, terrain, bus, inbox.post, store)
-            processes.append(Process(service, inbox, MonotonicClock(), tick_hz=50))
+            processes.append(Process(service, inbox, MonotonicClock(), tick_hz=50, gather=bus.gather))
             processes[0].run()
 
     with open_bus(network, mode="router"), open_bus(network) as bus:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
-from support.live_swarm import LiveSwarm, ask, client, swarm
+from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
 from support.processes import eventually, session_of
 
 from launch_scripts.simulation.replay import replay_run
@@ -126,6 +127,17 @@ def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tm
     states = {each["run"]: each["state"] for each in json.loads(swarm("ps", "-a", "--json").stdout)}
     assert (states[first], states[second]) == ("running", "ended")
     assert "does not run here; these do: " + first in swarm("down", second).stderr
+
+
+def test_a_start_in_the_background_that_is_asked_to_end_leaves_no_run(live: LiveSwarm, tmp_path: Path) -> None:
+    words = ("up", str(live.path), "--port", "0", "--runs", str(tmp_path), "--no-live", "-d")
+    with subprocess.Popen([*SWARM, *words], stderr=subprocess.PIPE, text=True, start_new_session=True) as start:
+        assert start.stderr is not None
+        assert start.stderr.readline(), "the launcher has said something"
+        start.send_signal(signal.SIGTERM)
+        assert "goes on in the background" not in start.communicate(timeout=60)[1]
+        assert start.returncode != 0
+    assert [run["run"] for run in json.loads(swarm("ps", "--json").stdout)] == [live.run_dir.name]
 
 
 def test_top_tells_what_every_process_takes_up(live: LiveSwarm) -> None:

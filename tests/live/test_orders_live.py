@@ -7,6 +7,8 @@ import json
 import os
 import signal
 import time
+from collections.abc import Iterator
+from hashlib import blake2b
 from typing import Any
 
 import pytest
@@ -14,8 +16,10 @@ import zenoh
 from support.live_swarm import LiveSwarm, client, swarm
 from support.processes import eventually
 
+from launch_scripts.launcher.takeover import processes
 from swarm.bus.bus import Heard
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.run_secret import state_folder
 from swarm.wire.fields import column
 from swarm.wire.topics import FLEET
 
@@ -94,23 +98,83 @@ def test_an_added_target_gets_a_planner_and_is_chased(live: LiveSwarm) -> None:
     eventually(lambda: "planner-x" not in swarm("status", "--connect", live.endpoint).stdout, 20, "its end")
 
 
-def test_a_person_gives_an_order_by_a_selector_and_reads_json(live: LiveSwarm) -> None:
+class Stranger:
+    """A program in any language: JSON, keyed BLAKE2b, and one session on loopback.
+
+    secret, run_id  of the run; without a secret it has no codes
+    """
+
+    def __init__(self, session: zenoh.Session, secret: bytes = b"", run_id: str = "") -> None:
+        self.session, self.secret = session, secret
+        self.run_key = blake2b(run_id.encode(), key=secret, digest_size=32).digest()
+
+    def code(self, key: str, payload: bytes) -> bytes | None:
+        said = f"{len(key)},0,".encode() + key.encode() + payload
+        return blake2b(said, key=self.run_key, digest_size=16).digest() if self.secret else None
+
+    def order(self, what: str, **order: Any) -> list[Any]:
+        """The replies; a refusal is a text."""
+        payload = json.dumps(order).encode()
+        return self.ask(f"swarm/order/0/{what}", payload, self.code(f"swarm/order/0/{what}", payload))
+
+    def ask(self, selector: str, payload: bytes | None, code: bytes | None) -> list[Any]:
+        encoding = None if payload is None else zenoh.Encoding.APPLICATION_JSON
+        found = self.session.get(selector, payload=payload, encoding=encoding, attachment=code, timeout=5.0)
+        return [
+            each.err.payload.to_string() if each.ok is None else json.loads(each.ok.payload.to_bytes())
+            for each in found
+        ]
+
+
+@pytest.fixture
+def session(live: LiveSwarm) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([live.endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config) as session:
+    with zenoh.open(config) as opened:
+        yield opened
 
-        def get(selector: str) -> list[Any]:
-            replies = session.get(f"swarm/{selector};format=json", timeout=5.0)
-            return [json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
-        (paused,) = get("order/0/give?subject=pause")
-        assert paused["given"]["subject"] == "pause"
-        (resumed,) = get("order/0/give?subject=pause;off=true")
-        assert resumed["given"]["off"] is True
-        (zones,) = get("order/0/zones?action=list")
-        assert zones["zones"] == []
+def run_of(session: zenoh.Session) -> str:
+    (told,) = Stranger(session).ask("swarm/run/keeper/0?format=json", None, None)
+    return str(told["run_id"])
+
+
+def test_a_program_in_any_language_orders_with_the_secret_and_each_order_counts_once(
+    live: LiveSwarm, session: zenoh.Session
+) -> None:
+    ours = Stranger(session, (state_folder() / "secret").read_bytes(), run_of(session))
+    pause = {"subject": "pause", "stamp_ns": time.time_ns()}
+    (paused,) = ours.order("give", **pause)
+    assert paused["given"]["subject"] == "pause"
+    (resumed,) = ours.order("give", subject="pause", off=True, stamp_ns=time.time_ns())
+    assert resumed["given"]["off"] is True
+    (again,) = ours.order("give", **pause)  # as a stranger copies it off the bus
+    assert "counts once" in again
+    (undated,) = ours.order("give", subject="pause")
+    assert "stamp_ns is 0, expected the time of the order" in undated
+    (zones,) = ours.order("zones", action="list")
+    assert zones["zones"] == []
+
+
+def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session: zenoh.Session) -> None:
+    stranger, guesses = Stranger(session), Stranger(session, bytes(32), run_of(session))
+    now_ns = time.time_ns()
+    for n in range(50):
+        fields = {"subject": "target", "name": f"z{n}", "cell": 40 + n, "new": True, "stamp_ns": now_ns + n}
+        assert "no code" in str(stranger.order("give", **fields))
+        assert "a false code" in str(guesses.order("give", **fields))
+    assert "no payload" in str(stranger.ask("swarm/order/0/give?subject=pause", None, None))
+    assert "no code" in str(
+        stranger.order("zones", action="add", polygon=[[1, 1], [1, 9], [9, 9]], stamp_ns=now_ns)
+    )
+    # A keeper's whole book, forged: launchers and all processes drop it.
+    added = {"subject": "target", "name": "forged", "stamp_ns": now_ns, "cell": 40, "added": True}
+    session.put("swarm/orders/keeper/0", json.dumps({"orders": [added]}), encoding=zenoh.Encoding.APPLICATION_JSON)
+    time.sleep(4.0)  # a launcher of a part waits for three seconds
+    assert {(each["subject"], each["off"]) for each in order(live, "ls")} <= {("pause", True)}
+    assert [name for name in processes(live.run_dir) if name.startswith(("planner-z", "planner-f"))] == []
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
+from support.zenoh_router import Router
 
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied
@@ -41,37 +41,9 @@ from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import COST, GIVE_ORDER, OBEYED, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
-
-ROUTER = """
-import sys
-from swarm.config.scenario import NetworkConfig
-from swarm.bus.zenoh_bus import open_bus
-with open_bus(NetworkConfig(listen=(sys.argv[1],)), mode="router"):
-    print("up", flush=True)
-    sys.stdin.read()
-"""
-
-
-class Router:
-    """A router in a process of its own, to be killed, stalled and started again."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", ROUTER, self.endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == b"up\n"
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.communicate()
 
 
 class ZenohWorld:
@@ -149,7 +121,7 @@ def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
         event.answer(reply)
         event.end()
 
-    bus.serve(COST, post, target="t0")
+    bus.serve(NAMELESS_COST, post, target="t0")
 
 
 def test_any_zenoh_session_gets_a_readable_answer(world):
@@ -197,11 +169,11 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
 def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     planner, inbox, answers = world.bus("planner"), Inbox(), Box()
     before = threading.enumerate()
-    planner.serve(COST, inbox.post, undecoded=True, target="t0")
+    planner.serve(NAMELESS_COST, inbox.post, undecoded=True, target="t0")
     assert threading.enumerate() == before
     a, stranger = world.bus("a"), world.bus("stranger").session
     world.settle()
-    a.ask(COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
+    a.ask(NAMELESS_COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
     question = inbox.take(2.0)
     assert isinstance(question, Asked)
     assert (question.request, question.fields, question.timeout_s) == (
@@ -209,7 +181,7 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     )
     question.refuse("not now")
     question.end()
-    world.until(lambda: answers == [AskEnded("q", COST, 0, "not now")])
+    world.until(lambda: answers == [AskEnded("q", NAMELESS_COST, 0, "not now")])
     for selector, payload, complaint in (
         ("swarm/target/t0/cost", b"garbage", b"cost: "),
         ("swarm/target/t0/cost?timeout_s=never", encode(CostRequest(cells=[3])), b"not a positive number"),
@@ -219,7 +191,7 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
         (reply,) = replies
         assert complaint in reply.err.payload.to_bytes()
     assert planner.counts["payloads_dropped"] == 2
-    planner.unserve(COST, target="t0")
+    planner.unserve(NAMELESS_COST, target="t0")
     world.settle()
     assert list(stranger.get("swarm/target/t0/cost", timeout=1.0)) == []
     assert inbox.take(0) is None
@@ -411,7 +383,7 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
         "batch": lambda: b.subscribe(POSE, broken, together=True),
         "query": lambda: b.serve(RUN, broken, role="agent", id="b"),
         "reply": lambda: b.ask(RUN, Nothing(), broken, tag="q"),
-        "end": lambda: b.ask(COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),
+        "end": lambda: b.ask(NAMELESS_COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),
         "token": lambda: b.watch_alive(broken),
         "link": lambda: b.watch_links(broken),
     }[what]
@@ -451,9 +423,10 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     world.until(lambda: said and heard)
     put = (said[0].payload.to_bytes(), said[0].attachment.to_bytes())
     thief.put("swarm/stored/0/a1/a2", put[0], attachment=put[1])
+    thief.put("swarm/stored/0/a1/a2", put[0].replace(b"stored/0/a1/a0", b"stored/0/a1/a2"), attachment=put[1])
     thief.put("swarm/stored/0/a1/a0", put[0], attachment=put[1])
     world.until(lambda: len(heard) == 2)  # a repetition is nothing new
-    assert hears.counts["payloads_dropped"] == 1
+    assert hears.counts["payloads_misrouted"] == hears.counts["payloads_dropped"] == 1
     listening.undeclare()
 
     hears.serve(TABLE, answering((table(), {})), plot=0, member="a1", agent="a0")
@@ -496,7 +469,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
         event.answer(reply)
         event.end()
 
-    a.serve(COST, answer, target="t0")
+    a.serve(NAMELESS_COST, answer, target="t0")
     world.settle()
 
     def get(text: str):
@@ -508,8 +481,28 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
     assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [7.5]
     assert heard[0].request == CostRequest(row=4, col=2)
     wrong = get('{"rwo": 4}').err.payload.to_string()
-    assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
+    assert wrong == "nameless-cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1
+
+
+def test_who_waits_for_a_router_waits_behind_a_proxy_that_has_none_yet(caplog: pytest.LogCaptureFixture) -> None:
+    proxy = socket.create_server(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{proxy.getsockname()[1]}"
+    network = NetworkConfig(connect=(endpoint,), connect_timeout_s=0.3)
+    opened: list[ZenohBus] = []
+    waits = threading.Thread(target=lambda: opened.append(open_bus(network, patient=True)), daemon=True)
+    waits.start()
+    while "no router behind" not in caplog.text:
+        proxy.accept()[0].close()
+    for _ in range(8):  # further attempts
+        proxy.accept()[0].close()
+    assert waits.is_alive()
+    proxy.close()
+    router = Router(endpoint)
+    waits.join(20)
+    opened[0].close()
+    router.kill()
+    assert caplog.text.count("no router behind") == 1
 
 
 def test_who_leaves_before_it_obeys_is_not_called_silent_and_who_hangs_is(world: ZenohWorld) -> None:

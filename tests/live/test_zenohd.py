@@ -50,6 +50,7 @@ class Participant:
             event = self.inbox.take(0.01)
             if event is not None:
                 self.sync.on_map_event(event, self.clock.now_ns())
+            self.bus.gather()
             self.sync.tick(self.clock.now_ns())
 
     def write(self, cells: object, kind: MarkKind) -> None:

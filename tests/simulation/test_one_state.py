@@ -143,7 +143,7 @@ class Watched:
         self.simulation = simulation = OrderedSimulation(scenario, terrain=terrain)
         self.logged = Logged()
         setup = RoleSetup(scenario, simulation.run_id, "monitor", "0", EPOCH_NS + 1, EPOCH_NS)
-        bus = simulation.network.bus("monitor-0", scenario.network.namespace, simulation.authenticator)
+        bus = self.bus = simulation.network.bus("monitor-0", scenario.network.namespace, simulation.authenticator)
         clock = simulation.scheduler.clock
 
         def post(event: Event) -> None:
@@ -160,6 +160,7 @@ class Watched:
 
     def _tick(self) -> None:
         if self.watching:
+            self.bus.gather()
             self.monitor.tick(self.now_ns)
             self.simulation.scheduler.after(NS_PER_S // 4, self._tick)
 
@@ -183,6 +184,7 @@ class Watched:
     def draw_all(self, now_ns: int) -> None:
         """One frame in which nothing waits for the next, the figures first."""
         self.monitor._limit.all_due()
+        self.bus.gather()
         self.monitor.tick(now_ns)
         movers = self.monitor._movers
         for limit in (movers._vehicles._limit, movers._limit):
@@ -286,6 +288,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
 
     # The end: what the recording shows last is what the report says.
     simulation.finish()
+    watched.bus.gather()
     watched.monitor.stop(watched.now_ns)
     report, end = simulation.report(_SHOWN_S), simulation.recorder.summary(watched.now_ns)
     assert shown_in(watched.logged.summary) == shown_in(table_of(end))

@@ -13,6 +13,7 @@ from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode, encode_json
+from swarm.wire.meant import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored
@@ -31,7 +32,7 @@ def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
     assert box == [Heard(TRUE_POSE, {"target": "t0"}, pose())]
     assert a.counts["messages_out"] == 1
     assert b.counts["messages_in"] == 1
-    assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(encode(pose()))
+    assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(meant_for("world/target/t0/pose", encode(pose())))
 
 
 def test_a_process_hears_itself(world: World):
@@ -80,20 +81,25 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
     b.collect(TRUE_POSE)
     b.subscribe(MARKS, together, together=True)
     world.settle()
-    short = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    unnamed = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    short = unnamed[:-1] + b', "key": "world/target/t0/pose"}'
     world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t0")
+    world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t4")  # it is meant for t0
+    world.put_bytes(a, TRUE_POSE, unnamed, in_json=True, target="t5")  # the key of a pose is not implied
     world.put_bytes(a, TRUE_POSE, short, target="t1")  # without the encoding it is garbage
     world.put_bytes(
         a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
     )  # whatever it says, this is MessagePack
-    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:], in_json=True, target="t3")
+    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:].replace(b"t0", b"t3"), in_json=True, target="t3")
     world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
     world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
     world.until(lambda: len(alone) == 2 and together)
     assert [event.message for event in alone] == [pose(), pose("t2")]
     assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
-    world.until(lambda: b.counts["payloads_dropped"] == 3)
+    world.until(lambda: b.counts["payloads_dropped"] == 4)
+    b.gather()
     assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
+    assert b.counts["payloads_misrouted"] == 2  # heard and collected
 
 
 def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_outside_may_put(world: World):
@@ -123,9 +129,16 @@ def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World
             a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
         world.put_bytes(a, TRUE_POSE, b"garbage", target="t1")
     world.until(lambda: len(box) == 10 and b.counts["payloads_dropped"] == 5)
+    assert b.collected(TRUE_POSE) == []  # nothing was gathered
+    b.gather()
     assert b.collected(TRUE_POSE) == [
         Heard(TRUE_POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")
     ]
+    a.publish(TRUE_POSE, pose(seq=5), target="t0")
+    world.until(lambda: len(box) == 11)
+    assert b.collected(TRUE_POSE) == []  # it came after the inbox was read
+    b.gather()
+    assert [each.message for each in b.collected(TRUE_POSE)] == [pose(seq=5)]
     assert b.collected(TRUE_POSE) == []
     assert b.counts["payloads_dropped"] == 6  # each that was heard; of those collected the one after the newest
 
@@ -137,6 +150,7 @@ def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(wo
     b.collect(MARKS, region=0)
     b.collect(MARKS, region=1)
     world.settle()
+    b.gather()
     assert b.collected_together(MARKS) == []
     sent = [marks("a0.1", tile) for tile in (*range(12), 3, 3)]
     for region in (0, 1, 2):
@@ -145,15 +159,18 @@ def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(wo
             world.put_bytes(a, MARKS, b"garbage", region=str(region), tile=str(each.tile), author="a0.1")
     world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent))
     dropped = b.counts["payloads_dropped"]
+    b.gather()
     collected = b.collected_together(MARKS)
     assert collected == [(f"marks/{region}/{each.tile}/a0.1", each) for region in (0, 1) for each in sent]
     assert b.counts["payloads_dropped"] == dropped + 2 * len(sent)
+    b.gather()
     assert b.collected_together(MARKS) == []
     b.unsubscribe(MARKS, region=0)
     world.settle()
     for region in (0, 1):
         a.publish(MARKS, sent[0], region=region, tile=0, author="a0.1")
     world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent) + 2)
+    b.gather()
     assert b.collected_together(MARKS) == [("marks/1/0/a0.1", sent[0])]
 
 
@@ -168,6 +185,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
         if n % 200 == 0:
             world.settle()
     world.until(lambda: bool(box) and box[-1].message.text == f"n{NOTE.buffer + 49}")
+    b.gather()
     texts = [each.message.text for each in b.collected(NOTE)]
     assert texts[-1] == f"n{NOTE.buffer + 49}"
     assert len(texts) == NOTE.buffer  # the newest ones, of a topic whose values all count
@@ -175,6 +193,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
     world.settle()
     a.publish(NOTE, note("late"), role="agent", id="a0")
     world.settle()
+    b.gather()
     assert b.collected(NOTE) == []
 
 

@@ -79,6 +79,8 @@ class MessageFuzzer:
         """<group>.<agent>.<life>"""
         self._vehicles = [name for name in names if agent_of(name) != name] or ["a0-00"]
         self._chance = random.Random(seed)
+        self.largest: tuple[int, ...] | None = None
+        """Numbers of items in lists and maps; None for few."""
 
     def fields(self, topic: Topic, message: Message) -> dict[str, Any]:
         """The fields of the message's key: what the message says itself, the region of its tile and the agent of
@@ -139,11 +141,11 @@ class MessageFuzzer:
 
     def _made(self, kind: type[Any]) -> Any:
         if kind is Routes:
-            return RouteBatch.of([self._made(Route) for _ in range(self._chance.randrange(4))]).columns()
+            return RouteBatch.of([self._made(Route) for _ in range(self._many(3))]).columns()
         if kind is MarkSets:
             author = self._chance.choice(self._authors)
             own = {"author": author, "group": author.partition(".")[0]}
-            sets = [msgspec.structs.replace(self._made(MarkSet), **own) for _ in range(3)]
+            sets = [msgspec.structs.replace(self._made(MarkSet), **own) for _ in range(self._many(3))]
             return next(iter(packed({each.tile: each for each in sets}.values())))
         hints = _hints(kind)  # type: ignore[arg-type]
         fields = {name: self._value(name, hint) for name, hint in hints.items() if not _per(hint)}
@@ -169,7 +171,7 @@ class MessageFuzzer:
         """One agent's, about its own vehicles."""
         author = self._chance.choice(self._authors)
         group, agent, _ = author.split(".")
-        ids = [f"{agent}-{n:02d}" for n in range(self._chance.choice((0, 1, 2, 9)))]
+        ids = [f"{agent}-{n:02d}" for n in range(self._many(9))]
         target_ids = self._chance.sample(
             list(dict.fromkeys(self._names)), self._chance.choice((0, 1, min(len(set(self._names)), 5)))
         )
@@ -185,7 +187,7 @@ class MessageFuzzer:
         }
 
     def _statements(self) -> dict[str, bytes]:
-        many = self._chance.choice([0, 1, 3, 40])
+        many = min(self._many(40), 1024)
         where = sorted(self._chance.sample(range(1024), many))
         paces = [self._chance.choice([PACE_LEAST, PACE_MOST, 1.0]) for _ in where]
         stamps = [self._stamp_ns(0, (1 << 62) - 1) for _ in where]
@@ -271,13 +273,13 @@ class MessageFuzzer:
             return self._name() if is_id else self._chance.choice(["", "a/b", "ü" * 90, *self._names])
         if origin is bytes:
             rule = next((note for note in notes if isinstance(note, Column)), None)
-            return b"" if rule is None else self._column(rule, self._chance.choice([0, 1, 2, 40]))
+            return b"" if rule is None else self._column(rule, self._many(40))
         if origin is list:
-            return [self._value(name, args[0]) for _ in range(self._chance.choice([0, 1, 2, 9]))]
+            return [self._value(name, args[0]) for _ in range(self._many(9))]
         if origin is tuple:
             return tuple(self._value(name, arg) for arg in args)
         if origin is dict:
-            return {self._value(name, args[0]): self._value(name, args[1]) for _ in range(3)}
+            return {self._value(name, args[0]): self._value(name, args[1]) for _ in range(self._many(3))}
         if isinstance(origin, type) and issubclass(origin, Enum):
             return self._chance.choice(list(origin))
         return self._made(origin)
@@ -304,7 +306,37 @@ class MessageFuzzer:
         return min(max(self._chance.choice(some), least), most)
 
     def _name(self) -> str:
+        if self.largest is not None and self._chance.random() < 0.9:
+            return f"{self._chance.choice(('a0', 'all.x', 'x'))}-{self._chance.randrange(1 << 40):x}"
         return self._chance.choice(self._names)
+
+    def _many(self, most: int) -> int:
+        """Number of items in a list, map or column."""
+        return self._chance.choice((0, 1, 2, most) if self.largest is None else self.largest)
+
+    def large(self, kind: type[M], most_bytes: int) -> M:
+        """A message about as long as a bound on its bytes lets it be: one of several shapes, each list or map in it
+        empty, short or as long as fits."""
+        shape = self._chance.choice(((), (1,), (0, 1), (2, 9)))
+        state, found, many = self._chance.getstate(), self.message(kind), 4
+        while many <= most_bytes:
+            self.largest = (*shape, many)
+            self._chance.setstate(state)
+            made = self._fits(kind, most_bytes)
+            if made is None:
+                break
+            found, many = made, many * 3 // 2
+        self.largest = None
+        return found
+
+    def _fits(self, kind: type[M], most_bytes: int) -> M | None:
+        """A message of this type which decodes, if it has no more bytes than that."""
+        for _ in range(4):
+            with contextlib.suppress(ProtocolError, ValueError):
+                made = self._made(kind)
+                payload = encode(made)
+                return decode(payload, kind) if len(payload) <= most_bytes else None
+        return None
 
 
 @functools.cache

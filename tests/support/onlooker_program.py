@@ -23,7 +23,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import load_scenario
 from swarm.config.scenario import TlsConfig
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.map_data import DIGEST_ROW, Digest
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest, is_keeper
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Beat
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
@@ -70,8 +70,8 @@ class Notes:
                 self.followed.setdefault(followed.vehicle, []).append(now_s)
             case Heard(message=Beat(role="planner", leads=True) as beat):
                 self.leads[beat.id] = now_s
-            case Heard(message=Digest(role="keeper") as digest):
-                kept = self.acknowledged.setdefault(digest.author.partition(".")[0], {})
+            case Heard(message=Digest() as digest) if is_keeper(digest.author):
+                kept = self.acknowledged.setdefault(digest.author.split(".")[1], {})
                 for author, rows in digest.held.items():
                     for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist():
                         key = f"{author}/{tile}"

@@ -10,6 +10,7 @@ from support.makers import run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.wire.codec import encode
+from swarm.wire.meant import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Claim, Table
@@ -30,7 +31,7 @@ def test_a_query_is_answered_once(world: World):
         Replied("q", RUN, {"role": "agent", "id": "b"}, run_info(id="b")),
         AskEnded("q", RUN, 1, None),
     ]
-    question, answer = len(encode(Nothing())), len(encode(run_info(id="b")))
+    question, answer = (len(meant_for("run/agent/b", encode(each))) for each in (Nothing(), run_info(id="b")))
     assert (a.counts["bytes_out"], a.counts["bytes_in"]) == (question, answer)
     assert (b.counts["bytes_out"], b.counts["bytes_in"]) == (answer, question)
 

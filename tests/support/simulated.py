@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from msgspec.structs import replace
+
 from launch_scripts.process_table import planner_spec, spec_of
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
@@ -53,7 +55,7 @@ class OrderedSimulation(Simulation):
         super().__init__(scenario, **options)
         self.book = OrderBook()
         self.refused: list[tuple[float, GiveOrder | ZoneOrder, str | None]] = []
-        self._operator = self.network.bus(OBSERVER, scenario.network.namespace)
+        self._operator = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
         self._orders_given = 0
 
     def add(self, added: AddedAgent) -> Node:
@@ -80,6 +82,9 @@ class OrderedSimulation(Simulation):
                     self.refused.append((self.now_s, order, failure))
 
         topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
+        order = replace(
+            order, stamp_ns=self.scheduler.clock.now_ns() + self._orders_given
+        )  # several may be given at once
         self._operator.ask(topic, order, post, tag=f"order-{self._orders_given}", timeout_s=1.0, keeper="0")
 
     def _start_planners(self) -> None:

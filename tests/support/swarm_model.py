@@ -161,10 +161,12 @@ class SwarmModel:
 
         def post(event: Event) -> None:
             if not bus.closed:
+                bus.gather()
                 service.handle(event, self.now_ns)
 
         def tick() -> None:
             if not bus.closed:
+                bus.gather()
                 service.tick(self.now_ns)
                 for look in self.after_tick:
                     look()

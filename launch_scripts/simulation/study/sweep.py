@@ -20,10 +20,12 @@ from launch_scripts.simulation.study.trials import Result, Trial
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 from swarm.files import check_writable, write_file, writing
+from swarm.journal import digest_of
 
 FIGURE = "figure."
 """Begins the name of a column that holds a figure."""
 KEPT = "results.jsonl"
+_DIGEST = b',"digest":"'
 
 
 class ResultStore:
@@ -46,7 +48,10 @@ class ResultStore:
                 file.truncate(file.tell() - len(half))
         check_writable(folder)
         for number, line in enumerate(lines, 1):
+            content, mark, digest = line.rpartition(_DIGEST)
             try:
+                if mark and digest != _end(content + b"}")[len(_DIGEST) :]:
+                    raise ValueError("its digest is another")
                 result = msgspec.json.decode(line, type=Result)
             except (msgspec.MsgspecError, RecursionError, ValueError) as error:
                 damaged = f"{self.path}, line {number} is damaged; remove it, and its trial is simulated again"
@@ -57,7 +62,13 @@ class ResultStore:
         """Keeps a result. Raises StoreError."""
         self.results[result.key] = result
         with writing(self.path), self.path.open("ab", buffering=0) as file:
-            file.write(msgspec.json.encode(result) + b"\n")
+            content = msgspec.json.encode(result)
+            file.write(content[:-1] + _end(content) + b"\n")
+
+
+def _end(content: bytes) -> bytes:
+    """Replaces the last bracket of a result: with it the line is JSON, and ends with the digest of the result."""
+    return _DIGEST + digest_of(content).hex().encode() + b'"}'
 
 
 RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"

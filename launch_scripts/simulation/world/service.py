@@ -150,7 +150,7 @@ class TargetsService:
             self._candidacy.tell(self._member, now_ns)
         if leads and self._world.listening and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
-            self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
+            self._member.ask_by_name(COST, CostRequest(), tag=_ASK)
         self._obey(now_ns)
         self._perform(self._world.tick(now_ns), now_ns)
         self._member.tell_faults(self._world.faults, now_ns)

@@ -1,4 +1,4 @@
-"""Features of a GeoJSON, a GeoPackage or a Shapefile, as they are stored: bounded, before anything is made of them.
+"""Features of a file of shapes, by GDAL: bounded before anything is made of them, and none is lost.
 
 pyogrio and shapely are imported where they are used: agents never need them.
 """
@@ -18,53 +18,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.raster_files import BAD_ARCHIVE, LONGEST_REASON
+from shared_map.importers.zones.shape_texts import Kind, checked_json, checked_xml, kind_of
 from swarm.config.explain import nearest
-from swarm.config.input_files import FileKind, check_bytes, size
+from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import SwarmError, TerrainError
 
 MOST_FEATURES = 500_000
 """Number of those that touch the terrain."""
 MOST_VERTICES = 20_000_000
-_MAGIC = {b"SQLite format 3\0": "GPKG", b"\0\0\x27\x0a": "ESRI Shapefile"}
-"""First bytes -> GDAL's driver; a GeoJSON begins with a brace. GDAL knows 80 formats, some of which
-name other files."""
-_IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json")
+_CHUNK = 100_000
+"""Features which are read at once."""
+_IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
+_TOGETHER = {"LIBKML": None, "GPX": {"waypoints", "routes", "tracks"}, "OSM": {"points", "lines", "multipolygons"}}
+"""Formats whose layers are one drawing, and the layers which hold it; None: all."""
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
+_POLYGONS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
     """Metadata of a layer.
 
-    source    how GDAL names the file
-    what      how sentences name it
-    crs       as the file has it; empty if it has none
-    columns   names of its attributes
-    features  how many
-    bounds    (west, south, east, north) in units of `crs`; None if it is empty
+    source   GDAL's name of the file, or its content as GeoJSON
+    what     name in sentences
+    index    its number in the file
+    crs      as the file has it; empty if it has none
+    columns  names of its attributes
+    count    features which the file says that it holds
     """
 
-    source: str
+    source: str | bytes
     what: str
+    index: int
     name: str
     crs: str
     columns: tuple[str, ...]
-    features: int
-    bounds: tuple[float, float, float, float] | None
+    count: int
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of a layer, in its own coordinates.
+    """Some features of a layer, in its own coordinates. Each has a shape, all of whose coordinates are finite.
 
-    ids         what people call each, such as way/4711, or its number in the file
-    geometries  shapely geometries without heights, curves made of lines; None where there is none
-    tags        attributes of each as texts, without those that are not set
+    ids     what people call each, such as way/4711, or its number in the file
+    shapes  shapely points, lines and polygons without heights, curves made of lines
+    of      int64, the feature which each shape is a part of
+    tags    attributes of each as texts, without those that are not set
+    closed  ids of those with a ring whose last corner was not its first
     """
 
     ids: list[str]
-    geometries: NDArray[Any]
+    shapes: NDArray[Any]
+    of: NDArray[np.int64]
     tags: list[dict[str, str]]
+    closed: list[str]
 
 
 def is_vector(path: Path) -> bool:
@@ -74,87 +81,105 @@ def is_vector(path: Path) -> bool:
     return False
 
 
-def open_layer(path: Path, layer: str | None, what: str) -> Layer:
-    """The one layer of a file, or the one that is named.
+def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
+    """The layer that is named, or the one of a file, or those which are one drawing.
 
     Raises TerrainError with one sentence, which `what` begins, if the file is missing, too large, damaged, of
     another kind, or holds several layers and none is named.
     """
     import pyogrio
 
-    source = _source(path, what)
+    source, kind = _source(path, what)
     with _refused(what):
-        known = [str(name) for name, kind in pyogrio.list_layers(source) if kind is not None]
+        listed = pyogrio.list_layers(source)
+        known = [str(name) for name, shape in listed if shape is not None]
         if not known:
             raise TerrainError(f"{what} has no layer of shapes")
-        if layer is None and len(known) > 1:
-            shown = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "")
-            raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {shown}")
         if layer is not None and layer not in known:
             held = ", ".join(known[:12])
             raise TerrainError(f"{what} has no layer {layer!r}, only {held}{nearest(layer, known)}")
-        name = layer or known[0]
-        if source.startswith("GPKG:"):
-            _check_table(path, name, what)
-        info = pyogrio.read_info(source, layer=name, force_feature_count=True, force_total_bounds=True)
-    bounds = info["total_bounds"]
-    return Layer(
-        source=source,
-        what=what,
-        name=name,
-        crs=str(info["crs"] or ""),
-        columns=tuple(str(field) for field in info["fields"]),
-        features=int(info["features"]),
-        bounds=_box(bounds) if info["features"] else None,
-    )
+        names = [layer] if layer is not None else known
+        if layer is None and kind.driver in _TOGETHER:
+            names = [name for name in known if name in (_TOGETHER[kind.driver] or known)]
+        elif len(names) > 1:
+            shown = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "")
+            raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {shown}")
+        found = []
+        for name in names:
+            if kind.driver == "GPKG":
+                _check_table(path, name, what)
+            index = listed[:, 0].tolist().index(name)
+            info = pyogrio.read_info(source, layer=index, force_feature_count=True)
+            count = int(info["features"])
+            index_file = path.with_suffix(".SHX" if path.suffix.isupper() else ".shx")
+            if kind.driver == "ESRI Shapefile" and index_file.is_file():
+                count = max(count, (index_file.stat().st_size - 100) // 8)  # GDAL believes its header
+            columns = tuple(str(field) for field in info["fields"])
+            shown = name if isinstance(source, str) else "fence"
+            found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns, count))
+        return found
 
 
-def _box(bounds: Any) -> tuple[float, float, float, float] | None:
-    """Finite bounds; None if a layer has none, as its features have no shapes."""
-    if bounds is None or not np.isfinite(bounds).all():
-        return None
-    west, south, east, north = (float(side) for side in bounds)
-    return west, south, east, north
+def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
+    """All features of a layer, some at a time.
 
-
-def read_features(layer: Layer, bounds: tuple[float, float, float, float], columns: Sequence[str]) -> Features:
-    """The features of a layer that touch a rectangle in its own coordinates.
-
-    Raises TerrainError if they are too many, or the file is damaged.
+    Raises TerrainError, which names the feature, if one has no shape, or a part of it none, or a coordinate is no
+    number: GDAL leaves out of a shape what it cannot read. Raises it if the file is damaged.
     """
     import shapely
     from pyogrio.raw import read
 
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
-    with _refused(layer.what):
-        meta, numbers, stored, fields = read(
-            layer.source,
-            layer=layer.name,
-            columns=wanted,
-            bbox=bounds,
-            force_2d=True,
-            return_fids=True,
-            max_features=MOST_FEATURES + 1,
-        )
-    if len(numbers) > MOST_FEATURES:
-        raise TerrainError(
-            f"{layer.what} has more than {MOST_FEATURES} features on the terrain; crop it, or dissolve it"
-        )
-    vertices = sum(len(each) for each in stored if each is not None) // 16
-    if vertices > MOST_VERTICES:
-        raise TerrainError(
-            f"{layer.what} has {vertices} corners on the terrain, at most {MOST_VERTICES}; simplify it"
-        )
-    with np.errstate(all="ignore"):
-        geometries = shapely.from_wkb(stored, on_invalid="ignore")
-    tags: list[dict[str, str]] = [{} for _ in numbers]
-    for name, values in zip(meta["fields"], fields, strict=True):
-        for row, value in zip(tags, values.tolist(), strict=True):
-            if value is not None and value == value and value != "":
-                row[str(name)] = str(value)
-    id_column = next((name for name in _IDS if name in wanted), "")
-    ids = [row.get(id_column, str(number))[:60] for row, number in zip(tags, numbers, strict=True)]
-    return Features(ids, geometries, tags)
+    for first in range(0, 1 << 31, _CHUNK):
+        with _refused(layer.what), np.errstate(all="ignore"):
+            meta, numbers, stored, fields = read(
+                layer.source,
+                layer=layer.index,
+                columns=wanted,
+                force_2d=True,
+                return_fids=True,
+                skip_features=first,
+                max_features=_CHUNK,
+            )
+            geometries = shapely.from_wkb(stored, on_invalid="fix")
+            unclosed = shapely.is_missing(shapely.from_wkb(stored, on_invalid="ignore"))
+        tags: list[dict[str, str]] = [{} for _ in numbers]
+        for name, values in zip(meta["fields"], fields, strict=True):
+            for row, value in zip(tags, values.tolist(), strict=True):
+                if value is not None and str(value) not in ("", "nan", "NaT"):
+                    row[str(name)] = str(value)
+        id_column = next((name for name in _IDS if name in wanted), "")
+        ids = [row.get(id_column, str(number))[:60] for row, number in zip(tags, numbers, strict=True)]
+        shapes, of = _parts(geometries)
+        bad: dict[int, str] = {int(n): "it has no shape" for n in np.flatnonzero(shapely.is_missing(geometries))}
+        bad |= {int(n): "it, or a part of it, has no corners" for n in of[shapely.is_empty(shapes)]}
+        corners, at = shapely.get_coordinates(shapes, return_index=True)
+        bad |= {int(n): "its coordinates are no numbers" for n in of[at[~np.isfinite(corners).all(axis=1)]]}
+        for n, why in sorted(bad.items()):
+            raise TerrainError(f"{layer.what}: feature {ids[n]} cannot be used: {why}; repair or remove it")
+        yield Features(ids, shapes, of, tags, [ids[n] for n in np.flatnonzero(unclosed)])
+        if len(numbers) < _CHUNK:
+            if first + len(numbers) != layer.count:
+                raise TerrainError(
+                    f"{layer.what} is damaged: it holds {layer.count} features, of which {first + len(numbers)} are"
+                    " read; ogr2ogr makes a copy of these"
+                )
+            return
+
+
+def _parts(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Points, lines and polygons that geometries consist of, empty ones too, and of which each is a part."""
+    import shapely
+
+    of = np.arange(len(geometries))
+    parts = np.asarray(geometries, object)
+    while (several := (shapely.get_type_id(parts) > _POLYGONS) & ~shapely.is_empty(parts)).any():
+        inner, index = shapely.get_parts(parts[several], return_index=True)
+        of = np.concatenate([of[~several], of[several][index]])
+        parts = np.concatenate([parts[~several], inner])
+    order = np.argsort(of, kind="stable")
+    present = order[~shapely.is_missing(parts[order])]
+    return parts[present], of[present]
 
 
 @contextlib.contextmanager
@@ -174,8 +199,8 @@ def _refused(what: str) -> Iterator[None]:
 # --- which file ---------------------------------------------------------------------------------------------
 
 
-def _source(path: Path, what: str) -> str:
-    """Returns GDAL's name for a file. Raises TerrainError on a file of another kind."""
+def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
+    """Returns GDAL's name for a file, whose text is checked. Raises TerrainError on a file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
         found = _found(path, what)
@@ -187,22 +212,34 @@ def _source(path: Path, what: str) -> str:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
         raise TerrainError(
-            f"{what} is neither GeoJSON, GeoPackage nor Shapefile, nor a .zip of one: ogr2ogr makes one"
+            f"{what} is neither GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor"
+            " .waypoints, nor a .zip of one; `ogr2ogr -f GPKG out.gpkg FILE` converts most others"
         )
-    return found
-
-
-def _found(path: Path, what: str) -> str | None:
+    kind, member = found
     absolute = path.resolve()
+    source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
+    if kind.text is None:
+        return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
+    if member is None:
+        data = read_bytes(path, FileKind.VECTOR_TEXT)
+    else:
+        with zipfile.ZipFile(path) as archive:
+            data = archive.read(member)
+    if kind.text == "xml":
+        checked_xml(data, what)
+        return source, kind
+    return checked_json(data, kind, what) or f"GeoJSON:{source}", kind
+
+
+def _found(path: Path, what: str) -> tuple[Kind, str | None] | None:
+    """The kind of a file, and the member of a .zip which holds it."""
     with path.open("rb") as file:
         head = file.read(4096)
-    driver = _driver(head)
-    if driver == "GeoJSON":
-        check_bytes(path, FileKind.VECTOR_TEXT)
-    if driver is not None:
-        return str(absolute) if driver == "ESRI Shapefile" else f"{driver}:{absolute}"
     if not head.startswith(b"PK"):
-        return None
+        kind = kind_of(head, what)
+        if kind is not None and kind.text is not None:
+            check_bytes(path, FileKind.VECTOR_TEXT)
+        return None if kind is None else (kind, None)
     with zipfile.ZipFile(path) as archive:
         members = [each for each in archive.infolist() if not each.is_dir()]
         named = [each for each in members if Path(each.filename).suffix.lower() in _IN_ARCHIVES]
@@ -212,20 +249,17 @@ def _found(path: Path, what: str) -> str | None:
             raise TerrainError(
                 f"{what} holds {len(named)} files of shapes ({', '.join(_IN_ARCHIVES)}), expected one: unpack it"
             )
-        stem = str(Path(named[0].filename).with_suffix(""))
+        name = named[0].filename
+        with archive.open(name) as member:
+            kind = kind_of(member.read(4096), what)
+        if kind is None:
+            return None
+        stem = str(Path(name).with_suffix(""))
         unpacked = sum(each.file_size for each in members if str(Path(each.filename).with_suffix("")) == stem)
-        text = Path(named[0].filename).suffix.lower() in (".geojson", ".json")
-        most = (FileKind.VECTOR_TEXT if text else FileKind.VECTORS).most_bytes
+        most = (FileKind.VECTORS if kind.text is None else FileKind.VECTOR_TEXT).most_bytes
         if unpacked > most:
-            raise TerrainError(f"{what}: {named[0].filename} has {size(unpacked)}, at most {size(most)} are read")
-    return f"/vsizip/{{{absolute}}}/{named[0].filename}"
-
-
-def _driver(head: bytes) -> str | None:
-    for magic, driver in _MAGIC.items():
-        if head.startswith(magic):
-            return driver
-    return "GeoJSON" if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{") else None
+            raise TerrainError(f"{what}: {name} has {size(unpacked)}, at most {size(most)} are read")
+    return kind, name
 
 
 def _check_table(path: Path, layer: str, what: str) -> None:

@@ -1,5 +1,5 @@
 """Shapes of a file in any coordinate system, brought into cells of a grid: repaired, cut at its border, densified
-as the projection bends them; and its areas as simple rings, for orders to a running swarm.
+as the projection bends them.
 
 Cell coordinates are (column, row) from the north-west corner: cell (r, c) is the square from (c, r) to (c+1, r+1).
 """
@@ -9,45 +9,38 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
-from shared_map.importers.zones.vector_files import Features, Layer, open_layer, read_features
+from shared_map.importers.zones.vector_files import Features, Layer
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 Box = tuple[float, float, float, float]
+Floats64 = NDArray[np.float64]
 _MOST_CROSSINGS = 50_000
 _STEP_M = 1000.0
 """Longer edges are cut: a straight edge in one system is bent in another, by some centimetres over this length."""
 _DEG_M = 111_000.0
 _POLYGONS = 3
-MOST_OUTLINES = 50
-_TOLERANCES_CELLS = (0.01, 0.05, 0.1, 0.25)
-"""Tolerances for dropped corners, tried in order until few enough are left."""
-
-Corner = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
     """Simple shapes (points, lines, polygons) in cell coordinates.
 
-    of        int64 (n,)  which feature each is a part of
-    mended    ids of features that crossed themselves
-    unusable  id -> why a feature is left out
-    empty     how many features have no shape
+    of       int64 (n,)  which feature each is a part of
+    mended   ids of features that crossed themselves, or whose rings were not closed
+    outside  how many features lie outside of the terrain
     """
 
     shapes: NDArray[Any]
     of: NDArray[np.int64]
     mended: list[str]
-    unusable: dict[str, str]
-    empty: int
+    outside: int
 
 
 class Placing:
@@ -76,8 +69,8 @@ class Placing:
             self._box = self._extent()
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
-        if layer.bounds is not None:
-            self._check_touches(layer.bounds)
+        self._reach: Box | None = None
+        self._touched = False
 
     @property
     def crs(self) -> str:
@@ -105,63 +98,85 @@ class Placing:
         wide, high = 0.01 * (box[2] - box[0]), 0.01 * (box[3] - box[1])
         return box[0] - wide, box[1] - high, box[2] + wide, box[3] + high
 
-    def _check_touches(self, bounds: Box) -> None:
-        what, named = self.layer.what, self.crs
-        if self._degrees:
-            worst = max(abs(bounds[0]), abs(bounds[2])), max(abs(bounds[1]), abs(bounds[3]))
-            if worst[0] > 540 or worst[1] > 90.0001:
-                raise TerrainError(
-                    f"{what} reaches from {_shown(bounds)}, which are no degrees, as {named} has them; set crs"
-                )
-        if not self.boxes(bounds):
+    def check_touched(self) -> None:
+        """Raises TerrainError if the layer holds no feature, or none that was placed is on the terrain."""
+        what = self.layer.what
+        if self._reach is None:
+            raise TerrainError(f"{what} holds no feature")
+        if not self._touched:
+            turned = self._degrees and self._on(_turned(np.array([self._reach])))[0]
+            hint = "are longitude and latitude in reverse?" if turned else "is crs right?"
             raise TerrainError(
-                f"{what} does not touch the terrain: it reaches from {_shown(bounds)}, the terrain from"
-                f" {_shown(self._box)} in {named}; is crs right?"
+                f"{what} does not touch the terrain: it reaches from {_shown(self._reach)}, the terrain from"
+                f" {_shown(self._box)} in {self.crs}; {hint}"
             )
 
-    def boxes(self, bounds: Box) -> list[tuple[float, Box]]:
-        """(turn in degrees, where to look in the layer) of each part of a layer that may be on the terrain."""
-        found = []
-        for shift in self._shifts:
-            box = (self._box[0] + shift, self._box[1], self._box[2] + shift, self._box[3])
-            if box[0] <= bounds[2] and bounds[0] <= box[2] and box[1] <= bounds[3] and bounds[1] <= box[3]:
-                found.append((-shift, box))
-        return found
+    def _on(self, bounds: Floats64) -> NDArray[np.bool_]:
+        """True for each of (n, 4) bounds that meets the terrain, in any turn."""
+        west, south, east, north = self._box
+        high = (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
+        wide = [(bounds[:, 0] <= east + by) & (bounds[:, 2] >= west + by) for by in self._shifts]
+        return np.asarray(high & np.any(wide, axis=0))
 
-    def place(self, features: Features, box: Box, shift: float) -> Shapes:
-        """Features that were read from a box, in cells."""
-        with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
-            return self._place(features, box, shift)
+    def _check_bounds(self, features: Features, bounds: Floats64) -> None:
+        """Raises TerrainError if it is not sure where features lie."""
+        what = self.layer.what
+        if self._degrees:
+            wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
+            for n in np.flatnonzero(wrong)[:1]:
+                raise TerrainError(
+                    f"{what}: feature {features.ids[features.of[n]]} reaches from {_shown(tuple(bounds[n]))}, which"
+                    f" are no degrees, as {self.crs} has them; set crs"
+                )
+            for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
+                if _jumps(features.shapes[n]):
+                    raise _unusable(what, features, n, "an edge of it spans more than 180 degrees: cut it at 180")
+            for n in np.flatnonzero(self._on(_turned(bounds)) & ~self._on(bounds)):
+                raise _unusable(
+                    what, features, n, "it is on the terrain if longitude and latitude change places, else outside"
+                )
 
-    def _place(self, features: Features, box: Box, shift: float) -> Shapes:
+    def place(self, features: Features) -> Shapes:
+        """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
         import shapely
 
-        geometries = features.geometries
-        bounds = shapely.bounds(geometries)
-        lacking = shapely.is_missing(geometries) | shapely.is_empty(geometries)
-        unusable: dict[str, str] = {}
-        finite = np.isfinite(bounds).all(axis=1)
-        for n in np.flatnonzero(~lacking & ~finite):
-            unusable[features.ids[n]] = "its coordinates are no numbers"
-        if self._degrees:
-            for n in np.flatnonzero(finite & (bounds[:, 2] - bounds[:, 0] > 180)):
-                if _jumps(geometries[n]):
-                    unusable[features.ids[n]] = "an edge of it spans more than 180 degrees: cut it at 180"
-                    finite[n] = False
-        kept = np.flatnonzero(finite & ~lacking)
-        shapes, of = _simple(geometries[kept])
-        of = kept[of]
-        shapes, of, mended = _mended(shapes, of, features.ids, unusable)
-        shapes = np.asarray(shapely.clip_by_rect(shapes, *box), object) if len(shapes) else shapes
+        with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
+            bounds = shapely.bounds(features.shapes)
+            if len(bounds):
+                reach = (*bounds[:, :2].min(axis=0), *bounds[:, 2:].max(axis=0))
+                before = reach if self._reach is None else self._reach
+                self._reach = (*np.minimum(before[:2], reach[:2]), *np.maximum(before[2:], reach[2:]))
+            self._check_bounds(features, bounds)
+            near = self._on(bounds)
+            self._touched |= bool(near.any())
+            of = features.of[near]
+            shapes, of, mended = _mended(features, near, self.layer.what)
+            placed = [self._placed(shapes, of, shift, features) for shift in self._shifts]
+        outside = len(features.ids) - len(np.unique(of))
+        return Shapes(
+            np.concatenate([each for each, _ in placed]),
+            np.concatenate([each for _, each in placed]),
+            sorted({*mended, *features.closed}),
+            outside,
+        )
+
+    def _placed(
+        self, shapes: NDArray[Any], of: NDArray[np.int64], shift: float, features: Features
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """The parts of shapes within the terrain's box that is turned by some degrees."""
+        import shapely
+
+        box = (self._box[0] + shift, self._box[1], self._box[2] + shift, self._box[3])
+        shapes, within = _simple(np.asarray(shapely.clip_by_rect(shapes, *box), object))
+        of = of[within]
         if self._crs is not None and self._crs != self._target:
             unit_m = _DEG_M if self._degrees else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
         with self._reprojecting():
-            shapes = shapely.transform(shapes, lambda points: self._to_cells(points, shift))
-        shapes, within = _simple(shapes)
-        of = of[within]
-        good = np.isfinite(shapely.bounds(shapes)).all(axis=1)
-        return Shapes(shapes[good], of[good], mended, unusable, int(lacking.sum()))
+            shapes = shapely.transform(shapes, lambda points: self._to_cells(points, -shift))
+        for n in of[~np.isfinite(shapely.bounds(shapes)).all(axis=1)]:
+            raise _unusable(self.layer.what, features, n, "it has no place in the terrain's system")
+        return shapes, of
 
     @contextmanager
     def _reprojecting(self) -> Iterator[None]:
@@ -227,6 +242,16 @@ def _degrees_around(crs: Any, lon_deg: float) -> Any:
     return rasterio.CRS.from_proj4(f"+proj=longlat +pm={lon_deg!r} +datum=WGS84 +no_defs")
 
 
+def _turned(bounds: Floats64) -> Floats64:
+    """Bounds with longitude and latitude in reverse."""
+    return bounds[:, [1, 0, 3, 2]]
+
+
+def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
+    id = features.ids[features.of[shape]]
+    return TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
+
+
 def _shown(box: Box) -> str:
     return f"{box[0]:.7g}, {box[1]:.7g} to {box[2]:.7g}, {box[3]:.7g}"
 
@@ -258,24 +283,25 @@ def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 
 def _mended(
-    shapes: NDArray[Any], of: NDArray[np.int64], ids: list[str], unusable: dict[str, str]
-) -> tuple[NDArray[Any], NDArray[np.int64], list[str]]:
-    """Polygons that cross themselves, as the areas that their rings enclose."""
+    features: Features, near: NDArray[np.bool_], what: str
+) -> tuple[NDArray[Any], NDArray[np.int64], set[str]]:
+    """Shapes of features, and of which each is a part: polygons that cross themselves as what their rings enclose.
+
+    Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
+    """
     import shapely
 
-    polygons = shapely.get_type_id(shapes) == _POLYGONS
+    shapes = features.shapes.copy()
+    polygons = near & (shapely.get_type_id(shapes) == _POLYGONS)
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
-    if not len(wrong):
-        return shapes, of, []
-    shapes = shapes.copy()
     for n in wrong:
         if _crossings(shapes[n]) > _MOST_CROSSINGS:
-            unusable[ids[of[n]]] = "it crosses itself thousands of times"
-            shapes[n] = None
-        else:
-            shapes[n] = shapely.make_valid(shapes[n], method="structure", keep_collapsed=False)
-    simple, within = _simple(shapes)
-    return simple, of[within], sorted({ids[of[n]] for n in wrong} - unusable.keys())
+            raise _unusable(what, features, n, "it crosses itself thousands of times")
+        shapes[n] = shapely.make_valid(shapes[n], method="structure", keep_collapsed=False)
+        if shapely.is_empty(shapes[n]):
+            raise _unusable(what, features, n, "it encloses no ground")
+    simple, within = _simple(shapes[near])
+    return simple, features.of[near][within], {features.ids[features.of[n]] for n in wrong}
 
 
 def _crossings(polygon: Any) -> float:
@@ -287,59 +313,3 @@ def _crossings(polygon: Any) -> float:
     some = edges[np.unique(np.linspace(0, len(edges) - 1, 200).astype(np.intp))]
     crossed = shapely.STRtree(edges).query(some, predicate="crosses").shape[1]
     return float(crossed * len(edges) / len(some) / 2)
-
-
-# --- for orders ---------------------------------------------------------------------------------------------
-
-
-def outlines_of(
-    path: Path, grid: GridSpec, layer: str | None, crs: str | None, most_corners: int
-) -> list[list[Corner]]:
-    """The areas of a file, each as corners (row, col) of a grid; those that overlap are one.
-
-    Parameters
-    ----------
-    layer, crs : str or None
-        As in a scenario's zone.
-    most_corners : int
-        Of one area.
-
-    Raises
-    ------
-    TerrainError
-        The file cannot be read, has no area on the terrain, has an unusable feature, an area with a hole or with
-        more than `most_corners` corners, or too many areas.
-    """
-    import shapely
-
-    what = f"zone {path}"
-    found = open_layer(path, layer, what)
-    if found.bounds is None:
-        raise TerrainError(f"{what} holds no area")
-    placing = Placing(grid, found, crs, 2 * grid.resolution_m)
-    areas = []
-    for shift, box in placing.boxes(found.bounds):
-        shapes = placing.place(read_features(found, box, ()), box, shift)
-        for id, why in shapes.unusable.items():
-            raise TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
-        areas.append(shapes.shapes[shapely.get_type_id(shapes.shapes) == 3])
-    parts = shapely.get_parts(shapely.union_all(np.concatenate(areas)))
-    parts = parts[shapely.area(parts) > 0] if len(parts) else parts
-    if not len(parts):
-        raise TerrainError(f"{what} holds no area on the terrain")
-    if len(parts) > MOST_OUTLINES:
-        raise TerrainError(f"{what} holds {len(parts)} areas; at most {MOST_OUTLINES} are ordered at once")
-    return [_ring(part, what, most_corners) for part in parts]
-
-
-def _ring(area: object, what: str, most: int) -> list[Corner]:
-    import shapely
-
-    if shapely.get_num_interior_rings(area):
-        raise TerrainError(f"{what} holds an area with a hole, which an order cannot have; cut it in two")
-    points = np.zeros((0, 2))
-    for tolerance in _TOLERANCES_CELLS:
-        points = shapely.get_coordinates(shapely.simplify(area, tolerance))[:-1]
-        if len(points) <= most:
-            return [(float(row), float(col)) for col, row in points]
-    raise TerrainError(f"{what} holds an area of {len(points)} corners, at most {most} are ordered; simplify it")

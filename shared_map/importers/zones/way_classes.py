@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -47,7 +48,17 @@ COLUMNS: Mapping[Kind, tuple[str, ...]] = {
     "water": ("waterway", "natural", "landuse", "fclass"),
 }
 """Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
-TAGS = ("bridge", "tunnel", "width", "est_width", "area")
+TAGS = ("bridge", "tunnel", "area", "inclusion")
+_MOST_RADIUS_M = 200_000.0
+_EXTENTS = {
+    "radius": (2.0, _MOST_RADIUS_M),
+    "radius_m": (2.0, _MOST_RADIUS_M),
+    "diameter": (1.0, 2 * _MOST_RADIUS_M),
+    "width": (1.0, MOST_WIDTH_M),
+    "width_m": (1.0, MOST_WIDTH_M),
+    "est_width": (1.0, MOST_WIDTH_M),
+}
+"""Columns of a point's or a line's own extent, in any case -> its width over it, and the largest width, metres."""
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
 
@@ -55,7 +66,8 @@ _VARIANT = re.compile(r"(_link|_grade[1-5])$")
 _NO = ("no", "0", "f", "false")
 _NOT_A_BRIDGE = (*_NO, "aqueduct")
 _PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
-_WIDTH = re.compile(r"\s*(\d{1,5}(?:[.,]\d{1,9})?)\s*(m|metres|meters)?\s*")
+_LENGTH = re.compile(r"\s*(\d{1,9}(?:[.,]\d{1,9})?)\s*(m|metres|meters|km|ft|feet|')?\s*")
+_UNITS_M = {"km": 1000.0, "ft": 0.3048, "feet": 0.3048, "'": 0.3048}
 
 
 def unpacked(row: Mapping[str, str]) -> dict[str, str]:
@@ -95,13 +107,26 @@ def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | 
     return Way(width_m, None if given.factor == "lethal" else given.factor)
 
 
+def states_extent(column: str) -> bool:
+    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not."""
+    name = column.lower()
+    return name in _EXTENTS or "radius" in name or "diameter" in name
+
+
 def width_of(tags: Mapping[str, str]) -> float | None:
-    """The width in metres that a feature has of its own."""
-    for key in ("width", "est_width"):
-        match = _WIDTH.fullmatch(tags.get(key, ""))
-        if match is not None:
-            width_m = float(match[1].replace(",", "."))
-            return width_m if 0 < width_m <= MOST_WIDTH_M else None
+    """The width in metres that a feature has of its own; of "2-4 m" the larger.
+
+    Raises ValueError, which names the column, if it states an extent that cannot be read.
+    """
+    stated = {key.lower(): value for key, value in tags.items() if states_extent(key)}
+    for key in sorted(stated, key=lambda key: [*_EXTENTS, key].index(key)):
+        lengths = [_LENGTH.fullmatch(part) for part in re.split("[;-]", stated[key])]
+        found = [float(each[1].replace(",", ".")) * _UNITS_M.get(each[2], 1.0) for each in lengths if each]
+        over, most_m = _EXTENTS.get(key, (math.nan, 0.0))
+        if len(found) < len(lengths) or not max(found) * over <= most_m:
+            raise ValueError(f"its {key} is {stated[key][:40]!r}, expected metres as radius, diameter or width")
+        if max(found) > 0:
+            return max(found) * over
     return None
 
 

@@ -19,10 +19,12 @@ from shared_map.importers.onto_grid import Placed, overlap
 from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones import way_classes
 from shared_map.importers.zones.burn import Drawn, burn
-from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layer, read_features
+from shared_map.importers.zones.shape_texts import INCLUSION
+from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layers, read_features
 from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
-from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way
+from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from swarm.config.ground import ZoneConfig
+from swarm.config.input_files import FileKind, check_file
 from swarm.errors import TerrainError, missing
 from swarm.grid import MAX_CELLS, GridSpec, Window
 
@@ -76,43 +78,100 @@ class Burnt:
     bridges: tuple[Window, Bools]
 
 
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Shapes of a zone's file on a grid, in cells.
+
+    values   with a factor or pace
+    lethal   closed, each with its width
+    kept     all else is closed; empty if nothing is kept in
+    bridges  of roads
+    """
+
+    facts: FileFacts
+    values: list[Drawn] = field(default_factory=list)
+    lethal: list[Drawn] = field(default_factory=list)
+    kept: list[Drawn] = field(default_factory=list)
+    bridges: list[Drawn] = field(default_factory=list)
+
+
 def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
     assert zone.file is not None
     path = Path(zone.file)
     what = f"{where} {path}"
-    if not path.exists():
-        raise TerrainError(f"{what} does not exist")
+    try:
+        check_file(path, FileKind.VECTORS)
+    except TerrainError as error:
+        raise TerrainError(f"{where}: {error}") from error
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
+    drawn = draw_zone(zone, grid, what)
+    closed, closes = burn(closed_shapes(drawn, grid), grid, what, everywhere=True)
+    over, deck = burn(drawn.bridges, grid, what)
+    burnt = burn(drawn.values, grid, what, least_wins=zone.kind == "road")
+    return Burnt(drawn.facts, burnt, (closed, ~np.isnan(closes)), (over, ~np.isnan(deck)))
+
+
+def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
+    """The shapes of a vector file, for every use of it: each feature is drawn, lies outside of the terrain, or does
+    not count by its class; otherwise TerrainError names it."""
     if importlib.util.find_spec("pyogrio") is None or importlib.util.find_spec("shapely") is None:
         raise TerrainError(f"{what} cannot be read: it needs {missing('pyogrio')}")
-    layer = open_layer(path, zone.layer, what)
-    facts = FileFacts(path.name, layer.name, zone.crs or layer.crs or "none", layer.features)
-    worth = _Worth(zone, layer, facts)
-    values: list[Drawn] = []
-    lethal: list[Drawn] = []
-    bridges: list[Drawn] = []
-    if layer.bounds is not None:
-        placing = Placing(grid, layer, zone.crs, zone.width_m or _WIDEST_M / 2)
+    path = Path(zone.file or "")
+    layers = open_layers(path, zone.layer, what)
+    facts = FileFacts(path.name, ", ".join(layer.name for layer in layers), "")
+    drawing, used = Drawing(facts), 0
+    faults = []
+    for layer in layers:
+        worth = _Worth(zone, layer, facts)
+        placing = Placing(grid, layer, zone.crs, _margin_m(zone, layer))
         facts.crs = placing.crs
-        read, used = 0, set()
-        for shift, box in placing.boxes(layer.bounds):
-            features = read_features(layer, box, worth.columns)
-            read += len(features.ids)
-            placed = placing.place(features, box, shift)
-            for shape, id, way, bridge in worth.of(features, placed):
-                used.add(id)
+        for features in read_features(layer, worth.columns):
+            placed = placing.place(features)
+            facts.features += len(features.ids)
+            facts.outside += placed.outside
+            facts.mended += placed.mended
+            names = set()
+            for shape, id, way, bridge, inside in worth.of(features, placed):
+                names.add(id)
                 drawn = Drawn(shape, way.factor or 1.0, way.width_m / grid.resolution_m)
-                (lethal if way.factor is None else values).append(drawn)
+                closing = drawing.kept if inside else drawing.lethal
+                (closing if way.factor is None else drawing.values).append(drawn)
                 if bridge:
-                    bridges.append(drawn)
-        facts.used, facts.outside = len(used), max(layer.features - read, 0)
-        worth.check_used()
-    closed, closes = burn(lethal, grid, what, everywhere=True)
-    over, deck = burn(bridges, grid, what)
-    burnt = burn(values, grid, what, least_wins=zone.kind == "road")
-    return Burnt(facts, burnt, (closed, ~np.isnan(closes)), (over, ~np.isnan(deck)))
+                    drawing.bridges.append(drawn)
+            used += len(names)
+        try:
+            placing.check_touched()
+        except TerrainError as error:
+            faults.append(error)
+    facts.used = used
+    if len(faults) == len(layers):
+        raise faults[0]
+    worth.check_used()
+    return drawing
+
+
+def closed_shapes(drawing: Drawing, grid: GridSpec) -> list[Drawn]:
+    """The shapes of all closed ground: those that close it, and all that lies outside of those that keep in."""
+    import shapely
+
+    if not drawing.kept:
+        return drawing.lethal
+    kept = shapely.union_all([shapely.buffer(each.shape, each.width_cells / 2) for each in drawing.kept])
+    around = shapely.difference(shapely.box(-1, -1, grid.cols + 1, grid.rows + 1), kept)
+    return [*drawing.lethal, *(Drawn(part, 1.0, 0.0) for part in shapely.get_parts(around) if part.area > 0)]
+
+
+def _margin_m(zone: ZoneConfig, layer: Layer) -> float:
+    """The distance from the terrain up to which a feature may reach it."""
+    stated = [column for column in layer.columns if states_extent(column)]
+    widths = [way.width_m or 0.0 for way in zone.classes.values()] + [zone.width_m or 0.0, _WIDEST_M]
+    for features in read_features(layer, stated) if stated else ():
+        for tags in features.tags:
+            with contextlib.suppress(ValueError):
+                widths.append(way_classes.width_of(tags) or 0.0)
+    return max(widths) / 2
 
 
 class _Worth:
@@ -125,7 +184,7 @@ class _Worth:
         self._zone, self._layer, self._facts = zone, layer, facts
         self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
         self._by_class = bool(zone.classes) or (self._kind is not None and not self._is_plain())
-        self.columns = [*TAGS, *PACKED]
+        self.columns = [*TAGS, *PACKED, *(column for column in layer.columns if states_extent(column))]
         listed, name = self._listed(), zone.attribute
         if name is not None:
             if not {name, *PACKED} & set(layer.columns):
@@ -148,7 +207,7 @@ class _Worth:
         zone, assumed = self._zone, COLUMNS[self._kind or "road"]
         if zone.attribute is not None or {*assumed, *PACKED} & set(self._layer.columns):
             return False
-        if zone.width_m is None and self._layer.features:
+        if zone.width_m is None:
             raise TerrainError(
                 f"{self._layer.what} has no column {' or '.join(assumed)} (it has {self._listed()}); set attribute"
                 " to the column with the classes, or width_m, which takes each feature for one of this width"
@@ -159,28 +218,28 @@ class _Worth:
         columns = self._layer.columns
         return (", ".join(columns[:20]) + (" ..." if len(columns) > 20 else "")) or "none"
 
-    def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool]]:
-        """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge)."""
-        facts, zone = self._facts, self._zone
-        facts.mended += placed.mended
-        if placed.empty:
-            facts.skipped["without a shape"] += placed.empty
-        for id, why in placed.unusable.items():
-            if zone.kind in ("forbidden", "water"):
-                of = f"{self._layer.what}: feature {id} of a {zone.kind} zone"
-                raise TerrainError(f"{of} cannot be used: {why}; repair or remove it")
-            facts.skip(why, id)
-        ways = {}
-        for n in sorted(set(placed.of.tolist())):
-            tags = way_classes.unpacked(features.tags[n])
-            way = self._way(tags, features.ids[n])
-            if way is not None:
-                bridge = self._kind == "road" and way_classes.is_bridge(tags)
-                facts.bridges += bridge
-                ways[n] = way, bridge
+    def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool, bool]]:
+        """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge, whether all
+        else is closed)."""
+        ways: dict[int, tuple[Way | None, bool, bool]] = {}
         for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
-            if n in ways:
-                yield shape, features.ids[n], *ways[n]
+            id = features.ids[n]
+            if n not in ways:
+                tags = way_classes.unpacked(features.tags[n])
+                way = self._way(tags, id)
+                bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
+                self._facts.bridges += bridge
+                inside = self._zone.kind == "keep_in" or (self._closes and tags.get(INCLUSION) == "yes")
+                ways[n] = way, bridge, inside
+            way, bridge, inside = ways[n]
+            if way is not None:
+                if inside and not way.width_m and shape.geom_type != "Polygon":
+                    raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")
+                yield shape, id, way, bridge, inside
+
+    @property
+    def _closes(self) -> bool:
+        return self._zone.kind in ("forbidden", "keep_in")
 
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
@@ -204,8 +263,17 @@ class _Worth:
             return None
         if name:
             self._facts.classes[name] += 1
-        closes = zone.kind == "forbidden" or (kind == "water" and not name)
-        return Way(way_classes.width_of(tags) or zone.width_m or way.width_m, None if closes else way.factor)
+        closes = self._closes or (kind == "water" and not name)
+        try:
+            own_m = way_classes.width_of(tags)
+        except ValueError as error:
+            if closes or kind == "water":
+                raise self._unusable(id, str(error)) from None
+            own_m = None
+        return Way(own_m or zone.width_m or way.width_m, None if closes else way.factor)
+
+    def _unusable(self, id: str, why: str) -> TerrainError:
+        return TerrainError(f"{self._layer.what}: feature {id} cannot be used: {why}; repair or remove it")
 
     def _class_of(self, tags: dict[str, str]) -> str | None:
         attribute = self._zone.attribute
@@ -228,7 +296,7 @@ class _Worth:
     def check_used(self) -> None:
         """Raises TerrainError if features are on the terrain, and none counts for what they are."""
         facts = self._facts
-        if facts.used or set(facts.skipped) <= {"without a shape"}:
+        if facts.used:
             return
         reasons = ", ".join(f"{count} {why}" for why, count in facts.skipped.most_common(4))
         raise TerrainError(

@@ -229,12 +229,25 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
             raise ValueError(f"set {int(faulty[0])} of {sets} breaks a rule of its statements")
 
 
+MOST_DIGEST_BYTES = 1 << 16
+"""Bound of one digest, so that it is compared within a tick. It names 3,000 sets, more than most agents ever leave.
+A replica that holds more publishes parts (`Digest.after`)."""
+KEEPERS = "keeper"
+"""The authors under which keepers publish digests begin with this and a dot, and no group is called so: an author's
+role is what its name says, as access is granted by name."""
+_Place = tuple[Id, Tile]
+
+
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     """Sets that a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
+    Only a keeper names sets of others (`is_keeper`); a field that says so counts for nothing.
 
-    whole  false: only tiles that changed lately, published between the whole digests
+    role   read by wire version 8 only
+    whole  false: only tiles that changed lately, published between the whole digests; or a part of a whole one
     seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
+    after  of a part: the author and the tile after which it begins; none if it begins with the first
+    until  of a part: the author and the tile with which it ends; none if it ends with the last
     """
 
     author: Id
@@ -242,6 +255,22 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     held: Annotated[dict[Id, DigestRows], _AUTHORS]
     whole: bool = True
     seq: Natural = 0
+    after: _Place | None = None
+    until: _Place | None = None
+
+    @property
+    def complete(self) -> bool:
+        """True if all sets of its range are named."""
+        return self.whole or self.after is not None or self.until is not None
+
+
+def is_keeper(author: str) -> bool:
+    """Returns True if a sender of digests is a keeper."""
+    return author.startswith(f"{KEEPERS}.")
+
+
+MOST_TILES_ASKED = 4096
+"""In one question: the tiles of 64 regions. Who needs more asks again."""
 
 
 class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):

@@ -50,6 +50,8 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     lasts_s       after so long the zone ends by itself; without it never
     vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
+    stamp_ns      when it was given, as in `GiveOrder`
+    holes         parts of the polygon which are not of the zone, each as corners [row, col]; only with `polygon`
     """
 
     action: Literal["add", "remove", "list"] = "list"
@@ -61,6 +63,13 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     lasts_s: _Seconds | None = None
     corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
     vehicle_class: Id | None = None
+    stamp_ns: StampNs = 0
+    holes: Annotated[list[Corners], Meta(max_length=MOST_CORNERS // 3)] = []
+
+    @property
+    def changes(self) -> bool:
+        """True if it asks for more than a list."""
+        return self.action != "list"
 
     def relate(self) -> None:
         if self.name and _ZONE_NAME.fullmatch(self.name) is None:
@@ -76,6 +85,9 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
         corners = len(self.polygon or self.polygon_m or self.corners)
         if corners < 3:
             raise ValueError(f"polygon has {corners} corners, expected 3 ... {MOST_CORNERS}")
+        for hole in self.holes:
+            if not self.polygon or len(hole) < 3:
+                raise ValueError("holes have three corners or more, and go with polygon")
         if (self.kind == "pace") != (self.pace_s_per_m is not None):
             raise ValueError("pace_s_per_m goes with kind pace, and only with it")
 
@@ -166,6 +178,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     row, col  instead of a cell
     at        a place instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     new       the target must not be there yet; otherwise it must
+    stamp_ns  when it was given: where codes authenticate orders, an order counts once, and for a minute
     """
 
     subject: Subject | None = None
@@ -180,6 +193,12 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     speed_m_per_s: _Speed = _SPEED_M_PER_S
     new: bool = False
     at: PlaceText = ""
+    stamp_ns: StampNs = 0
+
+    @property
+    def changes(self) -> bool:
+        """True if it asks for more than the orders in force."""
+        return self.subject is not None
 
     def relate(self) -> None:
         if self.name:

@@ -128,7 +128,7 @@ def run_child(side: str, role: str, id: str, folder: Path) -> None:
         if not isinstance(service, RouterService):
             _tell_digests(service)
         _say([time.monotonic(), ""])
-        process = Process(service, inbox, MonotonicClock(), _TICK_HZ)
+        process = Process(service, inbox, MonotonicClock(), _TICK_HZ, gather=bus.gather)
         threading.Thread(target=_obey, args=(service, process), daemon=True).start()
         process.run()
 

@@ -21,7 +21,7 @@ from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import Event
+from swarm.bus.bus import Bus, Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig
@@ -69,9 +69,9 @@ def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:
     return entity
 
 
-def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[..., Any]) -> None:
+def run_service(service: Any, bus: Bus, inbox: Inbox, pipe: Connection, answer: Callable[..., Any]) -> None:
     """Runs a service as its role does until "end"; a thread beside it answers questions."""
-    process = Process(service, inbox, MonotonicClock(), 10.0)
+    process = Process(service, inbox, MonotonicClock(), 10.0, gather=bus.gather)
 
     def questions() -> None:
         while (question := pipe.recv()) != "end":
@@ -138,7 +138,7 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
         sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
         raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
         kept = read_on_thread(raw, received)
-        run_service(_map_service(sync, pipe), inbox, pipe, answer)
+        run_service(_map_service(sync, pipe), bus, inbox, pipe, answer)
         del kept
 
 
@@ -154,7 +154,7 @@ def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) 
             _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
             _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
         ]
-        run_service(_map_service(sync, pipe), inbox, pipe, lambda *_: None)
+        run_service(_map_service(sync, pipe), bus, inbox, pipe, lambda *_: None)
         del kept
 
 

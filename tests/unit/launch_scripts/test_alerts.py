@@ -77,6 +77,7 @@ FIRES: dict[str, dict[str, str]] = {
     "SwarmQuestionsExpired": {f"swarm_asks_expired_total{_PROCESS}": "0+1x40"},
     "SwarmInboxFull": {f"swarm_events_dropped_total{_PROCESS}": _COUNTED},
     "SwarmPayloadsDropped": {f"swarm_payloads_dropped_total{_PROCESS}": _COUNTED},
+    "SwarmPayloadsMisrouted": {f"swarm_payloads_misrouted_total{_PROCESS}": _COUNTED},
     "SwarmPluginFailed": {f"swarm_plugin_failed_total{_PROCESS}": _COUNTED},
     "SwarmCollision": {f"swarm_driven_into_total{_PROCESS}": _COUNTED},
     "SwarmLethalEntry": {f"swarm_lethal_entries_total{_PROCESS}": _COUNTED},

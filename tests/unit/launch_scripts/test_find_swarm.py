@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from datetime import datetime
@@ -16,7 +18,7 @@ from support.command import Swarm
 
 from launch_scripts.commands.running_swarm import Where, find_swarm
 from launch_scripts.observe.run_folder import begin_run, find_run
-from launch_scripts.observe.run_registry import register, registered
+from launch_scripts.observe.run_registry import _started_s, register, registered
 from launch_scripts.ports import free_ports
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError, ConfigError
@@ -125,6 +127,14 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
     assert find_run("LAST", Path("runs")).name == "second"
     assert find_swarm(name="first").network.connect == (f"tcp/127.0.0.1:{listens[0]}",)
     assert set(find_swarm().others) | {find_swarm().run} == {"first", "second"}
+    (tmp_path / "third" / "first").mkdir(parents=True)
+    other = json.dumps({"folder": str(tmp_path / "third/first"), "pid": 9, "started_s": 0})
+    (tmp_path / "state/runs/other.json").write_text(other)
+    with pytest.raises(
+        ConfigError, match=r"found 2 runs called 'first', expected the folder of one: /.*/third/first"
+    ):
+        find_run("first", Path("runs"))
+    (tmp_path / "third" / "first").rmdir()
     (tmp_path / "second").rename(tmp_path / "away")
     assert [run.name for run in registered()] == ["second", "first"], "the launcher of the second one runs"
     for file in (tmp_path / "state" / "runs").iterdir():
@@ -141,6 +151,39 @@ def test_a_launcher_that_has_ended_is_not_taken_for_the_process_which_has_its_pi
     (file,) = (tmp_path / "state" / "runs").iterdir()
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     assert [(run.name, run.launchers, run.processes()) for run in registered()] == [("r", (), {})]
+
+
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_process_which_outlives_its_launcher_is_seen_and_ended(
+    is_ours: bool, tmp_path: Path, swarm: Swarm
+) -> None:
+    """It is stopped, so that it does not notice the end. A program of another kind is shown and left alone."""
+    make_run(tmp_path, "r", 9, "2026-11-01T00:00:00Z")
+    (file,) = (tmp_path / "state" / "runs").iterdir()
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"pid": 2**30}))
+    code = "import os; log = open('agent-a0.log', 'a'); log.write('last\\n'); log.flush(); os.kill(os.getpid(), 19)"
+    words = [sys.executable, "-c", code, "swarm" if is_ours else "other"]
+    with subprocess.Popen(words, cwd=tmp_path / "r", start_new_session=True) as left:
+        os.waitpid(left.pid, os.WUNTRACED)
+        (run,) = json.loads(swarm("ps --json")[1])
+        told = swarm("down r")
+        assert (run["state"], run["processes"]) == ("left over", 1)
+        assert told[0] == (0 if is_ours else 2)
+        assert ("killed: agent-a0" if is_ours else "r does not run here") in told[1] + told[2]
+        assert (left.wait(30) if is_ours else left.poll()) == (-9 if is_ours else None)
+        left.kill()
+    assert json.loads(swarm("ps -a --json")[1])[0]["state"] == "broke off"
+
+
+def test_a_stopped_launcher_is_shown_so(tmp_path: Path, swarm: Swarm) -> None:
+    make_run(tmp_path, "r", 9, "2026-11-01T00:00:00Z")
+    with subprocess.Popen([sys.executable, "-c", "import os; os.kill(os.getpid(), 19)"]) as stopped:
+        os.waitpid(stopped.pid, os.WUNTRACED)
+        (file,) = (tmp_path / "state" / "runs").iterdir()
+        entry = json.loads(file.read_text()) | {"pid": stopped.pid, "started_s": _started_s(stopped.pid)}
+        file.write_text(json.dumps(entry))
+        assert json.loads(swarm("ps --json")[1])[0]["state"] == "stopped"
+        stopped.kill()
 
 
 @pytest.mark.parametrize(

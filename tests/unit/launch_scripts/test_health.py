@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -25,9 +26,10 @@ from launch_scripts.launcher import local_swarm
 from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.local_swarm import LOOK_EVERY_S, STILL_S, Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
+from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_probe import ask, fast
-from launch_scripts.web.health_verdict import HEALTHY, READY, Process, health_pages, verdict
-from launch_scripts.web.server import MOST_CONNECTIONS, Server
+from launch_scripts.web.health_verdict import Process, health_pages, verdict
+from launch_scripts.web.server import MOST_CONNECTIONS, Server, refusal
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals
@@ -197,6 +199,76 @@ def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: Server) -
     finally:
         for each in held:
             each.close()
+
+
+def is_cut(connection: socket.socket) -> bool:
+    try:
+        return connection.recv(1, socket.MSG_PEEK) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("asks", "crowd"), [("/pages", b"GET /pa"), ("/healthz", b"GET /pages HTTP/1.0\r\nHost: [::1]\r\n\r\n")]
+)
+def test_slow_connections_are_cut_before_old_ones_and_readers_before_probes(asks: str, crowd: bytes) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def page(query: str, headers: object) -> Reply:
+        begun.set()
+        assert go_on.wait(20)
+        return Reply(200, "text/plain", b"all of it")
+
+    server = Server("health port", 0, {"/pages": page, "/healthz": page})
+    with contextlib.ExitStack() as held:
+        early = held.enter_context(socket.create_connection(place(server), 10))
+        early.sendall(f"GET {asks} HTTP/1.0\r\nHost: localhost\r\n\r\n".encode())
+        assert begun.wait(10)
+        late = [
+            held.enter_context(socket.create_connection(place(server), 10)) for _ in range(3 * MOST_CONNECTIONS)
+        ]
+        for each in late:
+            each.setblocking(False)
+            with contextlib.suppress(OSError):
+                each.sendall(crowd)
+        eventually(lambda: sum(map(is_cut, late)) == 2 * MOST_CONNECTIONS + 1, 20, "a server that has accepted all")
+        go_on.set()
+        assert early.makefile("rb").read().endswith(b"all of it")
+    server.close()
+
+
+PARTS = (
+    "127.0.0.1",
+    "localhost",
+    "LOCALHOST",
+    "[::1]",
+    "::1",
+    "evil.com",
+    ".",
+    "@",
+    ":",
+    ":80",
+    "%00",
+    "/",
+    "#",
+    "?",
+    " ",
+    "\\",
+)
+OURS = ("127.0.0.1", "localhost", "[::1]")
+
+
+@given(st.one_of(st.lists(st.sampled_from(PARTS), max_size=4).map("".join), st.text(max_size=12)))
+def test_a_host_is_this_machine_by_name_or_address_and_nothing_else(host: str) -> None:
+    name = host.lower().removesuffix(":80")
+    for header, value in (("Host", host), ("Origin", f"http://{host}")):
+        headers = Message()
+        headers["Host"] = "localhost"
+        del headers[header]
+        headers[header] = value
+        assert (refusal(headers) is None) == (name in OURS)
 
 
 def test_only_an_address_beyond_this_machine_serves_others_by_name(health: Health) -> None:

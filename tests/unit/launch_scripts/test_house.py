@@ -1,4 +1,4 @@
-"""The order of the house: each fault has a sentence, and none is here."""
+"""The order and the English of the house: each fault has a sentence, and none is here."""
 
 from __future__ import annotations
 
@@ -10,35 +10,50 @@ from types import ModuleType
 import pytest
 
 FOLDER = Path(__file__).parents[3] / ".ci"
-
-
-@pytest.fixture
-def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The check of a made-up tree in `tmp_path`, whose budget has a row for `swarm/bus` only."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module = importlib.import_module("house")
-    monkeypatch.setattr(module, "ROOT", tmp_path)
-    monkeypatch.setattr(sys, "argv", ["house.py"])
-    (tmp_path / "budget.toml").write_text(
-        '[product]\nlines = 9\nfiles = 9\n[rooms]\n"swarm/bus" = { lines = 2, files = 3 }\n[beside]\n[docs]\n'
-    )
-    (tmp_path / "swarm" / "bus").mkdir(parents=True)
-    return module
+BUDGET = """
+[product]
+lines = 9
+files = 9
+[rooms]
+"swarm/bus" = { lines = 2, files = 3 }
+[beside]
+[docs]
+"pages" = { words = 6 }
+[words]
+"swarm" = 0
+"pages" = 1
+"""
+TABLE = "| one | two |\n|---|:-:|\n| three - 4 | a|b |\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "fault"),
+    ("check", "name", "text", "fault"),
     [
-        ("swarm/bus/long.py", "a = 1\nb = 2\nc = 3\n", "swarm/bus: 3 lines, of which budget.toml allows 2"),
-        ("swarm/lost.py", "a = 1\n", "swarm/lost.py: no row of budget.toml covers it"),
-        ("launch_scripts/ears.py", "bus.subscribe(TOPIC)\n", "launch_scripts/ears.py: subscribes"),
-        ("swarm/bus/load.py", 'open("/proc/stat")\n', "swarm/bus/load.py: reads /proc"),
+        ("house", "swarm/bus/long.py", "a = 1\nb = 2\nc = 3\n", "swarm/bus: 3 lines, of which"),
+        ("house", "swarm/lost.py", "a = 1\n", "swarm/lost.py: no row of budget.toml covers it"),
+        ("house", "launch_scripts/ears.py", "bus.subscribe(TOPIC)\n", "launch_scripts/ears.py: subscribes"),
+        ("house", "swarm/bus/load.py", 'open("/proc/stat")\n', "swarm/bus/load.py: reads /proc"),
+        ("house", "pages/table.md", TABLE, ""),
+        ("house", "pages/long.md", TABLE + "\nseven", "pages: 7 words, of which budget.toml allows 6"),
+        ("words", "swarm/ask.py", '"""Whether it ends."""\n', 'swarm/ask.py:1: a docstring begins with "Whether"'),
+        ("words", "swarm/say.py", "a = 1\nb = 2  # Dear cells\n", 'swarm/say.py:2: "Dear": the style page'),
+        ("words", "swarm/field.py", 'a = 1\n"""Told to so many."""\n', 'swarm/field.py:2: "so many"'),
+        ("words", "swarm/code.py", '"""Returns `anew`."""\ndear = "nobody"\n', ""),
+        ("words", "pages/one.md", "The tree is mended.\n```\nso many\n```\n", ""),
+        ("words", "pages/two.md", "Nobody\n\nis `dear`, but\nanew", "pages: 2 faults, of which"),
     ],
-)
-def test_a_fault_is_named(
-    house: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str, fault: str
-) -> None:
-    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+)  # fmt: skip
+def test_a_fault_is_named_and_all_else_is_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    check: str, name: str, text: str, fault: str,
+) -> None:  # fmt: skip
+    monkeypatch.syspath_prepend(FOLDER)
+    module: ModuleType = importlib.import_module(check)
+    for each in {module, importlib.import_module("house")}:
+        monkeypatch.setattr(each, "ROOT", tmp_path)
+    monkeypatch.setattr(sys, "argv", [f"{check}.py"])
+    (tmp_path / "budget.toml").write_text(BUDGET)
+    (tmp_path / name).parent.mkdir(parents=True)
     (tmp_path / name).write_text(text)
-    assert house.main() == 1
+    assert module.main() == bool(fault)
     assert fault in capsys.readouterr().err

@@ -37,11 +37,21 @@ def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path
     assert len(set(found)) == 20
 
 
-def test_a_file_that_holds_no_number_is_written_anew(tmp_path: Path) -> None:
-    (tmp_path / "lives").mkdir()
-    (tmp_path / "lives" / "agent-a0").write_text("garbage")
-    first = next_incarnation(tmp_path, "agent", "a0")
-    assert next_incarnation(tmp_path, "agent", "a0") > first
+def test_a_file_that_was_changed_is_written_again_from_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 1_800_000_000 * 10**9
+    monkeypatch.setattr(options.time, "time_ns", lambda: now_ns)
+    path = tmp_path / "lives" / "agent-a0"
+    path.parent.mkdir()
+    path.write_text(f"{now_ns:020}")  # from before there were digests
+    assert next_incarnation(tmp_path, "agent", "a0") == now_ns + 1
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        assert next_incarnation(tmp_path, "agent", "a0") == now_ns
+        path.write_bytes(whole[:at])
+        assert next_incarnation(tmp_path, "agent", "a0") == now_ns + 2 * (at in (20, 21)), "its digest alone is cut"
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence() -> None:

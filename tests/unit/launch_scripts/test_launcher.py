@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from support.processes import eventually, session_of
 from launch_scripts.launcher.child_process import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _build
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
-from launch_scripts.launcher.takeover import has_ended
+from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import TABLE, ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
@@ -267,7 +268,7 @@ _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
 from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.launcher.forkserver import WarmUp
+from launch_scripts.launcher.forkserver import ROLES_ONLY, WarmUp
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
@@ -275,7 +276,7 @@ from swarm.runtime.role import RoleSetup
 asked = []
 signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
 folder = Path(sys.argv[1])
-warm_up = WarmUp(None)
+warm_up = WarmUp(ROLES_ONLY)
 warm_up.begin()
 while not warm_up.done(0.05): pass
 specs = [ProcessSpec("planner", "t0", "support.dummy_roles:quiet"), ProcessSpec("agent", "a0", sys.argv[2])]
@@ -292,10 +293,11 @@ def launcher(folder: Path, agent: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, start_new_session=True, env=environment)
 
 
-def test_kill_9_of_the_launcher_leaves_no_process_behind(tmp_path: Path) -> None:
+def test_kill_9_of_the_launcher_leaves_no_process_behind_not_even_a_stopped_one(tmp_path: Path) -> None:
     with launcher(tmp_path, "support.dummy_roles:stubborn") as process:
         wait_for_line(tmp_path / "order.txt", "+planner-t0", within_s=20)
         assert len(session_of(process.pid)) == 5  # launcher, tracker, forkserver, two roles
+        os.kill(processes(tmp_path)["planner-t0"], signal.SIGSTOP)
         process.kill()
     eventually(lambda: not session_of(process.pid), 8, "the end of all")
 

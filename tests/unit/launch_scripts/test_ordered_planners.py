@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
+from launch_scripts.check.machine_check import Machine, why_no_room
 from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
 from launch_scripts.process_table import ProcessSpec, processes_of
@@ -13,6 +16,9 @@ from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.orders import Order
 
 SCENARIO = parse_scenario('[[targets]]\nname = "t"\ncount = 2\n[standbys]\nplanner = 1')
+
+
+LARGE = Machine(64, 1 << 40, 0)
 
 
 class Swarm:
@@ -38,12 +44,16 @@ class Swarm:
 
 
 def planners(
-    swarm: Swarm, *, whole: bool = True, ranks: tuple[int, ...] = (0, 1)
+    swarm: Swarm, *, whole: bool = True, ranks: tuple[int, ...] = (0, 1), here: Machine = LARGE
 ) -> tuple[OrderedPlanners, list[str]]:
     said: list[str] = []
     stands_for: Any = swarm
     own = [running.spec for running in swarm.running]
-    return OrderedPlanners(SCENARIO, stands_for, ranks, own, whole, said.append), said
+
+    def no_room(planners: int) -> str | None:
+        return why_no_room(SCENARIO, 10_000, planners, here)
+
+    return OrderedPlanners(SCENARIO, stands_for, ranks, own, whole, said.append, no_room), said
 
 
 def book(*orders: tuple[str, int, bool]) -> OrderBook:
@@ -126,3 +136,26 @@ def test_one_that_cannot_start_is_said_once_and_ends_nothing() -> None:
 def test_the_process_of_an_added_target_is_told_of_it() -> None:
     assert with_target(SCENARIO, book(("x", 1, False)), "x").target_ids == ["t0", "t1", "x"]
     assert with_target(SCENARIO, book(("x", 1, False)), "t0") is SCENARIO
+
+
+@pytest.mark.parametrize(
+    ("here", "says"), [(Machine(2, 1 << 40, 0), "2 cores"), (Machine(64, 1 << 20, 0), "memory")]
+)
+def test_no_more_planners_start_than_the_machine_carries_and_few_at_once(here: Machine, says: str) -> None:
+    swarm = Swarm()
+    ordered, said = planners(swarm, here=here)
+    orders = book(*((f"x{n}", 1, False) for n in range(200)))
+    most_at_once = 0
+    for turn in range(150):
+        before = len(swarm.running)
+        alive = {("planner", id) for id in swarm.ids} if turn % 2 else set()
+        ordered.follow_orders(orders, alive, 0.1 * turn)
+        most_at_once = max(most_at_once, len(swarm.running) - before)
+    assert most_at_once <= 2
+    started = len(swarm.running) - len(USUAL)
+    assert (started > 20) == (here.cores == 2)
+    assert started < 130
+    (refused,) = [line for line in said if "not started" in line]
+    assert says in refused
+    ordered.follow_orders(book(*((f"x{n}", 2, True) for n in range(200))), set(), 99.0)
+    assert swarm.ids == USUAL

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_example
 
-from launch_scripts.check.plugin_check import check_plugin
-from swarm.config.load import load_scenario
+from launch_scripts.check.plugin_check import check_plugin, not_made
+from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, plugins_of
 from swarm.errors import ConfigError
+from swarm.grid import GridSpec
 
 HEAD = """
 import math, random, time, itertools, numpy as np
@@ -88,6 +90,19 @@ def test_what_is_wrong_is_found_and_said(kind: str, body: str, said: str, folder
     sentences = found(kind, body, folder)
     assert any(said in sentence for sentence in sentences), sentences
     assert not any("\n" in sentence for sentence in sentences)
+
+
+@pytest.mark.parametrize(
+    "key", ["vehicles.sensor", "vehicles.assignment", "vehicles.dynamics", "planner.strategy", "targets[0].walk"]
+)
+def test_a_check_refuses_a_function_of_another_library_as_the_run_does(key: str) -> None:
+    section, _, name = key.rpartition(".")
+    text = {"targets[0]": f'[[targets]]\n{name} = "os:system"'}.get(section, f'[{section}]\n{name} = "os:system"')
+    scenario = parse_scenario(text if "targets" in text else f"[[targets]]\n{text}")
+    (refused,) = not_made(scenario, GridSpec(4, 5, 10.0), np.full((4, 5), 0.1, np.float32))
+    assert (refused.level, refused.about) == ("failure", key)
+    assert "'os:system' could not be made: TypeError" in refused.text
+    assert list(not_made(parse_scenario("[[targets]]"), GridSpec(4, 5, 10.0), np.ones((4, 5), np.float32))) == []
 
 
 def test_a_kind_that_is_none_and_a_plugin_that_is_nowhere_are_refused() -> None:

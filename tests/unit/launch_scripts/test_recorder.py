@@ -391,6 +391,14 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     assert {alarm.about for alarm in silent.alarms if alarm.kind == "silent"} == {
         f"{role}-{id}" for role, id in recorder.observed.plan.crew if id != "t1"
     }
+    for later_s in (at_s + 15, at_s + 16):
+        for role, id in recorder.observed.plan.crew:
+            hear(recorder, stats(role, id, at_s=later_s - 10 * (id == "a0")), at_s=later_s)
+    told_at_end = facts.for_report(recorder.summary(int(later_s * NS_PER_S)))["alarms"]
+    assert {alarm["text"] for alarm in told_at_end if alarm["kind"] == "silent"} == {
+        f"{role}-{id} was silent" for role, id in recorder.observed.plan.crew if id != "a0"
+    }
+    assert "keeper-0 was silent for 15 s" in facts.verdict({"vehicles": 0, "alarms": told_at_end})
     ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
     hear(recorder, ended, at_s=at_s + 1)
     assert not [alarm for alarm in recorder.summary(int((at_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]

@@ -233,6 +233,11 @@ def test_results_are_read_again_as_they_were_without_half_a_line_and_of_two_with
     again.add(second)
     again.add(second)
     assert ResultStore(tmp_path).results == {"a": first, "b": second}
+    whole = store.path.read_bytes()
+    for at in range(whole.index(b"\n")):
+        store.path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with contextlib.suppress(StoreError):
+            assert ResultStore(tmp_path).results["a"] == first
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ import pytest
 from support import wire_lock
 from support.wire_lock import broken, lock
 
+from swarm.wire.messages import WIRE_VERSION
+
 Change = Callable[[Any], object]
 
 
@@ -20,7 +22,7 @@ def fields(now: Any, name: str = "fleet", struct: str = "Fleet") -> list[str]:
 
 
 def stepped(
-    now: Any, name: str = "fleet", *, reads: tuple[int, ...] = (8, 9), writes: int = 8, wire: int = 9
+    now: Any, name: str = "fleet", *, reads: tuple[int, ...] = (8, 9), writes: int = 8, wire: int = WIRE_VERSION + 1
 ) -> None:
     """A message takes a step, with another type of a field."""
     fields(now, name, {"fleet": "Fleet", "run": "RunInfo"}[name])[0] += ", text"
@@ -36,10 +38,10 @@ ALLOWED: dict[str, Change] = {
         now["messages"].update(new=copy.deepcopy(now["messages"]["fleet"])),
         now["keys"].update(new=copy.deepcopy(now["keys"]["fleet"])),
     ),
-    "the wire version rises": lambda now: now.update(wire_version=9),
+    "the wire version rises": lambda now: now.update(wire_version=WIRE_VERSION + 1),
     "a message takes a step": stepped,
     "a key changes with the wire version": lambda now: (
-        now.update(wire_version=9),
+        now.update(wire_version=WIRE_VERSION + 1),
         now["keys"].update(fleet="fleets/{author}"),
     ),
 }  # fmt: skip
@@ -61,9 +63,9 @@ REFUSED: dict[str, tuple[Change, str]] = {
         lambda now: now["keys"].update(fleet="fleets/{author}"), "topic fleet has changed: the wire version",
     ),
     "a message goes": (lambda now: now["messages"].pop("fleet"), "the message fleet is gone"),
-    "the wire version skips one": (lambda now: now.update(wire_version=10), "was 8 and is 10: it rises by one"),
+    "the wire version skips one": (lambda now: now.update(wire_version=WIRE_VERSION + 2), "it rises by one"),
     "a token's key changes": (lambda now: now.update(token="here/{id}"), "it never changes"),
-    "a step without the wire version": (lambda now: stepped(now, wire=8), "the wire version has to rise"),
+    "a step without the wire version": (lambda now: stepped(now, wire=WIRE_VERSION), "the wire version has"),
     "a step that is written at once": (
         lambda now: stepped(now, writes=9), "fleet is written in version 9, which the build before does not read",
     ),

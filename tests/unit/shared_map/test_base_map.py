@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.swarm_model import SwarmModel
 
+from launch_scripts.launcher import fetched_terrain
 from shared_map.keeper.base_map import (
     LAYERS,
     NEEDED,
@@ -23,6 +25,7 @@ from shared_map.keeper.base_map import (
     pack,
 )
 from shared_map.keeper.mark_store import KeeperStore
+from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Bus, Event, Replied
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
@@ -30,6 +33,7 @@ from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
 SCENARIO = Scenario(
@@ -240,3 +244,31 @@ def test_every_keeper_answers_for_its_terrain() -> None:
     swarm.run(3)
     found = [event.message for event in events if isinstance(event, Replied)]
     assert sorted(each.keeper for each in found if isinstance(each, BaseMap)) == ["k1", "k2"]
+
+
+def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = msgspec.structs.replace(SCENARIO, terrain=TerrainConfig(source="missing.tif"))
+    fetched: list[str] = []
+
+    def fetch(*_: object) -> Terrain:
+        fetched.append("again")
+        return TERRAIN
+
+    monkeypatch.setattr(fetched_terrain, "open_bus", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(fetched_terrain, "fetch_base_map", fetch)
+    info = RunInfo(
+        run_id="r", role="keeper", id="0", incarnation=1, scenario="s", terrain=TERRAIN.digest, rows=300, cols=520,
+        resolution_m=30.0, started_ns=1,
+    )  # fmt: skip
+    for changed, expected in ((False, 1), (False, 1), (True, 2)):
+        if changed:
+            whole = bytearray((tmp_path / "pace.npy").read_bytes())
+            whole[-1] ^= 1
+            (tmp_path / "pace.npy").write_bytes(whole)
+        assert fetched_terrain.fetch_if_missing(scenario, tmp_path, [info], roles=["agent"])
+        assert len(fetched) == expected
+    found = load_prepared(tmp_path)
+    assert found is not None
+    assert np.array_equal(found.pace_s_per_m, TERRAIN.pace_s_per_m)

@@ -18,7 +18,7 @@ from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, Scenario
-from swarm.errors import StoreError
+from swarm.errors import DamagedError, StoreError, SwarmError
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 LETHAL = MarkKind.LETHAL
@@ -145,7 +145,7 @@ def test_a_store_can_be_read_while_a_keeper_writes_it(tmp_path: Path) -> None:
 def test_a_file_that_is_no_store_is_refused_with_the_reason_and_set_aside_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "map.sqlite"
     path.write_bytes(b"these are not the marks you are looking for" * 100)
-    with pytest.raises(StoreError, match=r"is damaged \(file is not a database\)"):
+    with pytest.raises(DamagedError, match=r"is damaged \(file is not a database\)"):
         KeeperStore(path)
     with KeeperStore(path, rebuild=True) as store:
         assert list(store.load()) == []
@@ -161,23 +161,92 @@ def test_a_store_with_torn_pages_is_refused(tmp_path: Path) -> None:
     assert len(whole) > 5 * 4096
     whole[2 * 4096 : 4 * 4096] = b"\xff" * (2 * 4096)
     path.write_bytes(whole)
-    with pytest.raises(StoreError, match="is damaged"):
+    with pytest.raises(DamagedError, match="is damaged"):
         KeeperStore(path)
 
 
-def test_a_row_that_is_no_set_is_damage(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("UPDATE sets SET cells = x'00' WHERE tile = 3", r"row 3, 'a' of table sets: expected one with digest \w+"),
+        ("DELETE FROM sets WHERE tile = 3", "expected the rows of its seal, found more or fewer"),
+        ("DELETE FROM meta WHERE key = 'seal'", "expected the rows of its seal"),
+        ("DROP TABLE orders", "no such table: orders"),
+    ],
+)
+def test_a_row_that_another_hand_has_changed_is_damage_and_rebuilding_begins_an_empty_store(
+    tmp_path: Path, change: str, why: str
+) -> None:
     path = tmp_path / "map.sqlite"
     with KeeperStore(path) as store:
         store.save(some_sets())
     with sqlite3.connect(path) as db:
-        db.execute("UPDATE sets SET cells = x'00' WHERE tile = 3")
-    with KeeperStore(path) as store, pytest.raises(StoreError, match="damaged"):
-        list(store.load())
+        db.execute(change)
+    for _ in range(2):
+        with pytest.raises(SwarmError, match=why):
+            KeeperStore(path)
+    with KeeperStore(path, rebuild=True) as store:
+        assert list(store.load()) == []
+        store.save(some_sets())
+    with KeeperStore(path) as store:
+        assert list(store.load()) == some_sets()
+    with sqlite3.connect(tmp_path / "map.sqlite.damaged-1") as db:
+        assert db.execute("SELECT count(*) FROM sets").fetchone()[0] >= 4
+
+
+def test_a_store_without_a_witness_gets_one_when_it_is_opened(tmp_path: Path) -> None:
+    path, lock = tmp_path / "map.sqlite", tmp_path / "map.sqlite.lock"
+    with KeeperStore(path) as store:
+        store.save(some_sets(2))
+        before = path.read_bytes()
+        store.save(some_sets(3))
+    lock.unlink()
+    KeeperStore(path).close()
+    path.write_bytes(before)
+    with pytest.raises(
+        DamagedError, match=r"is an older version: expected 3 records or commits, found 1; to use it"
+    ):
+        KeeperStore(path)
+    lock.unlink()
+    KeeperStore(path).close()
+
+
+def test_damage_that_comes_up_while_a_keeper_runs_is_noticed_at_the_row(tmp_path: Path) -> None:
+    path = tmp_path / "map.sqlite"
+    with KeeperStore(path) as store:
+        store.save(some_sets())
+        with sqlite3.connect(path) as db:
+            db.execute("UPDATE sets SET seq = seq + 1 WHERE tile = 3")
+        with pytest.raises(DamagedError, match="row 3, 'a' of table sets"):
+            list(store.load())
+
+
+def test_a_store_of_the_version_before_gets_digests_once(tmp_path: Path) -> None:
+    path, copy = tmp_path / "map.sqlite", tmp_path / "copy.sqlite"
+    with KeeperStore(path) as store:
+        store.bind("t", GRID)
+        store.save(some_sets())
+    with sqlite3.connect(path) as db:
+        for table in ("meta", "sets", "folded", "orders"):
+            db.execute(f"ALTER TABLE {table} DROP COLUMN digest")
+        db.execute("DROP TABLE sightings")  # a store from before there were any
+        db.execute("DELETE FROM meta WHERE key = 'seal'")
+        db.execute("UPDATE meta SET value = '2' WHERE key = 'version'")
+    db.close()
+    copy.write_bytes(path.read_bytes())
+    with pytest.raises(DamagedError, match="it is of version 2, but was one of version 3"):
+        KeeperStore(path)
+    with KeeperStore(copy, read_only=True) as store:
+        assert list(store.load()) == some_sets()
+    for _ in range(2):
+        with KeeperStore(copy) as store:
+            assert list(store.load()) == some_sets()
+            assert (store.terrain, store.sightings()) == ("t", [])
 
 
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot open the store"):
+    with pytest.raises(StoreError, match=r"cannot open .*map\.sqlite: File exists"):
         KeeperStore(tmp_path / "file" / "map.sqlite")
 
 

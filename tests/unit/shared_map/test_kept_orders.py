@@ -37,7 +37,7 @@ class BookWorld(SwarmModel):
     def give(self, keeper: str = "k", **fields: Any) -> list[Order] | str | None:
         """The book of the keeper after that, or its refusal."""
         heard: list[Event] = []
-        self.person.ask(GIVE_ORDER, GiveOrder(**fields), heard.append, tag="o", keeper=keeper)
+        self.person.ask(GIVE_ORDER, GiveOrder(**fields, stamp_ns=self.now_ns), heard.append, tag="o", keeper=keeper)
         self.run(0.2)
         for event in heard:
             if isinstance(event, Replied):

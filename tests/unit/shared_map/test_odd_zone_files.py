@@ -14,7 +14,7 @@ from rasterio.warp import transform as to_crs
 from support import height_models
 from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
-from shared_map.importers.zones.vector_shapes import outlines_of
+from shared_map.importers.zones.outlines import outlines_of
 from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
@@ -33,8 +33,8 @@ def collection(*geometries: Any) -> str:
 
 
 REFUSED = {
-    "empty": ("", "neither GeoJSON, GeoPackage nor Shapefile"),
-    "words": ("not a map at all", "neither GeoJSON, GeoPackage nor Shapefile"),
+    "empty": ("", "neither GeoJSON, GeoPackage, Shapefile"),
+    "words": ("not a map at all", "neither GeoJSON, GeoPackage, Shapefile"),
     "other json": ('{"a": 1}', "is damaged"),
     "cut off": (collection(BOX)[:-40], "is damaged"),
     "deep": ('{"type": "FeatureCollection", "features":' + "[" * 100_000, "is damaged"),
@@ -73,19 +73,6 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_sentence(tmp_path: Path, n
         painted([zone])
 
 
-def test_files_without_shapes_change_nothing_and_say_so(tmp_path: Path) -> None:
-    path = tmp_path / "a.geojson"
-    for text, told in (
-        ('{"type": "FeatureCollection", "features": []}', "0 of 0 features; 0 cells, 0 changed"),
-        (collection(None, None), "0 of 2 features; 0 cells, 0 changed"),
-        (collection({"type": "Polygon", "coordinates": []}, None), "0 of 2 features"),
-    ):
-        path.write_text(text)
-        pace, (facts,) = painted([ZoneConfig(kind="forbidden", file=str(path))])
-        assert (pace == np.float32(0.1)).all()
-        assert told in facts.told(UTM.cells)
-
-
 def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
     turn = np.arange(5) * 4 * np.pi / 5
     star = shapely.Polygon(np.stack([20 + 12 * np.sin(turn), 20 - 12 * np.cos(turn)], axis=1))
@@ -94,12 +81,11 @@ def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
     mixed = shapely.GeometryCollection(
         [shapely.Point(3.5, 3.5), shapely.LineString([(1, 30), (9, 30.5)]), shapely.box(2, 8, 5, 11)]
     )
-    file = geojson(tmp_path / "a.geojson", [feature(star, id=7), feature(None), feature(mixed), feature(three_d)])
+    file = geojson(tmp_path / "a.geojson", [feature(star, id=7), feature(mixed), feature(three_d)])
     pace, (facts,) = painted([ZoneConfig(kind="forbidden", file=file)])
     assert np.isinf(pace[[20, 3, 30, 9, 7], [20, 3, 5, 3, 42]]).all()  # the middle of the star, too
     assert facts.file is not None
     assert facts.file.mended == ["7"]
-    assert "1 outside of the terrain, or without a shape" in facts.told(UTM.cells)
     assert facts.file.used == 3
 
 
@@ -107,13 +93,9 @@ def test_a_shape_that_crosses_itself_thousands_of_times_is_named_not_waited_for(
     rng = np.random.default_rng(3)
     scribble = shapely.Polygon(rng.uniform(5, 35, (4000, 2)))
     file = geojson(tmp_path / "a.geojson", [feature(scribble, id=99), feature(shapely.box(1, 1, 3, 3))])
-    with pytest.raises(
-        TerrainError, match="feature 99 of a forbidden zone cannot be used: it crosses itself thousands"
-    ):
-        painted([ZoneConfig(kind="forbidden", file=file)])
-    _, (facts,) = painted([ZoneConfig(kind="rough", file=file)])
-    assert facts.cells == 4
-    assert "1 it crosses itself thousands of times (feature 99)" in facts.told(UTM.cells)
+    for kind in ("forbidden", "rough"):
+        with pytest.raises(TerrainError, match="feature 99 cannot be used: it crosses itself thousands"):
+            painted([ZoneConfig(kind=kind, file=file)])
     lines = geojson(tmp_path / "b.geojson", [feature(shapely.LineString(rng.uniform(5, 35, (500, 2))))])
     assert painted([ZoneConfig(kind="road", file=lines, width_m=3.0)])[1][0].cells > 500
 
@@ -197,22 +179,24 @@ def test_areas_of_a_file_become_rings_that_a_keeper_takes(tmp_path: Path) -> Non
     star = shapely.Polygon([(5, 5), (15, 6), (14, 15), (6, 14)])
     overlapping = [shapely.box(25, 5, 35, 12), shapely.box(30, 10, 40, 20)]
     file = geojson(tmp_path / "a.geojson", [feature(each) for each in (star, *overlapping)], crs="EPSG:4326")
-    rings = outlines_of(Path(file), UTM, None, None, 256)
-    assert sorted(len(ring) for ring in rings) == [4, 8]
-    for ring, shape in zip(sorted(rings, key=len), (star, shapely.union_all(overlapping)), strict=True):
+    rings = outlines_of(ZoneConfig(kind="forbidden", file=file), UTM, 256)
+    assert sorted(len(ring) for (ring,) in rings) == [4, 8]
+    for (ring,), shape in zip(
+        sorted(rings, key=lambda area: len(area[0])), (star, shapely.union_all(overlapping)), strict=True
+    ):
         corners = tuple((10.0 * col, 10.0 * row) for row, col in ring)
         clear = shapely.distance(shape.boundary, middles()) > 0.02
         assert (polygon_mask(corners, UTM) == shapely.contains(shape, middles()))[clear].all()
     round_ = geojson(tmp_path / "b.geojson", [feature(shapely.Point(20, 20).buffer(15, 500))])
-    (ring,) = outlines_of(Path(round_), UTM, None, None, 256)
+    ((ring,),) = outlines_of(ZoneConfig(kind="forbidden", file=round_), UTM, 256)
     assert 20 < len(ring) <= 256
     hole = geojson(tmp_path / "c.geojson", [feature(shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5))])
-    with pytest.raises(TerrainError, match="an area with a hole, which an order cannot have"):
-        outlines_of(Path(hole), UTM, None, None, 256)
+    ((ring, inner),) = outlines_of(ZoneConfig(kind="forbidden", file=hole), UTM, 256)
+    assert (len(ring), np.array(inner).round(3).min(), np.array(inner).round(3).max()) == (4, 3.0, 5.0)
     line = geojson(tmp_path / "d.geojson", [feature(shapely.LineString([(1, 1), (5, 5)]))])
-    with pytest.raises(TerrainError, match="holds no area on the terrain"):
-        outlines_of(Path(line), UTM, None, None, 256)
+    with pytest.raises(TerrainError, match="a line or a point without a width"):
+        outlines_of(ZoneConfig(kind="forbidden", file=line), UTM, 256)
     comb = shapely.union_all([shapely.box(n, 1, n + 0.5, 20) for n in range(1, 40)] + [shapely.box(1, 19, 40, 21)])
     teeth = geojson(tmp_path / "e.geojson", [feature(comb)])
     with pytest.raises(TerrainError, match=r"of 1\d\d corners, at most 64 are ordered; simplify it"):
-        outlines_of(Path(teeth), UTM, None, None, 64)
+        outlines_of(ZoneConfig(kind="forbidden", file=teeth), UTM, 64)

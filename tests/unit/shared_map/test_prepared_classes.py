@@ -69,13 +69,21 @@ def test_a_folder_of_another_class_is_none(tmp_path: Path) -> None:
     assert 1 / 1.5 <= float(walker.truth.min()) < 1.0
 
 
-def test_a_damaged_folder_is_said_in_one_sentence(tmp_path: Path) -> None:
+def test_a_launcher_makes_a_damaged_folder_again_and_another_process_says_it_in_one_sentence(
+    tmp_path: Path,
+) -> None:
     scenario = parse_scenario(_TEXT.format(speed=1.5, directional="false"))
     terrain, truth = prepare(tmp_path, scenario)
     prepare_classes(tmp_path, scenario, terrain, truth)
-    (tmp_path / "classes/walker/class.json").write_text("{")
+    pace, description = (tmp_path / "classes/walker" / name for name in ("pace.npy", "class.json"))
+    whole = pace.read_bytes()
+    pace.unlink()  # it may be linked to the kept one
+    pace.write_bytes(whole[:-2] + bytes([whole[-2] ^ 1]) + whole[-1:])
+    description.write_text("{")
     with pytest.raises(TerrainError, match=r"prepared class .* is damaged .*; delete the folder"):
-        prepare_classes(tmp_path, scenario, terrain, truth)
+        load_classes(RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=tmp_path), terrain)
+    prepare_classes(tmp_path, scenario, terrain, truth)
+    assert pace.read_bytes() == whole
 
 
 def test_a_class_that_can_stand_nowhere_in_truth_is_said() -> None:

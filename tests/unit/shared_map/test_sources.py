@@ -207,7 +207,7 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: dem(f, None, *DEGREES["pole"]), "around latitude 89.98, where degrees of longitude have no width"),
     (lambda f: dem(f, None, *DEGREES["all"]), "no flat grid is true over more than 12; crop it"),
     (lambda f: dem(f, None, *DEGREES["beyond"]), "to 91; its georeference is damaged"),
-    (lambda f: dem(f, heights().astype(np.complex64)), "holds complex64 values"),
+    (lambda f: dem(f, heights().astype(np.complex64)), "holds complex numbers"),
     (lambda f: dem(f, crs=None), r"does not say in which coordinate system.*set terrain\.crs"),
     (lambda f: dem(f, crs=FEET), r"without metres or degrees.*set terrain\.crs"),
     (lambda f: dem(f, crs=None) | {"crs": "EPSG:banana"}, "'EPSG:banana' is no coordinate system"),

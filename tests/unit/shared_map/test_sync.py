@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 from support.map_strategies import Composite, set_of
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
+from shared_map.replication import replica_sync
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from swarm.bus.bus import Asked, Event, Replied
 from swarm.clock import NS_PER_S
+from swarm.wire.codec import decode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest
 from swarm.wire.topics import DIGEST, MARKS
 
@@ -49,6 +52,7 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
     swarm.run(0.15)
     assert not all_equal([author, reader])
     (rows,) = author.replica.own_digest().values()
+    swarm.buses["p"].gather()
     assert reader.sync.holds("a1.1", rows, swarm.now_ns)  # what an order needs is not fetched: it waits here
     assert all_equal([author, reader])
 
@@ -98,23 +102,79 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
     assert listener.replica.counts["sets_repeated"] == known
 
 
-def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it() -> None:
+@pytest.mark.parametrize("part_bytes", [200, replica_sync._PART_BYTES])
+def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it(
+    part_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The keeper's digest goes out whole, or in parts of three rows."""
+    monkeypatch.setattr(replica_sync, "_PART_BYTES", part_bytes)
     links = LossyLinks(3)
     swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    author, other, listener = swarm.writer("a1.1"), swarm.writer("b2.1"), swarm.listener("p")
+    write(other, swarm, [5, 2700])
     swarm.run(1)
     links.far_side = {"keeper.1"}
-    write(author, swarm, [5])
+    write(author, swarm, [5, 40, 2700])
     swarm.run(0.2)
     swarm.kill("a1.1")
     links.far_side = set()
     swarm.run(6)
+    sent = [decode(each, Digest) for _, node, to, topic, each in swarm.deliveries if (topic, to) == ("digest", "p")
+            and node == "keeper.1"]  # fmt: skip
+    assert any(digest.after is not None for digest in sent) == (part_bytes == 200)
     assert (
         keeper.replica.held.fingerprint()
         == listener.replica.held.fingerprint()
         == author.replica.held.fingerprint()
     )
+
+
+def test_a_role_in_a_digest_counts_for_nothing_and_sets_of_others_only_in_that_of_a_keeper() -> None:
+    swarm = SwarmModel()
+    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    write(author, swarm, [5])
+    swarm.run(0.2)
+    swarm.kill("a1.1")
+    swarm.run(4)
+    liar = swarm.network.bus("liar")
+    asked: list[Asked] = []
+    liar.serve(MARKS, asked.append)  # type: ignore[arg-type]
+    rows = np.array([(0, 9, 1)], DIGEST_ROW).tobytes()
+
+    def said_to(sender: str, held: dict[str, bytes]) -> tuple[int, int]:
+        """Sets that the replica puts, and sets that it asks for, once a sender has published this digest."""
+        before = len(asked)
+        marks = len([each for each in swarm.deliveries if each[3] == "marks" and each[1] == "p"])
+        liar.publish(DIGEST, Digest(author=sender, role="keeper", held=held), author=sender)
+        swarm.run(2)
+        after = len([each for each in swarm.deliveries if each[3] == "marks" and each[1] == "p"])
+        return after - marks - (len(asked) - before), len(asked) - before
+
+    swarm.network.bus("ear").subscribe(MARKS, lambda event: None)
+    assert said_to("all.q.1", {}) == (0, 0)
+    assert said_to("all.q.1", {"b2.1": rows}) == (0, 0)
+    puts, asks = said_to("keeper.k.1", {"b2.1": rows})
+    assert puts > 0
+    assert asks > 0
+    assert listener.replica.held.tiles == [0]
+
+
+def test_keepers_without_end_have_few_sets_put_again() -> None:
+    """Each digest of a keeper that holds nothing would have every replica put all that it holds of the dead."""
+    swarm = SwarmModel()
+    listener, liar = swarm.listener("p"), swarm.network.bus("liar")
+    for n in range(360):
+        said = set_of(f"x{n // 6}.1", n % 6, 1, {5: (LETHAL, 0, 1)})
+        liar.publish(MARKS, said, region=0, tile=said.tile, author=said.author)
+    swarm.run(4)
+    assert len(listener.replica.held.answer(MarksRequest())) == 360
+    put: list[Event] = []
+    swarm.network.bus("ear").subscribe(MARKS, put.append)
+    for n in range(300):
+        liar.publish(DIGEST, Digest(author=f"keeper.q{n}.1", role="keeper", held={}), author=f"keeper.q{n}.1")
+    swarm.run(3)
+    assert 0 < len(put) <= 4 * replica_sync._OFFERS_AT_ONCE
 
 
 def test_nobody_speaks_under_anothers_key() -> None:
@@ -169,15 +229,17 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
     listener = swarm.listener("p")
     kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
     for seq in (2, 1):
-        digest = Digest(author="k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
-        keeper_says.publish(DIGEST, digest, author="k.1")
+        digest = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
+        keeper_says.publish(DIGEST, digest, author="keeper.k.1")
         swarm.run(0.01)
+        swarm.buses["p"].gather()
         listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[2]}
-    uncounted = Digest(author="k.1", role="keeper", held={"a1.1": kept[3]})
-    keeper_says.publish(DIGEST, uncounted, author="k.1")
+    uncounted = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[3]})
+    keeper_says.publish(DIGEST, uncounted, author="keeper.k.1")
     swarm.run(0.01)
+    swarm.buses["p"].gather()
     listener.sync.tick(swarm.now_ns)
     [pending] = listener.sync._digests._pending.values()
     assert pending.digest.held == {"a1.1": kept[3]}

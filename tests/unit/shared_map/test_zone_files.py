@@ -316,7 +316,7 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
         "coordinates": [[[179.8, -17.2], [-179.9, -17.2], [-179.9, -17.1], [179.8, -17.1], [179.8, -17.2]]],
     }
     (tmp_path / "uncut.geojson").write_text(json.dumps(uncut))
-    with pytest.raises(TerrainError, match=r"feature 0 of a forbidden zone cannot be used: an edge .* 180 degrees"):
+    with pytest.raises(TerrainError, match=r"feature 0 cannot be used: an edge .* 180 degrees"):
         painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)
 
 

@@ -50,7 +50,7 @@ class ZoneWorld(SwarmModel):
     def order(self, **fields: Any) -> Zones | str | None:
         """The keeper's answer: zones, or its refusal."""
         heard: list[Event] = []
-        self.person.ask(ZONES, ZoneOrder(**fields), heard.append, tag="z", keeper="k")
+        self.person.ask(ZONES, ZoneOrder(**fields, stamp_ns=self.now_ns), heard.append, tag="z", keeper="k")
         self.run(0.3)
         for event in heard:
             if isinstance(event, Replied):

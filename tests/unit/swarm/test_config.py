@@ -132,6 +132,7 @@ def test_loopback_needs_no_certificates_and_elsewhere_does():
         assert parse_scenario(f"[network]\nlisten = ['{endpoint}']").network.listen == (endpoint,)
     assert parse_scenario(f"[network]\nlisten = ['tls/0.0.0.0:7447']\n{tls}").network.tls is not None
     assert "in the clear" in refusal(f"[network]\nlisten = ['tcp/0.0.0.0:7447']\n{tls}")
+    assert "quic/ is not offered, as strangers" in refusal(f"[network]\nlisten = ['quic/0.0.0.0:7447']\n{tls}")
 
 
 def test_agents_take_so_many_vehicles_each_and_one_group():

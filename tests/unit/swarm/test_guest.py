@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest import Guest, Removal
 from swarm.right_of_way.guest_session import GuestService
@@ -223,6 +223,12 @@ def test_lives_are_on_file_before_they_speak_and_one_process_has_the_file(tmp_pa
     again = LifeFile(tmp_path / "deep" / "rover")
     assert again.lives == [4, 9]
     again.close()
-    (tmp_path / "deep" / "rover").write_text("4\nnine\n")
-    with pytest.raises(StoreError, match="is damaged: expected one number a line"):
-        LifeFile(tmp_path / "deep" / "rover")
+    older = tmp_path / "older"
+    older.write_text("4\nnine\n")
+    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1'"):
+        LifeFile(older)
+    older.write_text("4\n9\n")
+    for _ in range(2):
+        again = LifeFile(older)
+        assert again.lives == [4, 9]
+        again.close()

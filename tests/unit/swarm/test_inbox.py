@@ -22,11 +22,11 @@ from swarm.bus.bus import (
     WorkDone,
 )
 from swarm.liveness import Peer
-from swarm.runtime.inbox import CAPACITY, Inbox
+from swarm.runtime.inbox import CAPACITY, PER_ASKER, Inbox
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.topics import COST, NOTE, ROUTE, RUN, TRUE_POSE, Topic
+from swarm.wire.topics import COST, NAMELESS_ROUTE, NOTE, ROUTE, RUN, TRUE_POSE, Topic
 
 
 class Time:
@@ -41,14 +41,16 @@ class Asker:
     timeout_s: float = 2.0
     topic: Topic = COST
     rejected: bool = False
+    name: str = ""
+    size: int = 0
     refusals: list[str] = field(default_factory=list)
     decoded: int = 0
     ended_s: float | None = None
 
     def __post_init__(self) -> None:
         self.asked_s = self.time.now_s
-        self.question = Asked(self.topic, {}, Nothing(), self)
-        self.undecoded = Undecoded(self.topic, self, self.decode)
+        self.question = Asked(self.topic, {"asker": self.name}, Nothing(), self)
+        self.undecoded = Undecoded(self.topic, self, self.decode, self.name, self.size)
 
     def decode(self) -> Asked | None:
         self.decoded += 1
@@ -207,7 +209,7 @@ def test_replies_tokens_links_and_results_are_never_dropped():
 
 def test_a_question_too_many_refuses_the_oldest_in_words():
     inbox, clock = Inbox(), Time()
-    askers = [Asker(clock) for _ in range(CAPACITY + 1)]
+    askers = [Asker(clock) for _ in range(PER_ASKER + 1)]
     for asker in askers:
         inbox.post(asker.question)
     assert askers[0].refusals == ["cost: too many questions wait"]
@@ -251,12 +253,12 @@ def test_a_question_that_is_rejected_when_its_turn_comes_is_no_event():
 
 def test_an_undecoded_question_that_nobody_answers_is_refused_and_never_decoded():
     inbox, clock = Inbox(), Time()
-    askers = [Asker(clock, timeout_s=1.0) for _ in range(CAPACITY + 1)]
+    askers = [Asker(clock, timeout_s=1.0) for _ in range(PER_ASKER + 1)]
     for asker in askers:
         inbox.post(asker.undecoded)
     clock.now_s = 3.0
     assert drain(inbox) == []
-    assert inbox.counts == {"events_dropped": 1, "asks_expired": CAPACITY}
+    assert inbox.counts == {"events_dropped": 1, "asks_expired": PER_ASKER}
     assert all(len(asker.refusals) == 1 and asker.decoded == 0 for asker in askers)
 
 
@@ -325,3 +327,85 @@ def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
         inbox.post(asker.question)
     clock.now_s = waited_s
     assert inbox.take(0) is askers[late].question  # of late ones the newest is taken
+
+
+# --- askers take turns --------------------------------------------------------------------------------------------
+
+
+def flooded(*askers: tuple[str, int], size: int = 450_000) -> tuple[Inbox, Time]:
+    """An inbox with expensive questions, a number of each asker."""
+    inbox, clock = Inbox(), Time()
+    for name, many in askers:
+        for _ in range(many):
+            inbox.post(Asker(clock, name=name, size=size).undecoded)
+    return inbox, clock
+
+
+def served_before(inbox: Inbox, asker: Asker) -> int:
+    """Number of questions that are taken before this one, of all that wait."""
+    inbox.post(asker.undecoded)
+    return drain(inbox).index(asker.question)
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("topic", [ROUTE, COST])
+def test_four_hundred_expensive_questions_of_ten_sessions_delay_no_agent(late: bool, topic: Topic) -> None:
+    for names in ([f"rover.q{n}" for n in range(10)], [""] * 10, [f"operator.q{n}" for n in range(10)]):
+        inbox, clock = flooded(*((name, 40) for name in names))
+        clock.now_s = 1.0 if late else 0.0
+        assert served_before(inbox, Asker(clock, name="agent.a0", topic=topic, size=200)) == 0
+
+
+def test_another_asker_waits_for_one_question_of_each_at_most() -> None:
+    inbox, clock = flooded(*((f"rover.q{n}", 40) for n in range(10)))
+    for _ in range(25):
+        inbox.take(0)
+    assert served_before(inbox, Asker(clock, name="rover.r1", topic=ROUTE, size=200)) <= 10
+
+
+def test_askers_without_a_name_share_one_turn_on_all_costly_topics() -> None:
+    inbox, clock = flooded(("", 40))
+    waiting = Asker(clock, topic=NAMELESS_ROUTE)
+    assert served_before(inbox, waiting) == 40
+    inbox, clock = flooded(("", 40))
+    assert served_before(inbox, Asker(clock, name="rover.r1")) <= 1
+
+
+def test_an_asker_pays_by_the_bytes_of_its_questions() -> None:
+    inbox, clock = Inbox(), Time()
+    for _ in range(20):
+        inbox.post(Asker(clock, name="rover.dear", size=10_000).undecoded)
+        inbox.post(Asker(clock, name="rover.cheap", size=1_000).undecoded)
+    taken = [event.asker for event in drain(inbox)[:12]]
+    assert taken.count("rover.cheap") >= 9
+
+
+def test_agents_that_flood_each_other_take_turns_too() -> None:
+    inbox, clock = flooded(("agent.a1", 400))
+    inbox.take(0)
+    assert served_before(inbox, Asker(clock, name="agent.a0", size=200)) <= 1
+
+
+def test_a_full_queue_refuses_the_askers_own_question_and_then_the_oldest_stranger() -> None:
+    inbox, clock = Inbox(), Time()
+    first = Asker(clock, name="rover.q")
+    vehicle = Asker(clock, name="agent.a0")
+    inbox.post(vehicle.undecoded)
+    inbox.post(first.undecoded)
+    for _ in range(PER_ASKER):
+        inbox.post(Asker(clock, name="rover.q").undecoded)
+    assert first.refusals == ["cost: too many questions wait of rover.q"]
+    for n in range(2 * CAPACITY):
+        inbox.post(Asker(clock, name=f"rover.x{n}").undecoded)
+    assert len(inbox) == CAPACITY
+    assert vehicle.refusals == []
+    assert inbox.take(0) is vehicle.question
+
+
+def test_names_without_end_are_forgotten() -> None:
+    inbox, clock = Inbox(), Time()
+    inbox.post(Asker(clock, name="agent.a0").undecoded)
+    for n in range(3 * CAPACITY):
+        inbox.post(Asker(clock, name=f"agent.x{n}").undecoded)
+        inbox.take(0)
+    assert len(inbox._asked._flows) <= 2 * CAPACITY

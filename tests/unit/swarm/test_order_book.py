@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
-from swarm.runtime.order_book import MAX_AHEAD_NS, MOST_ORDERS, SETTINGS, OrderBook, described, judged
+from swarm.runtime.order_book import (
+    FRESH_NS,
+    MAX_AHEAD_NS,
+    MOST_ORDERS,
+    SETTINGS,
+    FreshOrders,
+    OrderBook,
+    described,
+    judged,
+)
 from swarm.wire.messages.orders import GiveOrder, Order
 
 SCENARIO = parse_scenario("""
@@ -202,3 +211,21 @@ def test_a_book_is_bounded_and_no_stamp_is_beyond_reach() -> None:
 @given(orders)
 def test_every_order_has_words(order: Order) -> None:
     assert described(order).startswith(order.subject)
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 2 * FRESH_NS)), max_size=20), st.integers(0, FRESH_NS))
+def test_a_copy_of_an_order_counts_never_again_whenever_it_comes(
+    given: list[tuple[int, int]], since_ns: int
+) -> None:
+    """Also at a keeper that has started again since, and has forgotten which orders counted."""
+    stamps_ns = [since_ns + n * FRESH_NS // 2 for n in range(5)]
+    fresh, counted, now_ns = FreshOrders(since_ns), [], since_ns
+    for which, later_ns in given:
+        now_ns += later_ns
+        fault = fresh.fault(stamps_ns[which], now_ns)
+        counted += [which] if fault is None else []
+        if fault is not None and abs(stamps_ns[which] - now_ns) < FRESH_NS:
+            assert which in counted, fault
+        if counted and stamps_ns[counted[-1]] < now_ns:
+            assert FreshOrders(now_ns).fault(stamps_ns[counted[-1]], now_ns) is not None
+    assert len(counted) == len(set(counted))

@@ -7,6 +7,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.clock import NS_PER_S
@@ -15,7 +17,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Body
-from vehicle_agent.bodies import MOST_BODIES, Bodies
+from vehicle_agent.bodies import MOST_BODIES, MOST_CELLS, Bodies
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
@@ -108,6 +110,37 @@ def test_too_many_bodies_and_too_many_cells_are_refused_and_those_before_stay(bo
     assert not fine.any
     fine.take_report(body(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
     assert fine.any, "what was given back can be used again"
+
+
+LIES = st.tuples(
+    st.integers(1, 40),
+    st.floats(0, 3990),
+    st.floats(-3990, 0),
+    st.floats(0, 100),
+    st.floats(0, 340),
+    st.floats(0.1, 10),
+)
+
+
+@given(st.lists(LIES, max_size=60))
+@settings(max_examples=25)
+def test_whoever_has_one_id_closes_a_part_of_the_map_for_a_while_and_crowds_nobody_out(
+    lies: list[tuple[int, float, float, float, float, float]],
+) -> None:
+    bodies, now_ns = Bodies(GridSpec(400, 400, 10.0)), NOW
+    everywhere = [(99 + n, n % 20 * 200.0, n // 20 * -200.0, 50.0, 0.0, 10.0) for n in range(400)]
+    for seq, (incarnation, x_m, y_m, radius_m, speed, lease_s) in enumerate(everywhere + lies):
+        now_ns += TICK // 8
+        bodies.tick(now_ns)
+        said = {"x_m": x_m, "y_m": y_m, "radius_m": radius_m, "speed_m_per_s": speed, "lease_s": lease_s}
+        bodies.take_report(body(0, 0, id="thief", incarnation=incarnation, seq=seq, **said), now_ns)
+    assert sum(cell in bodies.closed for cell in range(160_000)) <= MOST_CELLS // 2
+    bodies.take_report(body(7.5, 7.5, id="honest"), now_ns)
+    assert 7 * 400 + 7 in bodies.closed
+    for _ in range(120):
+        now_ns += TICK
+        bodies.tick(now_ns)
+    assert not bodies.any
 
 
 def test_a_stopped_process_forgets_no_body_in_the_time_in_which_it_did_not_listen(bodies: Bodies) -> None:

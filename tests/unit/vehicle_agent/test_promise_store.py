@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
+from random import Random
 
 import pytest
+from msgspec.msgpack import encode
+from support.effort import few
 
-from swarm.errors import StoreError
+from swarm.errors import DamagedError, StoreError
 from swarm.wire.messages.traffic import Grant, Table
 from vehicle_agent import promise_store
 from vehicle_agent.promise_store import FilePromiseStore
@@ -35,20 +41,20 @@ def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     again.close()
 
 
-@pytest.mark.parametrize("written", [0, 1, 20, None], ids=["nothing", "a byte", "a part", "all but its length"])
-def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int | None) -> None:
-    """Its length is written last; the remains do not spoil the next one."""
+@pytest.mark.parametrize("written", [0, 1, 20, -1], ids=["nothing", "a byte", "a part", "all but a byte"])
+def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int) -> None:
+    """No one was told of it; the remains do not spoil the next one."""
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)
     store.save(3, table(0, 1))
-    end = store._at
+    store.sync()
+    before = path.read_bytes()
     store.save(3, table(0, 2))
     store.close()
-    data = bytearray(path.read_bytes())
-    data[end : end + 4] = bytes(4)
-    if written is not None:
-        data[end + 4 + written :] = bytes(len(data) - end - 4 - written)
-    path.write_bytes(data)
+    after = path.read_bytes()
+    first, last = (pick(n for n in range(len(before)) if before[n] != after[n]) for pick in (min, max))
+    cut = first + written if written >= 0 else last + written + 1
+    path.write_bytes(after[:cut] + before[cut:])
     again = FilePromiseStore(path)
     assert again.saved == {0: (3, table(0, 1))}
     again.save(4, Table(plot=1, agent="a0", epoch=4, seq=1, hosts={}, grants={}))  # a shorter one
@@ -56,6 +62,52 @@ def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int
     third = FilePromiseStore(path)
     assert {plot: promised for plot, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
     third.close()
+
+
+def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    syncs: list[int] = []
+    store = FilePromiseStore(tmp_path / "promises-a0")
+    monkeypatch.setattr(os, "fdatasync", syncs.append)
+    for seq in range(20):
+        store.save(3, table(seq % 4, seq))
+    store.sync()
+    store.sync()
+    assert len(syncs) == 1
+    store.close()
+
+
+_PROMISES = """
+import itertools, sys
+from pathlib import Path
+from swarm.wire.messages.traffic import Grant, Table
+from vehicle_agent.promise_store import FilePromiseStore
+store = FilePromiseStore(Path(sys.argv[1]))
+start = max((promised for promised, _ in store.saved.values()), default=0)
+for promised in itertools.count(start + 1):
+    for plot in range(3):
+        grants = {f"a0-{n}": Grant([n], (promised, n)) for n in range(40)}
+        store.save(promised, Table(plot=plot, agent="a0", epoch=promised, seq=1, hosts={}, grants=grants))
+    store.sync()
+    print(promised, flush=True)
+"""
+
+
+def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path) -> None:
+    chance, acknowledged = Random(3), 0
+    for _ in range(few(25)):
+        command = [sys.executable, "-c", _PROMISES, str(tmp_path / "promises-a0")]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as agent:
+            assert agent.stdout is not None
+            for _ in range(chance.randrange(1, 60)):
+                acknowledged = int(agent.stdout.readline())
+            time.sleep(chance.uniform(0, 0.003))
+            agent.kill()
+            acknowledged = max([acknowledged, *map(int, agent.stdout.read().split())])
+        store = FilePromiseStore(tmp_path / "promises-a0")
+        assert min(promised for promised, _ in store.saved.values()) >= acknowledged
+        store.close()
 
 
 def test_one_that_waits_goes_on_with_what_the_life_before_has_left(tmp_path: Path) -> None:
@@ -82,8 +134,25 @@ def test_a_second_process_on_the_same_file_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None:
     path = tmp_path / "promises-a0"
-    path.write_bytes((5).to_bytes(4, "little") + b"hello")
-    with pytest.raises(StoreError, match="damaged at byte 0"):
+    for content in (b"", bytes(4096), (5).to_bytes(4, "little") + b"hello"):
+        path.write_bytes(content)
+        with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'promises 1', found"):
+            FilePromiseStore(path)
+
+
+def test_a_file_from_before_journals_is_read_once(tmp_path: Path) -> None:
+    path = tmp_path / "promises-a0"
+    own = OwnRecord(disk=7, lives=[5])
+    bodies = [encode([own]), encode([None, 3, table(0, 1)]), encode([None, 4, table(0, 2)])]
+    older = b"".join(len(body).to_bytes(4, "little") + body for body in bodies) + bytes(1000)
+    path.write_bytes(older)
+    for _ in range(2):
+        store = FilePromiseStore(path)
+        assert (store.own, store.saved) == (own, {0: (4, table(0, 2))})
+        store.close()
+        assert path.read_bytes()[:5] == b"swarm"
+    path.write_bytes(older)
+    with pytest.raises(DamagedError, match="is another file than the one that was written last"):
         FilePromiseStore(path)
 
 

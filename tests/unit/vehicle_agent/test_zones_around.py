@@ -28,7 +28,11 @@ class ClosedWorld(AgentWorld):
         corners: Any = [(row0, col0), (row0, col1), (row1, col1), (row1, col0)]
         heard: list[Event] = []
         self._watch.ask(
-            ZONES, ZoneOrder(action="add", name="z", polygon=corners), heard.append, tag="z", keeper="k"
+            ZONES,
+            ZoneOrder(action="add", name="z", polygon=corners, stamp_ns=self.now_ns),
+            heard.append,
+            tag="z",
+            keeper="k",
         )
         self.run(0.5)
         assert any(isinstance(event, Replied) and isinstance(event.message, Zones) for event in heard)

@@ -1,0 +1,286 @@
+"""Texts that hold shapes: their formats by their first bytes, and a check of all their numbers.
+
+GDAL reads the shapes. It replaces or leaves out coordinates that it cannot read, without an error. Each text is
+therefore checked before: a GeoJSON against the types below, an XML in its coordinates and references.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from typing import Annotated, Any, Literal, NamedTuple
+from xml.etree import ElementTree
+
+import msgspec
+from msgspec import Meta, Struct
+
+from swarm.errors import TerrainError
+
+
+class Kind(NamedTuple):
+    """A format: GDAL's driver, and how its text is checked; None of a binary format."""
+
+    driver: str
+    text: Literal["json", "xml", "fence"] | None = None
+
+
+_MAGIC = {
+    b"SQLite format 3\0": Kind("GPKG"),
+    b"\0\0\x27\x0a": Kind("ESRI Shapefile"),
+    b"fgb\x03fgb": Kind("FlatGeobuf"),
+    b"{": Kind("GeoJSON", "json"),
+    b"QGC WPL": Kind("GeoJSON", "fence"),
+}
+"""First bytes -> format. GDAL knows 80 formats, some of which name other files."""
+_ROOTS = {b"kml": "LIBKML", b"gpx": "GPX", b"osm": "OSM"}
+_ROOT = re.compile(rb"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*|<!DOCTYPE[^>\[]*>\s*)*<(?:\w+:)?(\w+)[\s/>]", re.DOTALL)
+_CONVERTED = {
+    b"PAR1": "GeoParquet",
+    b"\0\0\0\x0d\x0a\x09OSMHeader": "OSM PBF",
+    b"\0\0\0\x0e\x0a\x09OSMHeader": "OSM PBF",
+}
+"""First bytes of formats that are not read here."""
+_CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
+
+
+def kind_of(head: bytes, what: str) -> Kind | None:
+    """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
+    for magic, name in _CONVERTED.items():
+        if head.startswith(magic) and what:
+            raise TerrainError(f"{what} is {name}, which {_CONVERT}")
+    head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
+    root = _ROOT.match(head) if found is None else None
+    return Kind(_ROOTS[root[1]], "xml") if root is not None and root[1] in _ROOTS else found
+
+
+# --- GeoJSON ------------------------------------------------------------------------------------------------
+
+Position = Annotated[list[float], Meta(min_length=2)]
+_Ring = Annotated[list[Position], Meta(min_length=3)]
+_Line = Annotated[list[Position], Meta(min_length=2)]
+_Area = Annotated[list[_Ring], Meta(min_length=1)]
+
+
+class Point(Struct, tag_field="type", frozen=True):
+    coordinates: Position
+
+
+class MultiPoint(Struct, tag_field="type", frozen=True):
+    coordinates: Annotated[list[Position], Meta(min_length=1)]
+
+
+class LineString(Struct, tag_field="type", frozen=True):
+    coordinates: _Line
+
+
+class MultiLineString(Struct, tag_field="type", frozen=True):
+    coordinates: Annotated[list[_Line], Meta(min_length=1)]
+
+
+class Polygon(Struct, tag_field="type", frozen=True):
+    coordinates: _Area
+
+
+class MultiPolygon(Struct, tag_field="type", frozen=True):
+    coordinates: Annotated[list[_Area], Meta(min_length=1)]
+
+
+class GeometryCollection(Struct, tag_field="type", frozen=True):
+    geometries: Annotated[list[Geometry], Meta(min_length=1)]
+
+
+Geometry = Point | MultiPoint | LineString | MultiLineString | Polygon | MultiPolygon | GeometryCollection
+
+
+class Feature(Struct, tag_field="type", frozen=True):
+    geometry: Geometry
+
+
+class _Document(Struct, frozen=True):
+    """The outermost object, of which only features are looked at further."""
+
+    type: str = ""
+    features: list[msgspec.Raw] | None = None
+    fileType: str = ""  # noqa: N815
+    geometryType: str = ""  # noqa: N815
+
+
+_document = msgspec.json.Decoder(_Document)
+_feature = msgspec.json.Decoder(Feature | Geometry)
+
+
+INCLUSION = "inclusion"
+"""Column of a fence: yes if all but the area is closed."""
+
+
+def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
+    """Checks every coordinate of a GeoJSON; returns the GeoJSON of a fence, None if it is one itself.
+
+    Raises TerrainError with one sentence, which names the first feature that cannot be read.
+    """
+    number = 0
+    try:
+        if kind.text == "fence":
+            return fence_of_waypoints(data.decode("ascii"))
+        document = _document.decode(data.removeprefix(b"\xef\xbb\xbf"))
+        if document.fileType:
+            return fence_of_plan(data)
+        foreign = "TopoJSON" if document.type == "Topology" else "ArcGIS JSON" if document.geometryType else ""
+        if foreign:
+            raise TerrainError(f"{what} is {foreign}, which {_CONVERT}")
+        if document.type == "FeatureCollection" and document.features is None:
+            raise TerrainError(f"{what} is damaged: a FeatureCollection without features")
+        for number, each in enumerate(document.features if document.features is not None else [data], 1):  # noqa: B007
+            _feature.decode(each)
+    except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
+        at = f"feature number {number} cannot be used: " if number else ""
+        raise TerrainError(f"{what} is damaged: {at}{error}; repair or remove it") from error
+    return None
+
+
+# --- XML ----------------------------------------------------------------------------------------------------
+
+
+def checked_xml(data: bytes, what: str) -> None:
+    """Checks every coordinate of a KML, a GPX or an OSM XML, and that no shape refers to what is not in the file.
+
+    Raises TerrainError with one sentence.
+    """
+    if b"<OGR" in data or b"<VRT" in data:
+        raise TerrainError(f"{what} names other files, which are not read")
+    known: set[tuple[str, str | None]] = set()
+    needed: dict[tuple[str, str | None], str] = {}
+    try:
+        for _, element in ElementTree.iterparse(io.BytesIO(data)):
+            name = element.tag.rpartition("}")[2]
+            places: list[list[str]] = []
+            if name == "coordinates":
+                text = re.sub(r"\s*,\s*", ",", (element.text or "").strip())
+                places = [place.split(",") for place in text.split()] or [[]]
+            elif name == "coord":
+                places = [(element.text or "").split()]
+            elif name in ("wpt", "rtept", "trkpt", "node"):
+                places = [[element.get("lon", ""), element.get("lat", "")]]
+            for place in places:
+                if len(place) not in (2, 3) or not all(_is_number(each) for each in place):
+                    raise TerrainError(
+                        f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers; repair it"
+                    )
+            if name == "NetworkLink":
+                raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
+            if name in ("node", "way"):
+                known.add((name, element.get("id")))
+            for inner in element if name in ("way", "relation") else ():
+                kind = {"nd": "node", "member": inner.get("type")}.get(inner.tag)
+                if kind in ("node", "way") and (name == "way" or _is_area(element)):
+                    needed[kind, inner.get("ref")] = f"{name} {element.get('id')}"
+            if name not in ("nd", "member", "tag"):
+                element.clear()
+    except ElementTree.ParseError as error:
+        raise TerrainError(f"{what} is damaged: {error}") from error
+    for absent in needed.keys() - known:
+        user = needed[absent]
+        raise TerrainError(
+            f"{what} is not complete: {user} needs {absent[0]} {absent[1]}; load it with all it needs"
+        )
+
+
+def _is_area(relation: ElementTree.Element) -> bool:
+    return any(tag.get("k") == "type" and tag.get("v") in ("multipolygon", "boundary") for tag in relation)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+# --- fences of ground stations ------------------------------------------------------------------------------
+
+
+class _PlanPolygon(Struct, frozen=True):
+    polygon: _Ring
+    inclusion: bool
+
+
+class _Centre(Struct, frozen=True):
+    center: Position
+    radius: Annotated[float, Meta(gt=0)]
+
+
+class _PlanCircle(Struct, frozen=True):
+    circle: _Centre
+    inclusion: bool
+
+
+class _Fence(Struct, frozen=True):
+    polygons: list[_PlanPolygon]
+    circles: list[_PlanCircle]
+
+
+class _Plan(Struct, frozen=True):
+    geoFence: _Fence  # noqa: N815
+
+
+def fence_of_plan(data: bytes) -> bytes:
+    """The fence of a QGroundControl .plan as GeoJSON."""
+    fence = msgspec.json.decode(data, type=_Plan).geoFence
+    return _collection(
+        [_area(each.polygon, each.inclusion) for each in fence.polygons]
+        + [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
+    )
+
+
+def fence_of_waypoints(text: str) -> bytes:
+    """The fence of a Mission Planner .waypoints as GeoJSON; of a mission, the line of its places.
+
+    Raises ValueError if a row is damaged.
+    """
+    rows = [[float(word) for word in line.split()] for line in text.splitlines()[1:] if line.strip()]
+    if not all(len(row) == 12 and math.isfinite(sum(row)) for row in rows):
+        raise ValueError("a row does not have 12 numbers")
+    found: list[dict[str, Any]] = []
+    path: list[list[float]] = []
+    while rows:
+        command, extent, place = int(rows[0][3]), rows[0][4], rows[0][8:10]
+        if command in (_POLYGON_IN, _POLYGON_OUT):
+            count = int(extent)
+            ring = rows[:count]
+            if count < 3 or [row[3:5] for row in ring] != [rows[0][3:5]] * count:
+                raise ValueError(f"a fence polygon of {count} corners has not as many")
+            found.append(_area([row[8:10] for row in ring], command == _POLYGON_IN))
+            del rows[: count - 1]
+        elif command in (_CIRCLE_IN, _CIRCLE_OUT):
+            if not extent > 0:
+                raise ValueError(f"a fence circle has the radius {extent:g}")
+            found.append(_disc(place, extent, command == _CIRCLE_IN))
+        elif command < _RETURN and any(place) and rows[0][0] > 0:  # row 0 is where it starts from
+            path.append(place[::-1])
+        del rows[0]
+    if len(path) > 1:
+        found.append({"type": "Feature", "properties": {}, "geometry": LineString(path)})
+    return _collection(found)
+
+
+_RETURN, _POLYGON_IN, _POLYGON_OUT, _CIRCLE_IN, _CIRCLE_OUT = 5000, 5001, 5002, 5003, 5004
+"""MAVLink's commands of fences; those of routes are below."""
+
+
+def _area(ring: list[list[float]], inside: bool) -> dict[str, Any]:
+    corners = [[lon, lat] for lat, lon, *_ in ring]
+    return _fence(Polygon([[*corners, corners[0]]]), inside)
+
+
+def _disc(centre: list[float], radius_m: float, inside: bool) -> dict[str, Any]:
+    return _fence(Point([centre[1], centre[0]]), inside, radius=radius_m)
+
+
+def _fence(shape: Geometry, inside: bool, **extent: float) -> dict[str, Any]:
+    return {"type": "Feature", "properties": {INCLUSION: "yes" if inside else "no", **extent}, "geometry": shape}
+
+
+def _collection(features: list[dict[str, Any]]) -> bytes:
+    return msgspec.json.encode({"type": "FeatureCollection", "features": features})

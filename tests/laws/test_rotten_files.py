@@ -1,0 +1,217 @@
+"""Files of stores that a disk has changed: each is read as it was written, or refused in a sentence.
+
+By hand, with more files: `PYTHONPATH=.:tests python tests/laws/test_rotten_files.py 2000`"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+import pytest
+from support.effort import few
+from support.map_strategies import set_of
+
+from shared_map.keeper.mark_store import KeeperStore
+from swarm.errors import SwarmError
+from swarm.grid import GridSpec
+from swarm.right_of_way.incarnations import LifeFile
+from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.orders import Order
+from swarm.wire.messages.traffic import Grant, Table
+from vehicle_agent.promise_store import FilePromiseStore
+
+COMMITS = 12
+Files = dict[str, bytes]
+"""Name -> content, of a store and what lies beside it."""
+Parts = tuple[object, ...]
+"""The content of a store, in parts each of which one record or commit brings."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A store.
+
+    commit  opens it and saves the content of one number; leaves it as a kill would
+    read    its content
+    beside  endings of the files that belong to it
+    """
+
+    commit: Callable[[Path, int], object]
+    read: Callable[[Path], Parts]
+    beside: tuple[str, ...] = (".lock",)
+
+
+def commit_marks(path: Path, number: int) -> None:
+    with KeeperStore(path) as store:
+        save_marks(store, number)
+
+
+def commit_marks_to_the_log(path: Path, number: int) -> object:
+    store = KeeperStore(path)
+    save_marks(store, number)
+    store._unlock()  # as a kill does: the log is not put into the file
+    return store
+
+
+def save_marks(store: KeeperStore, number: int) -> None:
+    store.bind("0123456789abcdef", GridSpec(320, 320, 30.0))
+    marks: dict[int, tuple[int, float, int]] = {
+        cell: (MarkKind.PACE, 0.5, 100 + cell + number) for cell in range(40)
+    }
+    store.save([set_of(f"a{author}.1", tile, number + 1, marks) for author in range(3) for tile in range(8)])
+    store.save_orders([Order(subject="vehicle", name=f"a1-0{number % 5}", stamp_ns=number + 1)])
+
+
+def read_marks(path: Path) -> Parts:
+    with KeeperStore(path) as store:
+        return list(store.load()), store.orders(), store.terrain, store.grid, store.tiles_set_aside()
+
+
+def commit_promises(path: Path, number: int) -> None:
+    store = FilePromiseStore(path)
+    grants = {f"a1-{k:02d}": Grant([1000 * number + k], (number, k)) for k in range(8)}
+    for seq in range(3):
+        store.save(number, Table(plot=seq, agent="a1", epoch=number, seq=seq, hosts={"a1": (7, 1)}, grants=grants))
+    store.sync()
+    store.close()
+
+
+def read_promises(path: Path) -> Parts:
+    store = FilePromiseStore(path)
+    store.close()
+    return (store.own, *map(store.saved.get, range(3)))
+
+
+def commit_lives(path: Path, number: int) -> None:
+    lives = LifeFile(path)
+    lives.save([*lives.lives, number + 1])
+    lives.close()
+
+
+def read_lives(path: Path) -> Parts:
+    lives = LifeFile(path)
+    lives.close()
+    return (lives.lives,)
+
+
+KINDS = {
+    "marks": Kind(commit_marks, read_marks),
+    "marks with their log": Kind(commit_marks_to_the_log, read_marks, (".lock", "-wal")),
+    "promises": Kind(commit_promises, read_promises),
+    "lives": Kind(commit_lives, read_lives),
+}
+
+
+def versions_of(kind: Kind, folder: Path) -> list[tuple[Files, Parts]]:
+    """The files after each commit, and their content."""
+    path = folder / "made" / "store"
+    path.parent.mkdir(parents=True)
+    found = []
+    for number in range(COMMITS):
+        held = kind.commit(path, number)
+        files = {f"store{end}": path.with_name(f"store{end}").read_bytes() for end in ("", *kind.beside)}
+        if isinstance(held, KeeperStore):
+            held.close()
+        found.append((files, opened(kind, folder, files)))
+    return found
+
+
+def opened(kind: Kind, folder: Path, files: Files) -> Parts:
+    spot = folder / "tried"
+    shutil.rmtree(spot, ignore_errors=True)
+    spot.mkdir()
+    for name, content in files.items():
+        (spot / name).write_bytes(content)
+    return kind.read(spot / "store")
+
+
+def rotten(chance: Random, content: bytes, what: str) -> bytes:
+    """The content of a file after one fault."""
+    used = len(content.rstrip(b"\0")) + 4
+    bad = bytearray(content)
+    size = chance.choice((512, 4096))
+    at = min(chance.randrange(used), len(content) - 1)
+    other = chance.randrange(used)
+    if chance.random() < 0.5:  # most disks rot in whole sectors
+        at, other = at // size * size, other // size * size
+    match what:
+        case "flip":
+            bad[at] ^= 1 << chance.randrange(8)
+        case "zeros":
+            bad[at : at + size] = bytes(len(bad[at : at + size]))
+        case "cut":
+            del bad[at:]
+        case "swapped":
+            here, there = content[at : at + size], content[other : other + size]
+            if len(here) == len(there) and abs(at - other) >= size:
+                bad[at : at + size], bad[other : other + size] = there, here
+        case "repeated":
+            bad[at : at + size] = content[other : other + size][: len(bad) - at]
+    return bytes(bad)
+
+
+def tally(kind: Kind, folder: Path, count: int) -> Counter[str]:
+    """Fault and outcome -> number of files."""
+    versions = versions_of(kind, folder)
+    chance = Random(9)
+    found: Counter[str] = Counter()
+    for _ in range(count):
+        at = chance.randrange(COMMITS // 2, COMMITS)
+        files, truth = versions[at]
+        what = chance.choice(("flip", "flip", "zeros", "cut", "swapped", "repeated", "older", "alone"))
+        if what == "older":
+            bad = {**versions[chance.randrange(at)][0], "store.lock": files["store.lock"]}
+        else:
+            name = chance.choice([each for each in files if what != "alone" or each == "store"])
+            fault = chance.choice(("flip", "zeros", "cut")) if what == "alone" else what
+            bad = {**files, name: rotten(chance, files[name], fault)}
+            if what == "alone":
+                bad = {"store": bad["store"]} if "store-wal" not in bad else bad
+        try:
+            outcome = "as it was" if opened(kind, folder, bad) == truth else "UNNOTICED"
+        except SwarmError as error:
+            outcome = "refused" if "store" in str(error) else f"WITHOUT THE FILE: {error}"
+        found[f"{what}: {outcome}"] += 1
+    return found
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_change_of_a_file_goes_unnoticed(tmp_path: Path, name: str) -> None:
+    found = tally(KINDS[name], tmp_path, few(1000))
+    assert not [each for each in found if not each.endswith((": refused", ": as it was"))], found
+    assert {"flip: refused", "zeros: refused", "cut: refused", "older: refused"} <= found.keys()
+    assert "older: as it was" not in found
+
+
+@pytest.mark.parametrize("name", ["marks with their log", "promises"])
+def test_a_commit_that_a_kill_cut_short_is_there_record_by_record_or_not(tmp_path: Path, name: str) -> None:
+    """The file is cut anywhere in what the last commit wrote, and nothing says yet that there is more."""
+    kind, chance = KINDS[name], Random(5)
+    versions = versions_of(kind, tmp_path)
+    written = "store-wal" if "store-wal" in versions[0][0] else "store"
+    for _ in range(few(100)):
+        at = chance.randrange(1, COMMITS)
+        (before, old), (after, new) = versions[at - 1 : at + 1]
+        whole = after[written]
+        if written == "store":
+            seal = before["store"][:200]  # written last
+            whole = seal + whole[200:]
+            start = len(before["store"].rstrip(b"\0"))
+            cut = chance.randrange(start, len(whole.rstrip(b"\0")) + 1)
+            torn = whole[:cut] + bytes(len(whole) - cut)
+        else:
+            torn = whole[: chance.randrange(len(whole))]
+        found = opened(kind, tmp_path, {**after, written: torn, "store.lock": before["store.lock"]})
+        assert all(part in each for part, *each in zip(found, old, new, strict=True))
+
+
+if __name__ == "__main__":
+    for label, each in KINDS.items():
+        with tempfile.TemporaryDirectory() as place:
+            sys.stdout.write(f"{label}: {dict(sorted(tally(each, Path(place), int(sys.argv[1])).items()))}\n")

@@ -1,0 +1,44 @@
+"""Processes that are stopped anywhere within a call: no vehicles meet, and no report says that they did."""
+
+from __future__ import annotations
+
+import pytest
+
+from launch_scripts.simulation.faults import FaultPlan
+from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import crowd
+from swarm.bus.memory_bus import MemoryBus
+
+SECONDS = 12.0
+DELAYS_MS = (0.2, 5.0, 20.0, 100.0)
+
+
+def met(seed: int, delay_ms: float) -> tuple[int, int]:
+    """Collisions in truth and by the referee's judgement, in a crowd whose processes are stopped."""
+    scenario, terrain = crowd("open", seed, vehicles=24, per_agent=6, side=12)
+    simulation = Simulation(scenario, faults=FaultPlan(delay_ms=delay_ms, stutter=0.02), terrain=terrain)
+    book = LawBook(simulation)
+    simulation.run_until(SECONDS)
+    report = simulation.report(SECONDS)
+    assert report["captures"] > 0 or delay_ms > 20.0
+    return len(book.collisions) + len(book.lethal), report["collisions"]
+
+
+@pytest.mark.seeds(8)
+def test_no_vehicles_meet_and_none_are_said_to_wherever_processes_are_stopped(seed):
+    assert met(seed + 1, DELAYS_MS[seed % len(DELAYS_MS)]) == (0, 0)
+
+
+def test_a_tick_that_receives_what_is_newer_than_its_time_is_said_to_collide(monkeypatch):
+    """The order that was wrong: a clock that is read before the inbox."""
+    collected = MemoryBus.collected
+
+    def late(bus, topic):
+        bus.gather()
+        return collected(bus, topic)
+
+    monkeypatch.setattr(MemoryBus, "collected", late)
+    in_truth, said = met(13, 0.2)
+    assert in_truth == 0
+    assert said > 0

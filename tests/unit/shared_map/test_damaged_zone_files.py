@@ -1,0 +1,330 @@
+"""Files of zones with any damage: all features close their ground, or the file is refused by name."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effort import few
+from support.zone_shapes import UTM, feature, geojson, in_crs, middles, painted, squares, written
+
+from shared_map.importers.zones.outlines import outlines_of
+from shared_map.terrain.layers import polygon_mask
+from swarm.config.ground import ZoneConfig
+from swarm.errors import TerrainError
+
+Damage = Callable[[dict[str, Any], random.Random], None]
+
+
+def spot(at: Any, chance: random.Random) -> list[Any]:
+    """A list of coordinates somewhere in a geometry."""
+    while not isinstance(at[0][0], float):
+        at = chance.choice(at)
+    return at  # type: ignore[no-any-return]
+
+
+def opened(f: dict[str, Any], chance: random.Random) -> None:
+    ring = spot(f["geometry"]["coordinates"], chance)
+    if ring[0] != ring[-1]:
+        raise IndexError("a line has no ring to open")
+    ring.pop()
+
+
+def coordinate(value: Any) -> Damage:
+    def damage(f: dict[str, Any], chance: random.Random) -> None:
+        line = spot(f["geometry"]["coordinates"], chance)
+        line[chance.randrange(len(line))] = value
+
+    return damage
+
+
+def geometry(make: Callable[[dict[str, Any]], Any]) -> Damage:
+    def damage(f: dict[str, Any], chance: random.Random) -> None:
+        f["geometry"] = make(f["geometry"])
+
+    return damage
+
+
+def collection(*more: Any) -> Damage:
+    return geometry(lambda g: {"type": "GeometryCollection", "geometries": [*more, g]})
+
+
+def reverse(f: dict[str, Any], chance: random.Random) -> None:
+    f["geometry"] = shapely.geometry.mapping(
+        shapely.transform(shapely.geometry.shape(f["geometry"]), lambda p: p[:, ::-1])
+    )
+
+
+DAMAGES: dict[str, Damage] = {
+    "open ring": opened,
+    "text": lambda f, chance: spot(f["geometry"]["coordinates"], chance).__setitem__(0, ["9.0", "46.9"]),
+    "null number": coordinate([None, 46.94]),
+    "null place": coordinate(None),
+    "one number": coordinate([9.0]),
+    "no number": coordinate([float("nan"), 46.94]),
+    "infinite": coordinate([float("inf"), 46.94]),
+    "truth": coordinate([True, 46.94]),
+    "object": coordinate({"lon": 9.0, "lat": 46.9}),
+    "far": coordinate([9.0, 4e6]),
+    "null shape": geometry(lambda g: None),
+    "no shape": lambda f, chance: f.pop("geometry"),
+    "no coordinates": lambda f, chance: f["geometry"].pop("coordinates"),
+    "empty": lambda f, chance: f["geometry"].update(coordinates=[]),
+    "empty part": lambda f, chance: f["geometry"]["coordinates"].append([]),
+    "too deep": lambda f, chance: f["geometry"].update(coordinates=[f["geometry"]["coordinates"]]),
+    "too flat": lambda f, chance: f["geometry"].update(coordinates=f["geometry"]["coordinates"][0]),
+    "small letters": lambda f, chance: f["geometry"].update(type=f["geometry"]["type"].lower()),
+    "unknown type": lambda f, chance: f["geometry"].update(type="Circle"),
+    "list in a list": lambda f, chance: f.update(type="FeatureCollection", features=[dict(f)]),
+    "collection": collection(),
+    "nested": collection({"type": "GeometryCollection", "geometries": [{"type": "Point", "coordinates": [9, 46]}]}),
+    "collection of null": collection(None),
+    "collection of circles": collection({"type": "Circle", "coordinates": [9.0, 46.9]}),
+    "reverse": reverse,
+}
+
+
+@st.composite
+def shapes(draw: st.DrawFn) -> list[Any]:
+    """Shapes on the terrain, beyond it, and in several parts."""
+    made = []
+    for _ in range(draw(st.integers(1, 4))):
+        col, row = draw(st.integers(0, 44)), draw(st.integers(0, 34))
+        area = shapely.box(col + 0.2, row + 0.3, col + 4.7, row + 4.6)
+        hole = area.difference(shapely.box(col + 1.5, row + 1.5, col + 2.5, row + 2.5))
+        line = shapely.LineString([(col, row + 0.4), (col + 3, row + 2.1), (col + 6, row + 0.2)])
+        several = shapely.MultiPolygon([area, shapely.box(col + 5.5, row, col + 6.5, row + 1)])
+        made.append(draw(st.sampled_from([area, hole, line, several, shapely.box(900, 900, 905, 905)])))
+    return [shapely.box(1.1, 1.1, 2.9, 2.9), *made]
+
+
+def closed_by(file: str, kind: str) -> np.ndarray:
+    slow = {"factor": 2.0} if kind == "factor" else {}
+    pace, _ = painted([ZoneConfig(kind=kind, file=file, width_m=3.0, **slow)])  # type: ignore[arg-type]
+    return np.asarray(pace != np.float32(0.1))
+
+
+@settings(max_examples=few(400), deadline=None)
+@given(
+    shapes(),
+    st.sampled_from(sorted(DAMAGES)),
+    st.sampled_from(["forbidden", "water", "factor", "keep_in"]),
+    st.integers(),
+)
+def test_a_damaged_feature_closes_its_ground_or_ends_the_start(
+    tmp_path_factory: pytest.TempPathFactory, drawn: list[Any], name: str, kind: str, seed: int
+) -> None:
+    chance, path = random.Random(seed), tmp_path_factory.mktemp("damage") / "a.geojson"
+    if kind == "keep_in":
+        drawn = [shape for shape in drawn if shape.geom_type != "LineString"]
+    file = geojson(path, [feature(shape) for shape in drawn])
+    text = json.loads(path.read_text())
+    before = closed_by(file, kind)
+    hurt = text["features"][chance.randrange(len(drawn))]
+    try:
+        DAMAGES[name](hurt, chance)
+    except (IndexError, TypeError, KeyError):
+        return  # it does not go with this shape
+    path.write_text(json.dumps(text))
+    refused = ""
+    try:
+        assert (closed_by(file, kind) == before).all()
+    except TerrainError as error:
+        refused = str(error)
+    if refused:
+        assert re.fullmatch(r".*a\.geojson.*", refused)
+        with pytest.raises(TerrainError):
+            outlines_of(ZoneConfig(kind="forbidden", file=file, width_m=3.0), UTM, 256)
+
+
+# --- other formats ------------------------------------------------------------------------------------------
+
+AREA = shapely.box(10.3, 10.3, 20.6, 18.4)
+CORNERS = shapely.get_coordinates(in_crs(AREA, UTM, "EPSG:4326"))[:-1]
+RING = " ".join(f"{x:.10f},{y:.10f}" for x, y in [*CORNERS, CORNERS[0]])
+MIDDLE = shapely.get_coordinates(in_crs(shapely.Point(15.5, 14.5), UTM, "EPSG:4326"))[0]
+
+
+def kml(inside: str) -> str:
+    return f'<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document>{inside}</Document></kml>'
+
+
+def placemark(ring: str) -> str:
+    ring = f"<LinearRing><coordinates>{ring}</coordinates></LinearRing>"
+    return f"<Placemark><Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon></Placemark>"
+
+
+def osm(ways: str) -> str:
+    nodes = "".join(f'<node id="{n}" lat="{y:.10f}" lon="{x:.10f}"/>' for n, (x, y) in enumerate(CORNERS, 1))
+    return f'<?xml version="1.0"?><osm version="0.6">{nodes}{ways}</osm>'
+
+
+def way(*nodes: int) -> str:
+    refs = "".join(f'<nd ref="{n}"/>' for n in nodes)
+    return f'<way id="7">{refs}<tag k="natural" v="water"/></way>'
+
+
+def plan(polygons: list[Any], circles: list[Any] | None = None, **more: Any) -> str:
+    fence = {"version": 2, "polygons": polygons, "circles": circles or []}
+    return json.dumps({"fileType": "Plan", "groundStation": "QGroundControl", "geoFence": fence, **more})
+
+
+def waypoints(*rows: tuple[int, float, Any]) -> str:
+    lines = [
+        f"{n}\t0\t3\t{c}\t{extent}\t0\t0\t0\t{y:.10f}\t{x:.10f}\t0\t1" for n, (c, extent, (x, y)) in enumerate(rows)
+    ]
+    return "\n".join(["QGC WPL 110", *lines])
+
+
+LATLON = [[y, x] for x, y in CORNERS]
+DISC = {"circle": {"center": MIDDLE[::-1].tolist(), "radius": 40.0}, "inclusion": False}
+SAME = {
+    "kml": kml(f"<Folder><name>a</name>{placemark(RING)}</Folder>"),
+    "kml with spaces": kml(placemark(RING.replace(",", ", "))),
+    "open kml": kml(placemark(RING.rpartition(" ")[0])),
+    "osm": osm(way(1, 2, 3, 4, 1)),
+    "plan": plan([{"inclusion": False, "polygon": LATLON}]),
+    "waypoints": waypoints(*((5002, 4, corner) for corner in CORNERS)),
+}
+DAMAGED = {
+    "kml of words": kml(placemark(RING.replace(f"{CORNERS[1][0]:.10f}", "east"))),
+    "kml of one number": kml(placemark(RING + " 9.0")),
+    "kml without corners": kml(placemark("")),
+    "kml without a shape": kml("<Placemark><name>a</name></Placemark>" + placemark(RING)),
+    "linked kml": kml("<NetworkLink><Link><href>http://127.0.0.1:9/a.kml</href></Link></NetworkLink>"),
+    "kml cut off": kml(placemark(RING))[:-20],
+    "osm without a node": osm(way(1, 2, 99, 4, 1)),
+    "osm of words": osm(way(1, 2, 3, 4, 1)).replace('lat="', 'lat="N'),
+    "gpx of words": '<?xml version="1.0"?><gpx version="1.1"><wpt lat="46" lon="x"/></gpx>',
+    "gpx without places": '<?xml version="1.0"?><gpx version="1.1"></gpx>',
+    "virtual": "<?xml version='1.0'?><kml><OGRVRTDataSource/></kml>",
+    "topojson": '{"type": "Topology", "objects": {}, "arcs": []}',
+    "arcgis": '{"geometryType": "esriGeometryPolygon", "features": []}',
+    "plan without a fence": json.dumps({"fileType": "Plan", "mission": {"items": []}}),
+    "plan of words": plan([{"inclusion": False, "polygon": [["a", "b"], *LATLON[1:]]}]),
+    "plan of nothing": plan([]),
+    "plan without radius": plan([], [{**DISC, "circle": {"center": LATLON[0]}}]),
+    "waypoints of less": waypoints(*((5002, 5, corner) for corner in CORNERS)),
+    "waypoints of words": waypoints(*((5002, 4, corner) for corner in CORNERS)).replace("\t0\t3\t", "\tx\t3\t"),
+    "circle of nothing": waypoints((5004, 0, MIDDLE)),
+    "parquet": "PAR1....",
+    "inav": "geozone 0 1 0 0 0 0 0 4\n",
+}
+
+
+@pytest.mark.parametrize("name", [*SAME, *DAMAGED])
+def test_other_formats_close_the_same_ground_or_say_why_not(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "zone.dat"
+    path.write_text({**SAME, **DAMAGED}[name])
+    zone = ZoneConfig(kind="forbidden", file=str(path))
+    archive = tmp_path / "zone.kmz"
+    with zipfile.ZipFile(archive, "w") as packed:
+        packed.write(path, f"doc.{name.partition(' ')[0]}")
+    if name in SAME:
+        touched = shapely.intersects(AREA, squares())
+        assert (closed_by(str(path), "forbidden") == touched).all()
+        if name in ("kml", "osm"):
+            assert (closed_by(str(archive), "forbidden") == touched).all()
+    else:
+        for file in (str(path), str(archive)):
+            with pytest.raises(TerrainError, match=r"^[^\n]{20,400}$"):
+                painted([ZoneConfig(kind="forbidden", file=file)])
+        with pytest.raises(TerrainError, match=r"^[^\n]{20,400}$"):
+            outlines_of(zone, UTM, 256)
+
+
+@pytest.mark.parametrize("kind", ["gpkg", "shp", "fgb", "kml"])
+def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path: Path, kind: str) -> None:
+    shapes = [shapely.box(c + 0.2, r + 0.3, c + 4.7, r + 4.6) for c in range(5, 40, 8) for r in range(5, 30, 8)]
+    options: Any = {"driver": "LIBKML"} if kind == "kml" else {}
+    file = written(tmp_path / f"a.{kind}", shapes, "EPSG:4326", **options)
+    before, chance = closed_by(file, "forbidden"), random.Random(kind)
+    for part in [path for path in tmp_path.iterdir() if path.suffix in (f".{kind}", ".shx")]:
+        whole = part.read_bytes()
+        for _ in range(few(30)):
+            part.write_bytes(whole[: chance.randrange(len(whole))])
+            try:
+                assert (closed_by(file, "forbidden") == before).all()
+            except TerrainError as error:
+                refused = str(error)
+                assert "\n" not in refused
+        part.write_bytes(whole)
+
+
+# --- extents and fences -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "tags", [{"radius": 40}, {"Radius": "40 m"}, {"diameter": 80}, {"width": 80.0}, {"radius": "0.04 km"}]
+)
+def test_a_stated_extent_is_closed_up_to_its_edge(tmp_path: Path, tags: dict[str, Any]) -> None:
+    for at in (15.5, -2.5):  # the middle may lie outside of the terrain
+        disc = shapely.Point(at, 14.5).buffer(4.0, 64)
+        file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(at, 14.5), **tags)])
+        closed = closed_by(file, "forbidden")
+        assert closed[shapely.intersects(disc.buffer(-1e-3), squares())].all()
+        assert not closed[~shapely.intersects(disc.buffer(0.02), squares())].any()
+
+
+@pytest.mark.parametrize(
+    "tags", [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}]
+)
+def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: dict[str, Any]) -> None:
+    file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
+    with pytest.raises(TerrainError, match=f"feature 0 cannot be used: its {next(iter(tags)).lower()} is"):
+        painted([ZoneConfig(kind="forbidden", file=file)])
+
+
+def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:
+    kept = ~shapely.contains(AREA, squares())
+    inside = {"inclusion": True, "polygon": LATLON}
+    disc = shapely.Point(15.5, 14.5).buffer(4.0, 64)
+    path = tmp_path / "a.plan"
+    path.write_text(plan([inside]))
+    assert (closed_by(str(path), "forbidden") == kept).all()
+    path.write_text(plan([inside], [DISC]))
+    closed = closed_by(str(path), "forbidden")
+    assert closed[kept | shapely.intersects(disc.buffer(-1e-3), squares())].all()
+    assert not closed[~kept & ~shapely.intersects(disc.buffer(0.02), squares())].any()
+    rings = outlines_of(ZoneConfig(kind="forbidden", file=str(path)), UTM, 256)
+    ordered = np.zeros(UTM.shape, np.bool_)
+    for border, *holes in rings:
+        masks = [polygon_mask([(10 * col, 10 * row) for row, col in ring], UTM) for ring in (border, *holes)]
+        ordered |= masks[0] & ~np.any([np.zeros(UTM.shape, np.bool_), *masks[1:]], axis=0)
+    clear = shapely.distance(disc.boundary, middles()) > 0.02
+    assert (ordered == (~shapely.contains(AREA, middles()) | shapely.contains(disc, middles())))[clear].all()
+    path.write_text(waypoints(*((5001, 4, corner) for corner in CORNERS), (5003, 40, MIDDLE)))
+    assert (closed_by(str(path), "forbidden") == kept).all()
+    drawn = geojson(tmp_path / "b.geojson", [feature(AREA)])
+    assert (closed_by(drawn, "keep_in") == kept).all()
+    corners = tuple((10.0 * x, 10.0 * y) for x, y in shapely.get_coordinates(AREA)[:-1])
+    pace, _ = painted([ZoneConfig(kind="keep_in", polygon_m=corners)])
+    assert (np.isinf(pace) == ~shapely.contains(AREA, middles())).all()
+    line = geojson(tmp_path / "c.geojson", [feature(shapely.LineString([(1, 1), (5, 5)]))])
+    with pytest.raises(TerrainError, match="keeps in, but is no area"):
+        painted([ZoneConfig(kind="keep_in", file=line)])
+
+
+@pytest.mark.parametrize("name", ["fifo", "folder", "/dev/zero", "x" * 5000, "nowhere", "a\0b"])
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "fifo":
+        os.mkfifo(path)
+    elif name == "folder":
+        path.mkdir()
+    zone = ZoneConfig(kind="forbidden", file=str(path))
+    with pytest.raises(TerrainError, match=r"cannot read zone"):
+        painted([zone])
+    with pytest.raises(TerrainError, match=r"cannot read zone"):
+        outlines_of(zone, UTM, 256)

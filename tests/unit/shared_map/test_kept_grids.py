@@ -1,0 +1,247 @@
+"""A grid comes in as it was written: every format, every cell size, every door."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.control import GroundControlPoint
+from rasterio.shutil import copy
+from rasterio.transform import from_origin
+from support.effort import few
+
+from shared_map.importers.sources import Source, load_source
+from swarm.config.ground import TerrainConfig
+from swarm.errors import TerrainError
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+UTM = "EPSG:32632"
+WEST, NORTH = 500_000.0, 5_200_000.0
+HEIGHTS = (300 + 8 * np.sin(np.arange(12) / 3)[:, None] + np.cos(np.arange(15) / 2)).astype(np.float32)
+ROWS, COLS = HEIGHTS.shape
+
+
+def load(path: Path, **settings: Any) -> Source:
+    return load_source(TerrainConfig(source=str(path), **settings), seed=1)
+
+
+def rows_of(heights: np.ndarray) -> str:
+    return "\n".join(" ".join(f"{height:.4f}" for height in row) for row in heights) + "\n"
+
+
+def write_raster(path: Path, side_m: float, **profile: object) -> None:
+    numbers = profile.pop("numbers", HEIGHTS)
+    assert isinstance(numbers, np.ndarray)
+    size = {"height": ROWS, "width": COLS, "count": 1, "dtype": numbers.dtype}
+    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m)}
+    with rasterio.open(path, "w", **{**size, **place, **profile}) as file:
+        file.write(numbers, 1)
+
+
+def write_esri(path: Path, side_m: float) -> None:
+    south = NORTH - ROWS * side_m
+    head = f"ncols {COLS}\nnrows {ROWS}\nxllcorner {WEST!r}\nyllcorner {south!r}\ncellsize {side_m!r}\n"
+    path.write_text(head + rows_of(HEIGHTS))
+
+
+def write_grass(path: Path, side_m: float) -> None:
+    edges = f"north: {NORTH!r}\nsouth: {NORTH - ROWS * side_m!r}\neast: {WEST + COLS * side_m!r}\nwest: {WEST!r}\n"
+    path.write_text(f"{edges}rows: {ROWS}\ncols: {COLS}\n" + rows_of(HEIGHTS))
+
+
+def write_surfer(path: Path, side_m: float) -> None:
+    """Surfer states the middles of the outermost cells, and its rows begin in the south."""
+    x, y = WEST + side_m / 2, NORTH - (ROWS - 0.5) * side_m
+    edges = f"{x!r} {x + (COLS - 1) * side_m!r}\n{y!r} {y + (ROWS - 1) * side_m!r}\n"
+    path.write_text(f"DSAA\n{COLS} {ROWS}\n{edges}0 999\n" + rows_of(HEIGHTS[::-1]))
+
+
+def write_points(path: Path, side_m: float) -> None:
+    xs, ys = WEST + (np.arange(COLS) + 0.5) * side_m, NORTH - (np.arange(ROWS) + 0.5) * side_m
+    lines = [
+        f"{x!r} {y!r} {HEIGHTS[r, c]:.4f}"
+        for r, y in enumerate(map(float, ys))
+        for c, x in enumerate(map(float, xs))
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_arrays(path: Path, side_m: float) -> None:
+    np.savez(path, elevation=HEIGHTS, resolution_m=side_m)
+
+
+WRITERS: dict[str, Callable[[Path, float], None]] = {
+    "tif": lambda path, side_m: write_raster(path, side_m),
+    "img": lambda path, side_m: write_raster(path, side_m, driver="HFA"),
+    "bil": lambda path, side_m: write_raster(path, side_m, driver="EHdr"),
+    "asc": write_esri,
+    "grass.asc": write_grass,
+    "grd": write_surfer,
+    "xyz": write_points,
+    "npz": write_arrays,
+}
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+@settings(max_examples=few(8))
+@given(side_m=st.floats(0.02, 2000).filter(lambda side: side % 1))
+def test_any_importer_keeps_a_square_metric_grid(
+    ending: str, side_m: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("kept") / f"dem.{ending}"
+    WRITERS[ending](path, side_m)
+    source = load(path, crs=None if ending in ("tif", "img", "bil", "npz") else UTM)
+    assert source.grid.shape == HEIGHTS.shape
+    assert source.grid.resolution_m == pytest.approx(side_m, rel=1e-6)
+    np.testing.assert_allclose(source.elevation_m, HEIGHTS, rtol=0, atol=1e-4)
+    if ending != "npz":
+        assert source.grid.west_m == pytest.approx(WEST, abs=side_m / 100)
+        assert source.grid.north_m == pytest.approx(NORTH, abs=side_m / 100)
+
+
+HEAD = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        HEAD + "NODATA_value null\n1.5 2 null\n4 5 6\n",
+        HEAD + "NODATA_value -9999\n1.5 2 -9999 4\n5\n6\n",
+        HEAD + "nodata_value nan\n1.5 2 nan 4 5 6",
+        HEAD.upper() + "NODATA_VALUE -1\r\n1.5 2 -1\r\n4 5 6\r\n",
+        HEAD.replace("cellsize 50", "dx 50\ndy 50") + "NODATA_value -9999\n1.5 2 -9999\n4 5 6\n",
+        HEAD.replace("corner 1000", "center 1025").replace("corner 2000", "center 2025") + "1,5 2 -9999 4 5 6",
+        "\ufeff" + HEAD + "NODATA_value -9999\n1.5 2 -9999\n4 5 6\n",
+        "north: 2100\nsouth: 2000\neast: 1150\nwest: 1000\nrows: 2\ncols: 3\nnull: *\n1.5 2 *\n4 5 6\n",
+    ],
+)  # fmt: skip
+def test_a_grid_as_text_is_read_in_all_its_versions(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.asc").write_bytes(text.encode())
+    source = load(tmp_path / "a.asc")
+    np.testing.assert_array_equal(source.elevation_m, np.array([[1.5, 2, np.nan], [4, 5, 6]], np.float32))
+    assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
+
+
+def test_fractions_far_behind_the_beginning_of_a_text_are_kept(tmp_path: Path) -> None:
+    """GDAL takes the first 100 kB for all of a text."""
+    numbers = np.full((300, 300), 1234567.0)
+    numbers[-1, -1] = 0.25
+    text = "\n".join(" ".join(f"{number:g}" for number in row) for row in numbers)
+    (tmp_path / "a.asc").write_text("ncols 300\nnrows 300\nxllcorner 0\nyllcorner 0\ncellsize 5\n" + text)
+    assert load(tmp_path / "a.asc").elevation_m[-1, -1] == np.float32(0.25)
+
+
+@pytest.mark.parametrize("side", [1.0, 1 / 3600])
+def test_a_setting_that_a_refusal_names_leads_to_the_same_map(tmp_path: Path, side: float) -> None:
+    crs = UTM if side == 1.0 else "EPSG:4326"
+    place = from_origin(9.0, 47.0, side, side)
+    write_raster(tmp_path / "said.tif", side, crs=crs, transform=place)
+    write_raster(tmp_path / "unsaid.tif", side, crs=None, transform=place)
+    with pytest.raises(TerrainError, match=r"terrain\.crs"):
+        load(tmp_path / "unsaid.tif")
+    for resolution_m in (None, 40.0 * side * 3600 if side < 1 else 2.5):
+        said = load(tmp_path / "said.tif", resolution_m=resolution_m)
+        unsaid = load(tmp_path / "unsaid.tif", crs=crs, resolution_m=resolution_m)
+        assert said.grid == unsaid.grid
+        np.testing.assert_array_equal(said.elevation_m, unsaid.elevation_m)
+
+
+def test_control_points_place_a_raster(tmp_path: Path) -> None:
+    corners = [(0, 0), (0, COLS), (ROWS, 0), (ROWS, COLS)]
+    points = [GroundControlPoint(r, c, WEST + 10 * c, NORTH - 10 * r) for r, c in corners]
+    write_raster(tmp_path / "a.tif", 10.0, transform=None, crs=None)
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        file.gcps = points, rasterio.CRS.from_string(UTM)
+    source = load(tmp_path / "a.tif")
+    assert source.grid.crs == UTM
+    assert abs(source.grid.west_m - WEST) < 10
+    assert abs(source.grid.rows - ROWS) <= 1
+    assert float(np.nanmean(source.elevation_m)) == pytest.approx(float(HEIGHTS.mean()), abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("ending", "scale", "profile", "words"),
+    [
+        ("tif", 100, {}, r"has heights of 2.* to 3.* m, expected at most 20000: of centimetres set"),
+        ("hgt", 1, {"driver": "GTiff"}, "says by its name where it lies, such as N46E008.hgt"),
+    ],
+)
+def test_a_refusal_states_what_was_found(
+    tmp_path: Path, ending: str, scale: float, profile: dict[str, Any], words: str
+) -> None:
+    path = tmp_path / f"dem.{ending}"
+    if ending == "hgt":
+        path.write_bytes(bytes(2 * 1201 * 1201))
+    else:
+        write_raster(path, 10.0, numbers=HEIGHTS * np.float32(scale), **profile)
+    with pytest.raises(TerrainError, match=words):
+        load(path)
+
+
+def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
+    write_raster(tmp_path / "a.tif", 10.0, crs="EPSG:32632+5715")
+    source = load(tmp_path / "a.tif")
+    np.testing.assert_array_equal(source.elevation_m, -HEIGHTS)
+    assert "the file states depths; heights are their negatives" in source.notes
+
+
+@pytest.mark.parametrize("kind", ["NC", "NC4"])
+def test_both_versions_of_netcdf_are_read(tmp_path: Path, kind: str) -> None:
+    write_raster(tmp_path / "a.tif", 10.0)
+    copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT=kind)
+    np.testing.assert_array_equal(load(tmp_path / "a.nc").elevation_m, HEIGHTS)
+
+
+KINDS = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
+KINDS += ["complex_int16", "complex64", "complex128"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("door", ["source", "photo", "cover"])
+def test_numbers_of_every_kind_are_read_or_refused_at_every_door(tmp_path: Path, kind: str, door: str) -> None:
+    write_raster(tmp_path / "dem.tif", 10.0)
+    numbers = (np.arange(ROWS * COLS).reshape(ROWS, COLS) % 90 + 1).astype(np.int16)
+    with rasterio.open(
+        tmp_path / "other.tif", "w", height=ROWS, width=COLS, count=1, dtype=kind, crs=UTM,
+        transform=from_origin(WEST, NORTH, 10, 10),
+    ) as file:  # fmt: skip
+        file.write(numbers.astype("complex64" if kind.startswith("complex") else kind), 1)
+    path = tmp_path / ("other.tif" if door == "source" else "dem.tif")
+    settings = {} if door == "source" else {door: str(tmp_path / "other.tif")}
+    if door == "cover":
+        settings["cover_codes"] = str(tmp_path / "codes.csv")
+        (tmp_path / "codes.csv").write_text("code,class\n" + "".join(f"{code},grass\n" for code in range(1, 91)))
+    if kind.startswith("complex"):
+        with pytest.raises(TerrainError, match=f"holds complex numbers \\({kind}\\), expected real ones"):
+            load(path, **settings)
+    else:
+        with warnings.catch_warnings(action="ignore"):
+            assert load(path, **settings).grid.shape == HEIGHTS.shape
+
+
+@pytest.mark.parametrize("ending", ["pgm", "png", "bmp"])
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_the_image_of_a_ros_map_is_of_any_kind_that_map_server_reads(
+    tmp_path: Path, ending: str, mode: str
+) -> None:
+    from PIL import Image
+
+    pixels = np.array([[254, 0, 254], [254, 254, 205]], np.uint8)
+    Image.fromarray(pixels).convert("RGB" if (mode, ending) == ("RGBA", "pgm") else mode).save(
+        tmp_path / f"m.{ending}", format="ppm" if ending == "pgm" else None
+    )
+    for text in ("origin: [0, 0, 0]\nnegate: 0", "origin:\n- 0.0\n- 0.0\n- 0\nnegate: false", "{Y}"):
+        values = f"image: m.{ending}, resolution: 0.5, origin: [0, 0, 0], occupied_thresh: 0.65, free_thresh: 0.196"
+        flow = f"{{{values}}}"
+        block = f"image: m.{ending}\nresolution: 0.5\noccupied_thresh: 0.65\nfree_thresh: 0.196\n{text}\n"
+        (tmp_path / "m.yaml").write_text(flow if text == "{Y}" else block)
+        factor = load(tmp_path / "m.yaml").factor
+        assert factor is not None
+        np.testing.assert_array_equal(factor, [[1, np.inf, 1], [1, 1, np.inf]])
