@@ -58,6 +58,10 @@ from vehicle_agent.target_choice import AskCosts
 
 log = logging.getLogger(__name__)
 
+_ANSWER_S = 2.0
+"""A planner's answer is waited for so long, or for several round trips where the link is slow."""
+_TRIPS = 3.0
+_LONGEST_ANSWER_S = 8.0
 _ROUTES, _COSTS = "route-", "cost-"
 """Tags of what we ask, each with a number."""
 
@@ -104,6 +108,7 @@ class AgentService:
         self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
+        self._answer_s = _ANSWER_S
         self.when_over: Callable[[], None] | None = None
         self._removed: set[str] = set()
         """Vehicles that an operator has let leave in this life."""
@@ -162,13 +167,17 @@ class AgentService:
                 event.end()
             case Heard(message=Sighted() as sighted):
                 self._on_sighted(sighted, now_ns)
-            case Replied(message=RouteReply() as reply):
+            case Replied(message=RouteReply() as reply, took_s=took_s):
+                self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
                 self._on_routes(event, reply, now_ns)
-            case Replied(tag=tag, message=CostReply() as reply):
+            case Replied(tag=tag, message=CostReply() as reply, took_s=took_s):
+                self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
                 self._on_costs(_number(tag), reply)
-            case AskEnded(tag=tag) if tag.startswith(_ROUTES):
+            case AskEnded(tag=tag, failure=failure) if tag.startswith(_ROUTES):
+                self._wait_longer(failure)
                 self.agent.routes_ended(_number(tag), now_ns)
-            case AskEnded(tag=tag) if tag.startswith(_COSTS):
+            case AskEnded(tag=tag, failure=failure) if tag.startswith(_COSTS):
+                self._wait_longer(failure)
                 self._on_costs_ended(_number(tag), now_ns)
             case Appeared() | Disappeared():
                 self._on_planner(event, now_ns)
@@ -224,6 +233,11 @@ class AgentService:
             self.counters.gauge(name, float(states.count(state)))
         if self.over and self.when_over is not None:
             self.when_over()
+
+    def _wait_longer(self, failure: str | None) -> None:
+        """A query has ended. If its answer came too late, or not at all, the next is waited for twice as long."""
+        if failure == "timeout":
+            self._answer_s = min(2 * self._answer_s, _LONGEST_ANSWER_S)
 
     def stop(self, now_ns: int) -> None:
         if self._parts.spawning is not None:
@@ -394,10 +408,10 @@ class AgentService:
                         vehicle_class=self._class,
                     )
                     tag = f"{_ROUTES}{request}"
-                    self._member.ask_by_name(ROUTE, asking, tag=tag, target=target)
+                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=self._answer_s, target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
-                    self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}")
+                    self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
