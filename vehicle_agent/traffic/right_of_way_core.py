@@ -211,11 +211,16 @@ class RightOfWay:
         """Returns the messages of our members and our vehicles to send now."""
         actions: list[Action] = [Refused(text) for text in self.holdings.refused]
         self.holdings.refused.clear()
-        for member in () if self.silent else self._members.values():
-            actions += member.tick(now_ns)
         if self.holdings.replaced:
             self.holdings.watch(self._known(self.agent)[1])
-        actions += self.host.standings(wishes, now_ns)
+        for tell in self.host.standings(wishes, now_ns):
+            if self.agent in tell.members:  # our own seat plans with it at this tick
+                self.hear_standing(tell.standing, now_ns)
+            others = tuple(member for member in tell.members if member != self.agent)
+            if others:
+                actions.append(Tell(others, tell.standing))
+        for member in () if self.silent else self._members.values():
+            actions += member.tick(now_ns)
         if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
         return actions

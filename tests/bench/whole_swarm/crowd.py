@@ -16,6 +16,7 @@ import typer
 
 from bench.harness import benchmark, names_of, track
 from bench.isolated import TimeLimit
+from bench.whole_swarm.ideal_crowd import drive_ideal
 from launch_scripts.simulation import worlds as crowded
 from launch_scripts.simulation.many_seeds import in_processes, parse_seeds
 from launch_scripts.simulation.worlds import CROWDS
@@ -32,6 +33,8 @@ WANTED_LONGEST_S, WANTED_LONG_SHARE = 15.0, 0.005
 COLUMNS = (
     "world",
     "cells_per_step",
+    "over_ideal",
+    "over_ideal_without_following",
     "longest_wait_s",
     "longest_wait_seed",
     "waited_long_share",
@@ -40,6 +43,7 @@ COLUMNS = (
 )
 _NOTES = (
     "Cells a step: while the target is not within reach; 1 is a straight drive at full speed.",
+    "Ideal: PIBT in lockstep with four neighbours, all known at once, no messages.",
     f"A wait: on one cell, target not within reach; long is over {LONG_S:g} s. Confined: within 5 x 5 cells.",
     f"Wanted: no wait over {WANTED_LONGEST_S:g} s, at most {100 * WANTED_LONG_SHARE:g} % of vehicles ever so long.",
 )
@@ -100,6 +104,9 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
     began_s = time.perf_counter()
     simulation, limit = Simulation(scenario, terrain=terrain), TimeLimit(LIMIT_S)
     drives = Drives(terrain.grid.cols)
+    ideal, alone = (
+        drive_ideal(terrain.pace_s_per_m, vehicles, seed, int(seconds / STEP_S), follow) for follow in (True, False)
+    )
 
     def hear(event: Event) -> None:
         assert isinstance(event, Heard)
@@ -121,6 +128,10 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
         "wall_s": time.perf_counter() - began_s,
         "vehicles": len(waits_s),
         "cells_per_step": drives.driven_cells / max(drives.ticks_out_of_reach, 1),
+        "ideal_cells_per_step": ideal["cells_per_step"],
+        "ideal_cells_per_step_without_following": alone["cells_per_step"],
+        "ideal_longest_wait_s": STEP_S * ideal["longest_wait"],
+        "ideal_arrivals": ideal["arrivals"],
         "longest_wait_s": max(waits_s, default=0.0),
         "waited_long": sum(each > LONG_S for each in waits_s),
         "confined_long": sum(each > LONG_S for each in confined_s),
@@ -192,11 +203,18 @@ def row_of(name: str, drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
     vehicles = sum(each["vehicles"] for each in drives) or 1
     simulated_s = sum(each["vehicles"] * each["simulated_s"] for each in drives) or 1.0
     worst = max(drives, key=lambda each: each["longest_wait_s"])
+    flow, ideal, alone = (
+        sum(each[key] for each in drives) / len(drives)
+        for key in ("cells_per_step", "ideal_cells_per_step", "ideal_cells_per_step_without_following")
+    )
     return {
         "world": name,
         "drives": len(drives),
         "cut_short": sum(each["cut_short"] for each in drives),
-        "cells_per_step": sum(each["cells_per_step"] for each in drives) / len(drives),
+        "cells_per_step": flow,
+        "over_ideal": flow / max(ideal, 1e-9),
+        "over_ideal_without_following": flow / max(alone, 1e-9),
+        "ideal_longest_wait_s": max(each["ideal_longest_wait_s"] for each in drives),
         "longest_wait_s": worst["longest_wait_s"],
         "longest_wait_seed": f"{worst['world']} {worst['seed']}",
         "waited_long_share": sum(each["waited_long"] for each in drives) / vehicles,
