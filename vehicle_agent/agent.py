@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 
@@ -178,6 +178,11 @@ class Agent:
         for id in list(self.vehicles):
             del self.vehicles[id]
             self._wishes.forget(id)
+
+    @property
+    def shut_in(self) -> Set[str]:
+        """Vehicles which bodies keep from driving anywhere."""
+        return self._steering.shut_in & self.vehicles.keys()
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
         """Cells that only an operator's zone closes, and how many steps it is from each out of it."""

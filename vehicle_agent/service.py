@@ -109,6 +109,8 @@ class AgentService:
         self._roster = Roster()
         self._now_ns = 0
         self._answer_s = _ANSWER_S
+        self._shut_in: set[str] = set()
+        """Vehicles of which it has been said that bodies shut them in."""
         self.when_over: Callable[[], None] | None = None
         self._removed: set[str] = set()
         """Vehicles that an operator has let leave in this life."""
@@ -353,6 +355,12 @@ class AgentService:
         for text in bodies.complaints:
             self._warn("body", text)
         bodies.complaints.clear()
+        for id in self.agent.shut_in - self._shut_in:
+            row, col = self._replica.grid.row_col(self.agent.vehicles[id].cell)
+            self._warn(
+                "shut_in", f"{id} waits at row {row}, column {col}: bodies leave no cell to which it can drive"
+            )
+        self._shut_in = set(self.agent.shut_in)
 
     # --- driving and planners -------------------------------------------------------------------------------
 

@@ -114,7 +114,8 @@ class LawBook:
     acknowledged  the newest of each set that a keeper ever said it had committed
     longest_s     the longest time on one cell, less the time to drive across it, of a vehicle that has somewhere to
                   go. A second counts if every process works: one that is dead, hung or cut off may hold the cell
-                  ahead, or be the planner or warden that is waited for. Messages that are lost are no reason
+                  ahead, or be the planner or warden that is waited for. Messages that are lost are no reason;
+                  bodies that leave a vehicle no step are one
     longest       when that wait was last seen, vehicle and cell
     whole_s       when all processes worked for the first time since the quiet began; None until then
     routed_s      vehicle -> when it first had a route after that, to its target or to where it searches for it, or
@@ -198,7 +199,7 @@ class LawBook:
             self._unmoved.pop(id, None)
             if self.whole_s is not None and vehicle.state in _ROUTED:
                 self.routed_s.setdefault(id, now_s)
-            to_go = vehicle.state in _UNDER_WAY and not agent.stopped(id)
+            to_go = vehicle.state in _UNDER_WAY and not (agent.stopped(id) or id in agent.shut_in)
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
             self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
         if agent.holdings.replaced:

@@ -37,9 +37,9 @@ Messages (`swarm.wire.messages.traffic`), each of which carries the whole state 
                 takes the cells that follow the path of the vehicle, and passes over the others, which gives
                 them back. `pushed` asks a vehicle to make way into another plot; `occupied` are the cells of
                 others around.
-`Claim`         Member to members, where no warden was heard for 0.6 s: who answers with its table promises to
-                store nothing of a lower epoch. Two promises make a warden, which goes on from the newest table
-                of the two.
+`Claim`         Member to members, where no warden was heard for 0.6 s, longer where round trips are: who answers
+                with its table promises to store nothing of a lower epoch. Two promises make a warden, which goes on
+                from the newest table of the two.
 `KnownRequest`  New life to all agents: what is on file of this host?
 `Known`         The answer: the greatest life in any table, the plots that grant cells to the host or keep them
                 shut, and, for a guest, who the agents are and how large plots are.

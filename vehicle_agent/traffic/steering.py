@@ -47,6 +47,7 @@ class Steering:
     climb        says which steps are too steep; None if none is
 
     waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on
+    shut_in      vehicles that have stood for long on cells from which bodies leave no step
     ways_out     cell that only an operator's zone closes -> steps from there out of it: a vehicle there leaves
     """
 
@@ -69,6 +70,7 @@ class Steering:
         self._shut = bodies.closed
         self.ways_out: Mapping[int, int] = {}
         self.waiting_ns: dict[str, tuple[int, int]] = {}
+        self.shut_in: set[str] = set()
 
     def closed(self, cell: int) -> bool:
         """Returns True if a cell is lethal, or a body closes it."""
@@ -182,13 +184,21 @@ class Steering:
         another route after a while."""
         if vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
             self.waiting_ns.pop(vehicle.id, None)
+            self.shut_in.discard(vehicle.id)
             return False
         cell, since_ns = self.waiting_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
         if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:
             del self.waiting_ns[vehicle.id]
+            self.shut_in.discard(vehicle.id)
             if cell == vehicle.cell:
                 vehicle.blocked_for_long(now_ns)
+                if self._is_shut_in(cell):
+                    self.shut_in.add(vehicle.id)
         return True
+
+    def _is_shut_in(self, cell: int) -> bool:
+        """Returns True if no step leads from a cell, and bodies close a cell beside it."""
+        return not self.steps(cell) and any(each in self._shut for _, each in self._grid.neighbours(cell))
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""

@@ -69,7 +69,7 @@ class IdealCrowd:
         return self._reaches(self._chased[vehicle], self.cells[vehicle])
 
     def move_targets(self, step: int) -> None:
-        """Targets walk; those that are captured jump. Vehicles choose theirs anew from time to time."""
+        """Targets walk; those that are captured jump. From time to time vehicles choose another."""
         for target in range(_TARGETS):
             if step % _WALK_STEPS == 0:
                 self._targets[target] = self._chance.choice(self._beside(self._targets[target]))

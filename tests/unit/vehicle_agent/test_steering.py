@@ -16,6 +16,7 @@ from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
+from swarm.wire.messages.vehicles import Body
 from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import Bodies
@@ -160,3 +161,22 @@ def test_one_that_stands_though_its_route_goes_on_is_blocked_and_one_that_moves_
     vehicle.motion.at_rest = False
     assert not steering.blocked(vehicle, 2)
     assert steering.waiting_ns == {}
+
+
+def test_one_that_bodies_leave_no_step_is_shut_in_until_one_of_them_moves() -> None:
+    bodies, corner = Bodies(GRID), Vehicle("v", GRID, 0)
+    steering = Steering(GRID, LEVEL, PlannerConfig(), 4, bodies, None)
+    bodies.listen_anew(0)
+    corner.assign("t", 0)
+    corner.give_route(GivenRoute("t", (0, 1, 2), 1.0, 1.0, partial=False), [0], 0)
+    expected: dict[int, set[str]] = {20: set(), 59: {"v"}, 119: set()}
+    for tenth in range(120):
+        bodies.tick(tenth * 10**8)
+        places = (1, 8) if tenth < 60 else (30, 8)
+        for id, cell in zip("ab", places, strict=True):
+            x_m, y_m = GRID.centre_m(cell)
+            body = Body(id=id, incarnation=1, seq=tenth, x_m=x_m, y_m=y_m, radius_m=1.0)
+            bodies.take_report(body, tenth * 10**8)
+        steering.blocked(corner, tenth * 10**8)
+        if tenth in expected:
+            assert steering.shut_in == expected[tenth]
