@@ -14,10 +14,11 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
    back while the first is still used.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
 4. An entry that was left, given back or passed over is never used again by this host.
-5. A host acts on tables of a plot in their order, and on those of its own life.
+5. A host acts on tables for its own life only. (In their order, too; the model finds no harm in older ones.)
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
-   have ended; then one of them passes to the new life if the vehicle's body is known to be on it. A vehicle whose
-   body is made up enters by a new entry, like one that comes from nowhere.
+   have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if the
+   vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, like one that comes
+   from nowhere.
 """
 
 from __future__ import annotations
@@ -35,16 +36,19 @@ class Entry:
     """A vehicle's place in the order of one cell.
 
     after  the entries before it that the table which says this still lists
-    since  the first table that grants it to this life of the host: another than added it if it passed to a new life
     """
 
     number: Number
     after: tuple[Number, ...] = ()
-    since: Stamp = (0, 0)
 
     @property
     def cell(self) -> int:
         return self.number[0]
+
+    @property
+    def stamp(self) -> Stamp:
+        """The table that added it."""
+        return self.number[1:3]
 
 
 @dataclass(slots=True)

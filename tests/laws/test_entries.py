@@ -1,5 +1,5 @@
-"""The second version of right of way as a model of its real cores: no two vehicles meet in any history, and each rule
-that is taken out is found. Two plots with a seam, guests, restarts and second lives are in every history."""
+"""The second version of right of way as a model of its real cores: no two vehicles meet in any history, and each
+rule that is taken out is found. Every history has two plots with a seam, guests, restarts and second lives."""
 
 from __future__ import annotations
 
@@ -73,17 +73,6 @@ def takes_later_what_it_passed_over(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(HostEntries, "hear_granted", forgetful)
 
 
-def acts_on_older_tables(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-
-    def backwards(self: HostEntries, plot: int, stamp: Any, life: int, grants: Any) -> None:
-        known = self.knows.pop(plot, (0, -1))
-        hear(self, plot, stamp, life, grants)
-        self.knows[plot] = max(known, self.knows.get(plot, known))
-
-    patch.setattr(HostEntries, "hear_granted", backwards)
-
-
 def acts_on_what_was_granted_to_another_life(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
     patch.setattr(
@@ -141,28 +130,6 @@ def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Orders, "copy", greedy)
 
 
-def passes_on_an_entry_under_its_old_table(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_standing
-
-    def dated(self: Orders, *what: Any) -> None:
-        take(self, *what)
-        for vehicle, each in self.entries.items():
-            self.entries[vehicle] = [replace(entry, since=entry.number[1:3]) for entry in each]
-
-    patch.setattr(Orders, "take_standing", dated)
-
-
-def counts_an_older_statement(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_standing
-
-    def late(self: Orders, host: str, *what: Any) -> None:
-        life, _ = self.hosts.get(host, (0, 0))
-        self.hosts[host] = (life, -1)
-        take(self, host, *what)
-
-    patch.setattr(Orders, "take_standing", late)
-
-
 def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
     take = Orders.take_standing
     patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-1]))
@@ -185,7 +152,6 @@ RULES: list[Mutation] = [
     says_left_when_it_sets_out,
     takes_back_what_it_gave,
     takes_later_what_it_passed_over,
-    acts_on_older_tables,
     acts_on_what_was_granted_to_another_life,
     numbers_name_cell_and_vehicle_only,
     numbers_are_those_of_one_plot,
@@ -194,8 +160,6 @@ RULES: list[Mutation] = [
     opens_what_an_earlier_life_holds,
     frees_what_the_host_did_not_know_of,
     frees_what_was_not_said,
-    passes_on_an_entry_under_its_old_table,
-    counts_an_older_statement,
     forgets_where_bodies_are,
     _setting("majority", 1),
     _setting("forgetful", True),

@@ -53,7 +53,7 @@ class Seat:
 
 @dataclass(eq=False)
 class Life:
-    """One life of a host; `dead` are lives that it can prove to have ended."""
+    """One life of a host; `dead` are lives that it can prove to have ended. One that is cut off drives on."""
 
     host: str
     entries: HostEntries
@@ -61,6 +61,7 @@ class Life:
     seq: int = 0
     up: bool = True
     replaced: bool = False
+    cut: bool = False
 
 
 class OrderWorld:
@@ -212,7 +213,7 @@ class OrderWorld:
         self.counts["lives"] += 1
 
     def hear_granted(self, life: Life, plot: int, stamp: Stamp, known: int, grants: dict[str, list[Entry]]) -> None:
-        if not life.up:
+        if not life.up or life.cut:
             return
         if known > life.entries.life and not life.replaced:
             life.replaced = True  # it drives no more, and its made-up bodies vanish
@@ -224,6 +225,8 @@ class OrderWorld:
 
     def tell(self, life: Life) -> None:
         life.seq += 1
+        if life.cut:
+            return
         for plot, seats in enumerate(self.seats):
             holds, knows = life.entries.holds(plot), life.entries.knows.get(plot, (0, -1))
             for member in range(len(seats)):
@@ -280,6 +283,9 @@ class OrderWorld:
     def disturb(self) -> None:
         """A member or a host dies or starts again; or a second life starts beside the first."""
         chance = self.chance
+        if chance.random() < 0.2:
+            for life in self.lives:
+                life.cut = False
         if chance.random() < 0.4:
             plot, member = chance.randrange(PLOTS), chance.randrange(MEMBERS)
             seat = self.seats[plot][member]
@@ -293,8 +299,10 @@ class OrderWorld:
         if life.up and (host not in MADE_UP or chance.random() < 0.7):
             life.up = False
         elif life.up and not self.proves_too_much:
+            life.cut = True
             self.boot(host, [], {})  # on another machine
         else:
+            life.cut = life.up
             dead = [each.entries.life for each in ours if not each.up or self.proves_too_much]
             if len(dead) == len(ours):
                 dead.append(0)

@@ -79,9 +79,7 @@ class Orders:
                 cell = (bodies or {}).get(vehicle)
                 here = [entry for entry in entries if entry.cell == cell]
                 if here:
-                    epoch, number = self.stamp
-                    first = replace(here[0], since=(epoch, number + 1))
-                    self.entries[vehicle] = [first, *self.entries.get(vehicle, ())]
+                    self.entries[vehicle] = [here[0], *self.entries.get(vehicle, ())]
 
     def end(self, host: str, life: int) -> None:
         """A life that was replaced states that it drives no more."""
@@ -91,7 +89,7 @@ class Orders:
         """Drops the entries that a host which knows a table does not hold any more."""
         for vehicle in vehicles:
             held = holds.get(vehicle, ())
-            kept = [x for x in self.entries.get(vehicle, ()) if x.number in held or x.since > knows]
+            kept = [x for x in self.entries.get(vehicle, ()) if x.number in held or x.stamp > knows]
             self.entries[vehicle] = kept
             if not kept:
                 del self.entries[vehicle]
@@ -102,7 +100,7 @@ class Orders:
         epoch, seq = self.stamp
         if len(before) > _MOST_BEFORE or any(number[3] == vehicle for number in before):
             return False
-        entry = Entry((cell, epoch, seq + 1, vehicle), tuple(before), (epoch, seq + 1))
+        entry = Entry((cell, epoch, seq + 1, vehicle), tuple(before))
         self.entries.setdefault(vehicle, []).append(entry)
         return True
 
