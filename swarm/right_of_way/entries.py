@@ -16,9 +16,9 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 4. An entry that was left, given back or passed over is never used again by this host.
 5. A host acts on tables for its own life only. (In their order, too; the model finds no harm in older ones.)
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
-   have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if the
-   vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, like one that comes
-   from nowhere.
+   have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
+   the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, like one that
+   comes from nowhere.
 """
 
 from __future__ import annotations

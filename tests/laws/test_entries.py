@@ -169,9 +169,14 @@ RULES: list[Mutation] = [
 ]
 
 
+FIRST = {"takes_later_what_it_passed_over": 121, "forgetful": 72, "proves_too_much": 49}
+"""Histories tried before the others: rare faults are found soon."""
+
+
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
 def test_each_rule_is_needed(rule: Mutation, monkeypatch: pytest.MonkeyPatch) -> None:
     mutate = rule(monkeypatch)
-    if any(OrderWorld(seed, mutate).run().collisions for seed in range(HISTORIES)):
+    seeds = FIRST.get(rule.__name__, 0), *range(HISTORIES)
+    if any(OrderWorld(seed, mutate).run().collisions for seed in seeds):
         return
     raise AssertionError(f"{HISTORIES} histories without a collision: the law would not notice")
