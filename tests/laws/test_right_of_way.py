@@ -17,8 +17,6 @@ from hypothesis import strategies as st
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.holdings import Holdings
-from swarm.wire.messages.traffic import Grant
-from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.warden import Warden
