@@ -140,6 +140,7 @@ class Warden:
             return
         if standing.life != life:
             known.told = None
+            self.seq += 1  # two lives of one tick are given different entries
         if not standing.vehicles and (known.standing is None or known.standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
         stands = self._stands_of(standing)
@@ -287,8 +288,9 @@ class Warden:
         stand, entries = self._stands.get(vehicle), self._orders.entries(vehicle)
         if stand is None or number not in entries or self._orders.is_fenced(number[0]):
             return False
+        # Into a plot of a greater number only: no warden sees circles over two, and so there are none.
         return number != entries[-1] or (
-            number[0] != stand.end and number in stand.holds and self._plots.of(stand.end) != self._plot
+            number[0] != stand.end and number in stand.holds and self._plots.of(stand.end) > self._plot
         )
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
