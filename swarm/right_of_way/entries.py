@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from swarm.config.agents import agent_of
-from swarm.wire.messages.traffic import Entry, Number, Stamp
+from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
 
 _MOST_HEARD = 1 << 13
 """Entries of others that are remembered as over; each is told again until a table lists it no more."""
@@ -44,7 +44,7 @@ class HostEntries:
     paths     vehicle -> its entries in driving order, its own cell first
     placed    vehicles that are on the first cell of their paths; the others are nowhere
     over      plot -> numbers that this life has left, given back or passed over, and its table still lists
-    heard     (number, host) of which that host has said that it is over
+    heard     (number, host) of which that host has said that it is over; entries of paths know it
     knows     plot -> the newest table acted on
     """
 
@@ -62,8 +62,23 @@ class HostEntries:
     def hear_left(self, host: str, numbers: Iterable[Number]) -> None:
         """Another host has left these, or given them back: facts for good."""
         self.heard.update(dict.fromkeys((number, host) for number in numbers))
+        for path in self.paths.values():
+            for index, entry in enumerate(path):
+                if entry.after:
+                    path[index] = self._waiting(entry, entry.after)
         while len(self.heard) > _MOST_HEARD:
             del self.heard[next(iter(self.heard))]
+
+    def _waiting(self, entry: Entry, after: Sequence[Before]) -> Entry:
+        """Returns an entry with those of `after` which are before it and not known to be over."""
+        if not entry.after:
+            return entry
+        before = [
+            each
+            for each in entry.after
+            if each in after and ((entry.cell, each[0], each[1]), agent_of(each[2])) not in self.heard
+        ]
+        return Entry(entry.number, tuple(before))
 
     def hear_granted(self, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]) -> set[str]:
         """A usable table of a plot names these entries of our vehicles. Returns the vehicles of which the path has
@@ -79,9 +94,10 @@ class HostEntries:
             at = {entry.number: index for index, entry in enumerate(path)}
             for entry in entries:
                 if entry.number in at:
-                    path[at[entry.number]] = entry  # the same with fewer before it
+                    index = at[entry.number]
+                    path[index] = self._waiting(entry, path[index].after)
                 elif entry.number not in over and self._follows(vehicle, path, entry):
-                    path.append(entry)
+                    path.append(self._waiting(entry, entry.after))
                     longer.add(vehicle)
                 else:
                     over.add(entry.number)
@@ -100,13 +116,8 @@ class HostEntries:
 
     def may_enter(self, entry: Entry) -> bool:
         """Returns True if all entries before one are over."""
-        if not entry.after:
-            return True
-        cell, ours = entry.cell, self.over.get(self.plot_of(entry.cell), ())
-        return all(
-            ((number := (cell, epoch, seq)), agent_of(vehicle)) in self.heard or number in ours
-            for epoch, seq, vehicle in entry.after
-        )
+        ours = self.over.get(self.plot_of(entry.cell), ())
+        return all((entry.cell, epoch, seq) in ours for epoch, seq, _ in entry.after)
 
     def place(self, vehicle: str) -> bool:
         """Puts a vehicle that is nowhere on the first cell of its path, if it may."""

@@ -4,13 +4,13 @@ rule that is taken out is found. Every history has two plots with a seam, guests
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from support.order_world import OrderWorld
 
-from swarm.right_of_way.entries import Entry, HostEntries, Number
+from swarm.right_of_way.entries import HostEntries
+from swarm.wire.messages.traffic import Entry, Stamp, Table
 from vehicle_agent.traffic.orders import Orders
 
 HISTORIES = 100
@@ -36,41 +36,46 @@ def enters_at_once(patch: pytest.MonkeyPatch) -> None:
 
 
 def waits_for_the_last_before_it_only(patch: pytest.MonkeyPatch) -> None:
-    may = HostEntries.may_enter
-    patch.setattr(HostEntries, "may_enter", lambda self, entry: may(self, replace(entry, after=entry.after[-1:])))
+    hear = HostEntries.hear_granted
+
+    def hasty(self: HostEntries, plot: int, stamp: Stamp, life: int, grants: dict[str, list[Entry]]) -> set[str]:
+        last = {id: [Entry(each.number, each.after[-1:]) for each in entries] for id, entries in grants.items()}
+        return hear(self, plot, stamp, life, last)
+
+    patch.setattr(HostEntries, "hear_granted", hasty)
 
 
 def says_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
     enter = HostEntries.enter_next
 
     def early(self: HostEntries, vehicle: str) -> bool:
-        if len(self.paths[vehicle]) > 1:
-            self.over.add(self.paths[vehicle][0].number)
+        if vehicle in self.placed and len(self.paths[vehicle]) > 1:
+            self._end(self.paths[vehicle][:1])
         return enter(self, vehicle)
 
     patch.setattr(HostEntries, "enter_next", early)
 
 
-def takes_back_what_it_gave(patch: pytest.MonkeyPatch) -> None:
+def _forgetting(patch: pytest.MonkeyPatch, before: Callable[[HostEntries], object]) -> None:
+    """A host takes up a table without what it knows to be over, or forgets what it has passed over by it."""
     hear = HostEntries.hear_granted
 
-    def greedy(self: HostEntries, *what: Any) -> None:
-        over, self.over = self.over, set()
-        hear(self, *what)
-        self.over |= over
+    def forgetful(self: HostEntries, *what: Any) -> set[str]:
+        over = {plot: set(numbers) for plot, numbers in self.over.items()}
+        before(self)
+        changed = hear(self, *what)
+        self.over = over
+        return changed
 
-    patch.setattr(HostEntries, "hear_granted", greedy)
+    patch.setattr(HostEntries, "hear_granted", forgetful)
+
+
+def takes_back_what_it_gave(patch: pytest.MonkeyPatch) -> None:
+    _forgetting(patch, lambda entries: entries.over.clear())
 
 
 def takes_later_what_it_passed_over(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-
-    def forgetful(self: HostEntries, *what: Any) -> None:
-        over = set(self.over)
-        hear(self, *what)
-        self.over = over
-
-    patch.setattr(HostEntries, "hear_granted", forgetful)
+    _forgetting(patch, lambda entries: None)
 
 
 def acts_on_what_was_granted_to_another_life(patch: pytest.MonkeyPatch) -> None:
@@ -80,59 +85,60 @@ def acts_on_what_was_granted_to_another_life(patch: pytest.MonkeyPatch) -> None:
     )
 
 
-def _may_enter_by(key: Callable[[Number], object]) -> Callable[[HostEntries, Entry], bool]:
-    return lambda self, entry: {key(each) for each in entry.after} <= {key(each) for each in self.heard | self.over}
+def believes_that_another_vehicle_of_the_cell_has_left(patch: pytest.MonkeyPatch) -> None:
+    def careless(self: HostEntries, host: str, numbers: Any) -> None:
+        cells = {number[0] for number in numbers}
+        for path in self.paths.values():
+            path[:] = [Entry(each.number) if each.cell in cells else each for each in path]
 
-
-def numbers_name_cell_and_vehicle_only(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(HostEntries, "may_enter", _may_enter_by(lambda number: (number[0], number[3])))
-
-
-def numbers_are_those_of_one_plot(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(HostEntries, "may_enter", _may_enter_by(lambda number: number[1:]))
+    patch.setattr(HostEntries, "hear_left", careless)
 
 
 # --- rules of wardens -------------------------------------------------------------------------------------------
 
 
 def forgets_who_is_before(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Orders, "order", lambda self, cell: [])
+    patch.setattr(Orders, "before", lambda self, number, vehicle: iter(()))
 
 
 def forgets_those_before_in_earlier_lives(patch: pytest.MonkeyPatch) -> None:
-    order = Orders.order
-    patch.setattr(Orders, "order", lambda self, cell: order(replace(self, fenced={}), cell))
+    before = Orders.before
+    patch.setattr(
+        Orders, "before", lambda self, *of: (each for each in before(self, *of) if each[0] not in self._fences)
+    )
 
 
 def opens_what_an_earlier_life_holds(patch: pytest.MonkeyPatch) -> None:
     take = Orders.take_standing
 
-    def trusting(self: Orders, host: str, *what: Any) -> None:
-        take(self, host, *what)
-        for key in [key for key in self.fenced if key[0] == host and key[1]]:
-            del self.fenced[key]
+    def trusting(self: Orders, host: str, *what: Any) -> bool:
+        changed = take(self, host, *what)
+        for life in [life for each, life in self.fenced if each == host]:
+            self.end(host, life)
+        return changed
 
     patch.setattr(Orders, "take_standing", trusting)
 
 
 def frees_what_the_host_did_not_know_of(patch: pytest.MonkeyPatch) -> None:
     remove = Orders.remove
-    patch.setattr(Orders, "remove", lambda self, vehicles, holds, _: remove(self, vehicles, holds, (1 << 60, 0)))
+    patch.setattr(Orders, "remove", lambda self, host, holds, _: remove(self, host, holds, (1 << 60, 0)))
 
 
 def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
-    copy = Orders.copy
+    table = Orders.table
 
-    def greedy(self: Orders, stamp: Any) -> Orders:
-        self.entries = {vehicle: each[-1:] for vehicle, each in self.entries.items()}
-        return copy(self, stamp)
+    def greedy(self: Orders, *what: Any) -> Table:
+        for host, vehicles in self.by_host.items():
+            self.remove(host, {vehicle: self.of[vehicle][-1:] for vehicle in vehicles}, (1 << 60, 0))
+        return table(self, *what)
 
-    patch.setattr(Orders, "copy", greedy)
+    patch.setattr(Orders, "table", greedy)
 
 
 def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
     take = Orders.take_standing
-    patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-1]))
+    patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
 
 
 # --- rules of members and of lives ------------------------------------------------------------------------------
@@ -153,8 +159,7 @@ RULES: list[Mutation] = [
     takes_back_what_it_gave,
     takes_later_what_it_passed_over,
     acts_on_what_was_granted_to_another_life,
-    numbers_name_cell_and_vehicle_only,
-    numbers_are_those_of_one_plot,
+    believes_that_another_vehicle_of_the_cell_has_left,
     forgets_who_is_before,
     forgets_those_before_in_earlier_lives,
     opens_what_an_earlier_life_holds,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
+from vehicle_agent.traffic.grants import Grants
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.node import Node
@@ -20,7 +21,6 @@ from swarm.wire.messages.traffic import Granted, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.warden import SILENT_NS, Warden, _is_entering, _turn
 

@@ -1,6 +1,6 @@
-"""A world in which the cores of the second version of right of way meet everything that may happen: two plots with
-three members each, hosts with known and with made-up bodies, second lives beside the first, and a network that
-loses, repeats, delays and reorders. No time passes: any party acts at any moment."""
+"""A world in which the cores of right of way meet everything that may happen: two plots with three members each,
+hosts with known and with made-up bodies, second lives beside the first, and a network that loses, repeats, delays
+and reorders. No time passes: any party acts at any moment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from swarm.right_of_way.entries import Entry, HostEntries, Stamp
+from swarm.right_of_way.entries import HostEntries
+from swarm.wire.messages.traffic import Entry, Number, Stamp, Table
 from vehicle_agent.traffic.orders import Orders
 
 SIDE, MEMBERS, PLOTS = 6, 3, 2
@@ -41,14 +42,15 @@ def vehicles_of(host: str) -> list[str]:
 class Seat:
     """A member of a plot: what is on its file, and its part as a warden."""
 
+    stored: Table
     promised: int = 0
-    stored: Orders = field(default_factory=Orders)
     up: bool = True
     claimed: int = 0
-    promises: dict[int, Orders] = field(default_factory=dict)
+    promises: dict[int, Table] = field(default_factory=dict)
     orders: Orders | None = None
+    stamp: Stamp = (0, 0)
     acked: dict[Stamp, set[int]] = field(default_factory=dict)
-    told: dict[Stamp, Orders] = field(default_factory=dict)
+    told: dict[Stamp, Table] = field(default_factory=dict)
 
 
 @dataclass(eq=False)
@@ -85,15 +87,14 @@ class OrderWorld:
         self.lives: list[Life] = []
         self.bodies: dict[tuple[str, int], int] = {}
         """(vehicle, life) -> the cell of its body; a body of a dead process stays."""
-        first = [Orders() for _ in range(PLOTS)]
+        first = [Table(plot=plot, agent="member", epoch=0, seq=0, hosts={}, grants={}) for plot in range(PLOTS)]
         spawns: dict[str, int] = {}
         for host in HOSTS[:-1]:
             for vehicle in vehicles_of(host):
                 spawns[vehicle] = cell = cells.pop()
-                orders = first[plot_of(cell)]
-                orders.fenced.setdefault((host, 0), {})[vehicle] = [Entry((cell, 0, 0, vehicle))]
+                first[plot_of(cell)].grants[vehicle] = [(cell, 0, 1)]
                 self.bodies[vehicle, 0] = cell
-        self.seats = [[Seat(stored=first[plot].copy((0, 0))) for _ in range(MEMBERS)] for plot in range(PLOTS)]
+        self.seats = [[Seat(first[plot]) for _ in range(MEMBERS)] for plot in range(PLOTS)]
         self.first = first
         if mutate is not None:
             mutate(self)
@@ -115,13 +116,13 @@ class OrderWorld:
 
     # --- members --------------------------------------------------------------------------------------------
 
-    def hear_table(self, plot: int, member: int, sender: int, table: Orders) -> None:
+    def hear_table(self, plot: int, member: int, sender: int, table: Table) -> None:
         seat = self.seats[plot][member]
         if not seat.up:
             return
         if (table.stamp[0] >= seat.promised or self.obliging) and table.stamp > seat.stored.stamp:
             seat.promised, seat.stored = max(seat.promised, table.stamp[0]), table
-            if seat.orders is not None and seat.orders.stamp[0] < table.stamp[0]:
+            if seat.orders is not None and seat.stamp[0] < table.stamp[0]:
                 seat.orders = None
         if seat.stored.stamp == table.stamp:
             self.send(self.hear_stored, plot, sender, member, table.stamp)
@@ -135,12 +136,13 @@ class OrderWorld:
         if len(acked) >= self.majority:
             self.grant(plot, seat.told[stamp])
 
-    def grant(self, plot: int, table: Orders) -> None:
+    def grant(self, plot: int, table: Table) -> None:
+        orders = Orders(table)
         for life in self.lives:
             if not life.up:
                 continue
             known = table.hosts.get(life.host, (0, 0))[0]
-            grants = table.granted(vehicles_of(life.host))
+            grants = orders.granted(life.host)
             self.send(self.hear_granted, life, plot, table.stamp, known, grants)
 
     def hear_claim(self, plot: int, member: int, claimant: int, epoch: int) -> None:
@@ -151,14 +153,14 @@ class OrderWorld:
                 seat.orders = None
             self.send(self.hear_promise, plot, claimant, member, epoch, seat.stored)
 
-    def hear_promise(self, plot: int, member: int, sender: int, epoch: int, table: Orders) -> None:
+    def hear_promise(self, plot: int, member: int, sender: int, epoch: int, table: Table) -> None:
         seat = self.seats[plot][member]
         if not seat.up or seat.claimed != epoch:
             return
         seat.promises[sender] = table
         if len(seat.promises) >= self.promises_needed:
             newest = max(seat.promises.values(), key=lambda each: each.stamp)
-            seat.orders, seat.claimed = newest.copy((epoch, 0)), 0
+            seat.orders, seat.stamp, seat.claimed = Orders(newest), (epoch, 0), 0
             self.counts["takeovers"] += 1
 
     def claim(self, plot: int, member: int) -> None:
@@ -177,19 +179,21 @@ class OrderWorld:
         seat, chance = self.seats[plot][member], self.chance
         if not seat.up or seat.orders is None:
             return
-        orders = seat.orders
+        orders, fresh = seat.orders, (seat.stamp[0], seat.stamp[1] + 1)
         for host in chance.sample(HOSTS, 2):
             for vehicle in chance.sample(vehicles_of(host), 2):
-                path = orders.entries.get(vehicle)
+                path = orders.of.get(vehicle)
                 if path and len(path) < 4:
-                    orders.append(vehicle, chance.choice([c for c in beside(path[-1].cell) if plot_of(c) == plot]))
+                    orders.append(
+                        vehicle, chance.choice([c for c in beside(path[-1][0]) if plot_of(c) == plot]), fresh
+                    )
                 elif not path:  # it comes in over the seam, or from nowhere
                     near = [c for other in self.ends(vehicle) for c in beside(other) if plot_of(c) == plot]
                     cells = near or [c for c in range(SIDE * SIDE) if plot_of(c) == plot]
                     if near or chance.random() < 0.3:
-                        orders.append(vehicle, chance.choice(cells))
-        told = orders.copy((orders.stamp[0], orders.stamp[1] + 1))
-        orders.stamp = told.stamp
+                        orders.append(vehicle, chance.choice(cells), fresh)
+        told = orders.table(plot, "member", fresh, {})
+        seat.stamp = fresh
         seat.told = {stamp: table for stamp, table in seat.told.items() if stamp[0] == told.stamp[0]}
         seat.told[told.stamp] = told
         for other in range(MEMBERS):
@@ -228,16 +232,17 @@ class OrderWorld:
         if life.cut:
             return
         for plot, seats in enumerate(self.seats):
-            holds, knows = life.entries.holds(plot), life.entries.knows.get(plot, (0, -1))
+            holds, knows = life.entries.holds(plot), life.entries.knows.get(plot, (0, 0))
             for member in range(len(seats)):
                 self.send(self.hear_standing, plot, member, life, life.seq, holds, knows, life.replaced)
         for other in self.lives:
-            if other is not life and other.up and life.entries.over:
-                self.send(self.hear_left, other, frozenset(life.entries.over))
+            over = frozenset(number for numbers in life.entries.over.values() for number in numbers)
+            if other is not life and other.up and over:
+                self.send(self.hear_left, other, life.host, over)
 
-    def hear_left(self, life: Life, numbers: frozenset[Any]) -> None:
+    def hear_left(self, life: Life, host: str, numbers: frozenset[Number]) -> None:
         if life.up:
-            life.entries.hear_left(numbers)
+            life.entries.hear_left(host, numbers)
 
     def hear_standing(
         self, plot: int, member: int, life: Life, seq: int, holds: dict[str, Any], knows: Stamp, ended: bool
@@ -249,10 +254,13 @@ class OrderWorld:
         if ended:
             seat.orders.end(life.host, number)
         else:
-            bodies = life.entries.bodies
-            seat.orders.take_standing(
-                life.host, number, seq, vehicles_of(life.host), holds, knows, life.dead, bodies
-            )
+            bodies = {id: cell for id, cell in life.entries.bodies.items() if plot_of(cell) == plot}
+            fresh = (seat.stamp[0], seat.stamp[1] + 1)
+            known = seat.orders.hosts.get(life.host, (0, 0))[0]
+            if number > known:  # a table is skipped, so that two lives begin with different entries
+                seat.stamp = fresh
+                fresh = (fresh[0], fresh[1] + 1)
+            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, fresh)
 
     def drive(self, life: Life) -> None:
         entries, chance = life.entries, self.chance
@@ -270,7 +278,7 @@ class OrderWorld:
             return
         before = path[0]
         follows = len(path) > 1 and bool(path[1].after)
-        if entries.enter_next(vehicle):
+        if entries.place(vehicle) or entries.enter_next(vehicle):
             cell = entries.paths[vehicle][0].cell
             self.counts["moves"] += 1
             self.counts["followed"] += follows
@@ -289,9 +297,9 @@ class OrderWorld:
         if chance.random() < 0.4:
             plot, member = chance.randrange(PLOTS), chance.randrange(MEMBERS)
             seat = self.seats[plot][member]
-            stored = self.first[plot].copy((0, 0)) if self.forgetful and not seat.up else seat.stored
+            stored = self.first[plot] if self.forgetful and not seat.up else seat.stored
             promised = 0 if self.forgetful and not seat.up else seat.promised
-            self.seats[plot][member] = Seat(promised, stored, not seat.up)
+            self.seats[plot][member] = Seat(stored, promised, not seat.up)
             return
         host = chance.choice(HOSTS)
         ours = [life for life in self.lives if life.host == host]

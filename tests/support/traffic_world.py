@@ -214,7 +214,8 @@ class Process:
             at = min(world.next_to(at), key=cost.__getitem__)
             ahead.append(at)
         here = path[0]
-        wants = sorted(world.next_to(here), key=lambda cell: (cost[cell], cell))[:8]
+        held = self.rights.holdings.occupied()
+        wants = sorted(world.next_to(here), key=lambda cell: (cost[cell] + 0.9 * (cell in held), cell))[:8]
         better = sum(cost[cell] < cost[here] for cell in wants)
         pushed = self.rights.holdings.pushed.get(vehicle, 0)
         if pushed:

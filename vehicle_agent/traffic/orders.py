@@ -6,7 +6,7 @@ their own host, or by proof that its life has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agents import agent_of
@@ -252,16 +252,3 @@ class Orders:
         order.pop(number, None)
         if not order:
             self.orders.pop(number[0], None)
-
-
-def copy_of(orders: Orders, stamp: Stamp) -> Orders:
-    """Returns the same entries on their own, as another member has them on file."""
-    return Orders(orders.table(0, "", stamp, {}))
-
-
-def numbers_of(tables: Iterable[Table]) -> Iterator[Number]:
-    """All entries that tables list."""
-    for table in tables:
-        for of in (table.grants, *(fence.entries for fence in table.fences)):
-            for entries in of.values():
-                yield from entries
