@@ -140,6 +140,13 @@ class HostEntries:
         self._end(path[keep:])
         del path[keep:]
 
+    def enter(self, vehicle: str, cell: int) -> None:
+        """The body of a vehicle that has no place is on a cell, or it would enter there and nowhere else."""
+        if vehicle in self.paths and self.paths[vehicle][0].cell != cell:
+            self._end(self.paths.pop(vehicle))
+        self.bodies[vehicle] = cell
+        self.away.discard(vehicle)
+
     def leave(self, vehicle: str) -> None:
         """The vehicle goes nowhere more: it gives back all that it holds."""
         self._end(self.paths.pop(vehicle, ()))

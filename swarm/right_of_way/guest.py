@@ -16,6 +16,8 @@ from swarm.wire.messages.traffic import Granted, Known, Left
 
 MOST_AHEAD = 16
 """Cells ahead of itself that a guest is granted at most."""
+_PATIENCE_NS = 3 * NS_PER_S
+"""For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
 """Greatest age that is sent: half of the message's range, so that a push may still add to it."""
 
@@ -54,6 +56,8 @@ class Guest:
         self._wish = Wish()
         self._since_ns: int | None = None
         """Since when it has wanted to go somewhere; None while it does not."""
+        self._waits_ns: tuple[int, int] | None = None
+        """The cell behind others before which it waits, and since when."""
 
     # --- what its driver says -------------------------------------------------------------------------------
 
@@ -173,8 +177,20 @@ class Guest:
         if self.replaced:
             # Not that it has ended, as a host would: its vehicle still stands there.
             return [AskKnown()] if self._host.ended_alone(now_ns) and self._cell is not None else []
+        self._wait(now_ns)
         standings = self._host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)
         return [*self._host.lefts(now_ns), *standings]
+
+    def _wait(self, now_ns: int) -> None:
+        """Gives back what it waits for in vain, so that no circle of waiting lasts."""
+        held, free = self._host.holdings.path(self.vehicle), len(self.cells)
+        before, self._waits_ns = self._waits_ns, None
+        if len(held) > free:
+            cell, since_ns = before if before and before[0] == held[free] else (held[free], now_ns)
+            if now_ns - since_ns > _PATIENCE_NS:
+                self._host.holdings.give_back(self.vehicle, free)
+            else:
+                self._waits_ns = cell, since_ns
 
     def _wish_now(self, now_ns: int) -> Wish:
         held, path = self._host.holdings.path(self.vehicle), self._path

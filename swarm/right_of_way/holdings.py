@@ -201,11 +201,10 @@ class Holdings:
         self._paths[vehicle] = [entry.cell for entry in self._entries.paths[vehicle]]
 
     def enter(self, vehicle: str, cell: int) -> None:
-        """States the cell of a vehicle that holds none: its body is there, or it would enter there. If an earlier
+        """States the cell of a vehicle that has no place: its body is there, or it would enter there. If an earlier
         life of ours held it, it takes it, and releases all others. The newest call counts."""
         if vehicle not in self._paths:
-            self._entries.bodies[vehicle] = cell
-            self._entries.away.discard(vehicle)
+            self._entries.enter(vehicle, cell)
             self.watch([self._plots.of(cell)])
 
     def leave(self, vehicle: str) -> None:

@@ -68,7 +68,8 @@ class Driver:
             self._dynamics.begin(seconds)
 
     def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
-        """Makes each drive until it comes to another cell, or its time is over.
+        """Makes each drive until it comes to another cell, or to the border of one that another has not left, or
+        its time is over.
 
         stopped  whether a vehicle has to stand
         """
@@ -106,8 +107,9 @@ class Driver:
                 entering = motion.entering
                 enters = entering is None or self._holdings.may_enter(vehicle.id, entering)
                 left_s = motion.advance(left_s, pace_s_per_m, enters=enters)
-                if not enters and left_s == 0.0:
-                    self._steps.pop(vehicle.id, None)  # it may have stood
+                if not enters and left_s > 0.0:
+                    self._steps.pop(vehicle.id, None)
+                    return left_s  # in this tick another of ours may leave yet
             else:
                 path = self._holdings.open(vehicle.id)
                 passes = partial(self._passes, vehicle)

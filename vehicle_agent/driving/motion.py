@@ -100,10 +100,11 @@ class Motion:
         """
         goal_m = self.border_m if self.done_m < self.border_m else self.length_m
         if not enters and self.entering is not None:
-            goal_m *= _BEFORE_BORDER
-            if goal_m - self.done_m <= seconds / pace_s_per_m:
-                self.done_m = max(goal_m, self.done_m)
-                return 0.0
+            goal_m = max(goal_m * _BEFORE_BORDER, self.done_m)
+            needed_s = (goal_m - self.done_m) * pace_s_per_m
+            if needed_s <= seconds:
+                self.done_m = goal_m
+                return seconds - needed_s
         needed_s = (goal_m - self.done_m) * pace_s_per_m
         if needed_s > seconds:
             self.done_m += seconds / pace_s_per_m
