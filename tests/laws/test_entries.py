@@ -138,7 +138,7 @@ def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
 
 def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
     take = Orders.take_standing
-    patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
+    patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-3], {}, *what[-2:]))
 
 
 # --- rules of members and of lives ------------------------------------------------------------------------------

@@ -260,7 +260,8 @@ class OrderWorld:
             if number > known:  # a table is skipped, so that two lives begin with different entries
                 seat.stamp = fresh
                 fresh = (fresh[0], fresh[1] + 1)
-            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, fresh)
+            placed = set(life.entries.placed)
+            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, placed, fresh)
 
     def drive(self, life: Life) -> None:
         entries, chance = life.entries, self.chance

@@ -6,7 +6,7 @@ their own host, or by proof that its life has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agents import agent_of
@@ -151,6 +151,7 @@ class Orders:
         knows: Stamp,
         dead: Sequence[int],
         bodies: Mapping[str, int],
+        placed: Collection[str],
         fresh: Stamp,
     ) -> bool:
         """A host states what its vehicles hold; what it omits of tables that it knows is over. Returns True if a
@@ -158,6 +159,7 @@ class Orders:
 
         dead    earlier lives of the host that have certainly ended
         bodies  vehicle without a place -> the cell on which its body is, or where it would enter
+        placed  vehicles which have a place
         fresh   stamp of entries that are added
         """
         known, heard = self.hosts.get(host, (0, 0))
@@ -169,11 +171,12 @@ class Orders:
             self._fence(host, known)
         self.remove(host, holds, knows)
         earlier = [of for (of_host, _), of in reversed(self.fenced.items()) if of_host == host]
-        for each in dead:
-            self._open(host, each, bodies)
         for vehicle in {vehicle: None for of in earlier for vehicle in of} if begins and life not in dead else ():
             if vehicle not in self.of and vehicle not in bodies:
                 self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
+        for each in dead:
+            begun = self.of.keys() - bodies.keys() - set(placed)
+            self._open(host, each, bodies, but=begun)
         return begins or any(earlier)
 
     def _fence(self, host: str, life: int) -> None:
@@ -185,9 +188,16 @@ class Orders:
                 fence[vehicle] = [*fence.get(vehicle, ()), *entries]
                 self._fences.update(entries)
 
-    def _open(self, host: str, life: int, bodies: Mapping[str, int]) -> None:
-        """A life has ended: its entries are over, but those on which bodies are."""
-        for vehicle, entries in self.fenced.pop((host, life), {}).items():
+    def _open(self, host: str, life: int, bodies: Mapping[str, int], but: Collection[str] = ()) -> None:
+        """A life has ended: its entries are over, except those on which bodies are, and those of vehicles which
+        are to begin from there and have no place yet."""
+        fence = self.fenced.pop((host, life), {})
+        kept = {vehicle: entries for vehicle, entries in fence.items() if vehicle in but}
+        if kept:
+            self.fenced[host, life] = kept
+        for vehicle, entries in fence.items():
+            if vehicle in kept:
+                continue
             here = [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
             self._fences.difference_update(entries)
             for entry in entries:

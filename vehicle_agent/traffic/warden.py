@@ -146,9 +146,18 @@ class Warden:
         stands = self._stands_of(standing)
         holds = {id: stand.holds for id, stand in stands.items()}
         bodies = {id: stand.cell for id, stand in stands.items() if _is_entering(stand)}
+        placed = {id for id, stand in stands.items() if stand.holds and stand.cell not in stand.wants}
         before = self._orders.by_host_count(host)
         self._granted |= self._orders.take_standing(
-            host, standing.life, standing.seq, holds, standing.knows, standing.dead, bodies, self._next_stamp
+            host,
+            standing.life,
+            standing.seq,
+            holds,
+            standing.knows,
+            standing.dead,
+            bodies,
+            placed,
+            self._next_stamp,
         )
         self._changed |= self._orders.by_host_count(host) != before
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
