@@ -1,6 +1,6 @@
 """Entries: a vehicle's place in the order of vehicles for each cell, as its host acts on them. Pure.
 
-A warden keeps one order of entries for each cell, and appends at its end only (`vehicle_agent.traffic.orders`). The
+A warden keeps one order of entries for each cell, and appends at its end only (`vehicle_agent.traffic.cell_orders`). The
 vehicle of an entry enters the cell once every entry before it is over. An entry is over by the word `Left` of the
 host that had it, or by a usable table that lists it no more; both are facts for good, so loss, repetition, order
 and age of messages do no harm. A vehicle may therefore set out for a cell while another leaves it, and stops at the
@@ -78,7 +78,7 @@ class HostEntries:
             for each in entry.after
             if each in after and ((entry.cell, each[0], each[1]), agent_of(each[2])) not in self.heard
         ]
-        return Entry(entry.number, tuple(before))
+        return Entry(entry.number, before)
 
     def hear_granted(self, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]) -> set[str]:
         """A usable table of a plot names these entries of our vehicles. Returns the vehicles of which the path has

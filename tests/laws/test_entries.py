@@ -11,7 +11,7 @@ from support.order_world import OrderWorld
 
 from swarm.right_of_way.entries import HostEntries
 from swarm.wire.messages.traffic import Entry, Stamp, Table
-from vehicle_agent.traffic.orders import Orders
+from vehicle_agent.traffic.cell_orders import Orders
 
 HISTORIES = 100
 Mutation = Callable[[pytest.MonkeyPatch], Callable[[OrderWorld], None] | None]

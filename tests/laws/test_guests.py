@@ -19,7 +19,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.guest import Guest
 from swarm.right_of_way.host import Host
-from vehicle_agent.traffic.orders import Orders
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.warden import SILENT_NS, Warden
 
 QUIET_S = 12.0

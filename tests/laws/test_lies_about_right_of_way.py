@@ -48,7 +48,7 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
                 )
             )
         case Granted():
-            somewhere = [Entry((chance.randrange(cells), 0, 1), ((0, 1, "a1-00"),)) for _ in range(5)]
+            somewhere = [Entry((chance.randrange(cells), 0, 1), [(0, 1, "a1-00")]) for _ in range(5)]
             return chance.choice(
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),

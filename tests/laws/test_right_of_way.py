@@ -19,8 +19,8 @@ from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Entry
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import Member
-from vehicle_agent.traffic.orders import Orders
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.warden import Warden
 

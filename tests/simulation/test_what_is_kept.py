@@ -20,8 +20,8 @@ from swarm.config.scenario import RoverConfig, Scenario
 from swarm.wire.messages.traffic import Entry, Granted, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.orders import Orders
 from vehicle_agent.traffic.warden import Warden
 
 ROVERS = (
@@ -114,7 +114,7 @@ def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[E
 
     def entry(number: Number, vehicle: str) -> Entry:
         earlier = [each for each in before if each[0][0] == number[0] and each[0][1:] < number[1:]]
-        return Entry(number, tuple((n[1], n[2], of) for n, of in earlier if of != vehicle))
+        return Entry(number, [(n[1], n[2], of) for n, of in earlier if of != vehicle])
 
     standing, cols = warden._hosts[host].standing, warden._plots.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]

@@ -11,7 +11,7 @@ from typing import Any
 
 from swarm.right_of_way.entries import HostEntries
 from swarm.wire.messages.traffic import Entry, Number, Stamp, Table
-from vehicle_agent.traffic.orders import Orders
+from vehicle_agent.traffic.cell_orders import Orders
 
 SIDE, MEMBERS, PLOTS = 6, 3, 2
 HOSTS = ("a", "b", "c", "guest")

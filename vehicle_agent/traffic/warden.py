@@ -17,7 +17,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Number, Stamp, Stand, Standing, Table
-from vehicle_agent.traffic.orders import Orders, cells_beside
+from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S

@@ -46,7 +46,7 @@ class Stand(Part, frozen=True, array_like=True):
     age_ms: Milliseconds
 
 
-class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
+class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing", 9)):
     """All vehicles of a host that hold or request a cell of one plot, sent to one of its members. The newest
     replaces the older.
 
@@ -75,7 +75,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
     """
 
     number: Number
-    after: Annotated[tuple[Before, ...], Meta(max_length=64)] = ()
+    after: Annotated[list[Before], Meta(max_length=64)] = []
 
     @property
     def cell(self) -> int:
@@ -90,7 +90,7 @@ class Fence(Bounded, frozen=True, array_like=True):
     entries: Annotated[dict[VehicleId, Held], LARGE]
 
 
-class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
+class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     """Entries of one plot, for its members. In a publication its author is the plot's warden; in a reply, a member
     which tells what it has stored. The entries of a cell are in the order of their numbers.
 
@@ -123,7 +123,7 @@ class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
     seq: Natural
 
 
-class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
+class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     """Content of a plot's table for one host, once a majority of the plot's members has it on file.
 
     agent        the plot's warden

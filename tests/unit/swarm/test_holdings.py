@@ -72,7 +72,7 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
 def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
-    waits = Entry((10, 1, 2), ((1, 1, "a1-00"),))
+    waits = Entry((10, 1, 2), [(1, 1, "a1-00")])
     held = {"a0-00": [Entry((9, 1, 1)), waits]}
     granted = msgspec.structs.replace(granted_of(table_of(1, 2, a0=[9])), grants=held)
     holdings.hear_granted(granted, S)

@@ -127,7 +127,7 @@ class Orders:
         if len(self.orders[number[0]]) == 1:
             return Entry(number)
         before: list[Before] = [(other[1], other[2], of) for other, of in self.before(number, vehicle)]
-        return Entry(number, tuple(before))
+        return Entry(number, before)
 
     def followed(self) -> dict[str, dict[str, list[Number]]]:
         """Returns host -> other host -> entries of the first behind which vehicles of the other wait."""
