@@ -1,10 +1,10 @@
 """Entries: a vehicle's place in the order of vehicles for each cell, as its host acts on them. Pure.
 
-A warden keeps one order of entries for each cell, and appends at its end only (`vehicle_agent.traffic.cell_orders`). The
-vehicle of an entry enters the cell once every entry before it is over. An entry is over by the word `Left` of the
-host that had it, or by a usable table that lists it no more; both are facts for good, so loss, repetition, order
-and age of messages do no harm. A vehicle may therefore set out for a cell while another leaves it, and stops at the
-border of its own cell until the word is there.
+A warden keeps one order of entries for each cell, and appends at its end only
+(`vehicle_agent.traffic.cell_orders`). The vehicle of an entry enters the cell once every entry before it is over.
+An entry is over by the word `Left` of the host that had it, or by a usable table that lists it no more. Both are
+facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
+cell while another leaves it, and stops at the border of its own cell until the word is there.
 
 Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 
@@ -17,7 +17,7 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
    have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
    the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, at the end of the
-   order of a cell which the earlier life held.
+   order of a cell which the earlier life held; the others are over once it has a place there.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def as_written(message: Message) -> Fields | None:
 
 
 FIRST_SHARED = 10
-"""Builds of this wire version and later share no run with those before: their rules of right of way differ, by which
+"""Builds of this wire version and later share no run with those before, which have other rules of right of way:
 vehicles of the two would meet."""
 
 

@@ -45,9 +45,8 @@ def neighbour_tree(folder: Path) -> Path:
     tree = folder / f"tree-{commit[:8]}"
     with tarfile.open(fileobj=io.BytesIO(archive)) as files:
         files.extractall(tree, filter="data")
-    found = re.search(
-        r"^WIRE_VERSION = (\d+)", (tree / "swarm/wire/messages/__init__.py").read_text(), re.MULTILINE
-    )
+    messages = (tree / "swarm" / "wire" / "messages" / "__init__.py").read_text(encoding="utf-8")
+    found = re.search(r"^WIRE_VERSION = (\d+)", messages, re.MULTILINE)
     if found is None or not are_neighbours(int(found[1]), WIRE_VERSION):
         pytest.skip("the version before this one shares no run with it")
     return tree
