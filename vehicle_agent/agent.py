@@ -362,6 +362,7 @@ class Agent:
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
+            self._driver.wait(vehicle, now_ns)
             path = paths[vehicle.id]
             if len(path) > 1 and vehicle.motion.at_rest:
                 # Late grants may be closed by now, and would be held for ever.

@@ -14,8 +14,8 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
+from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Left, Standing, Stored, Table
+from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import SLOW_NS, AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -120,6 +120,7 @@ class RightOfWaySync:
         self._bus.subscribe(TABLE, self._post, member=self._id)
         self._bus.subscribe(STORED, self._post, member=self._id)
         self._bus.collect(GRANTED, host=self._id)
+        self._bus.collect(LEFT, host=self._id)
         self._ask_known(now_ns)
 
     def on_cells_event(self, event: Event, now_ns: int) -> bool:
@@ -157,8 +158,12 @@ class RightOfWaySync:
         return True
 
     def take_granted(self, now_ns: int) -> Iterator[list[str]]:
-        """Takes in what wardens have granted since the last time, before vehicles drive. Yields the vehicles that
-        have found their places by each message; they are to be placed before the next."""
+        """Takes in what wardens have granted, and other hosts have left, since the last time, before vehicles
+        drive. Yields the vehicles that have found their places by each message; they are to be placed before the
+        next."""
+        for heard in self._bus.collected(LEFT):
+            assert isinstance(heard.message, Left)
+            yield self.core.host.hear_left(heard.message)
         for heard in self._bus.collected(GRANTED):
             assert isinstance(heard.message, Granted)
             yield self.core.host.hear_granted(heard.message, self._own_time.at(now_ns))
@@ -272,6 +277,8 @@ class RightOfWaySync:
                 case Tell(members, standing):
                     for member in members:
                         self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self._id)
+                case Left():
+                    self._bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case Granted():
                     self._bus.publish(GRANTED, action, plot=action.plot, host=action.host, agent=self._id)
                 case Table():

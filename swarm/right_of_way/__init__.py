@@ -3,9 +3,9 @@ restart.
 
 The map is cut into *plots* (`lock_regions`): lock regions. Three agents are the *members* of a plot, and one of
 them is its *warden*: the leader, by epoch and majority. A *host* is a process with vehicles in a plot or at its
-border. It asks the warden for cells and drives into those only that were granted. A *life* is one incarnation
-of a host. A grant is never revoked and never runs out: a cell is free again by the word of its host alone. Only
-authority is leased.
+border. A *life* is one incarnation of a host. The warden keeps an order of *entries* for each cell (`entries`): the
+vehicle of an entry enters the cell once all before it are over. An entry is never revoked and never runs out: it is
+over by the word of its host alone. Only authority is leased.
 
 This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in
 docs/design/right-of-way.md, and docs/design/external-vehicles.md says how guests come into it. All but
@@ -17,32 +17,42 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
    word. First ask all agents (`KnownRequest`), until enough members of every plot have replied that one of them
    has its newest usable table.
 2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
-   Cells that it omits are released.
-3. Enter a cell only if a `Granted` for this life, newer than all that it knows of the plot, adds it to the path
-   of the vehicle. Never go back to an older table of a plot, not even after the vehicles have left it.
-4. Never ask for a released cell while a table still grants it: granted again, the cell could not be told from one
-   that is about to be freed.
-5. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
-6. Speak to the warden, and to all members where no warden was heard for half a second.
+   Entries that it omits are over.
+3. Enter a cell only by an entry that a `Granted` for this life, newer than all that it knows of the plot, adds to
+   the path of the vehicle, and only once all entries before it are over. Never go back to an older table of a plot,
+   not even after the vehicles have left it.
+4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
+   table lists it no more. Never use such an entry again.
+5. Give back what waits for others that do not go on: circles over several plots end by it.
+6. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
+7. Speak to the warden, and to all members where no warden was heard for half a second.
 
-Messages (`swarm.wire.messages.traffic`), each of which carries the whole state of its key:
+Duties of a warden:
+
+1. Add an entry at the end of a cell's order only, one to a cell and table, and remove it by the word of its host
+   only: a statement that knows the table which added it and omits it, or proof that its life has ended.
+2. Put a vehicle only behind one that goes on, and never so that it would wait for itself.
+3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
+
+Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
 
 `Standing`      Host to warden: all vehicles of the host that hold or want a cell of one plot, each with its
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
-                what that granted, the host holds no more than it lists. `dead` are lives that are proved to
-                have ended, by which their cells are opened.
-`Table`         Warden to members: who may be where in one plot. Its stamp is (epoch, seq).
+                what that added, the host holds no more than it lists. `dead` are lives that are proved to
+                have ended, by which their entries are over.
+`Table`         Warden to members: the entries of one plot. Its stamp is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable.
-`Granted`       Warden to host: what a usable table says of the vehicles of one host, under its stamp. A host
-                takes the cells that follow the path of the vehicle, and passes over the others, which gives
-                them back. `pushed` asks a vehicle to make way into another plot; `occupied` are the cells of
-                others around.
+`Granted`       Warden to host: what a usable table says of the vehicles of one host, under its stamp, each entry
+                with those before it, and which other hosts follow. A host takes the entries that continue the path
+                of the vehicle, and passes over the others, which gives them back. `pushed` asks a vehicle to make
+                way into another plot; `occupied` are the cells of others around.
+`Left`          Host to host: these entries are over.
 `Claim`         Member to members, where no warden was heard for 0.6 s, longer where round trips are: who answers
                 with its table promises to store nothing of a lower epoch. Two promises make a warden, which goes on
                 from the newest table of the two.
 `KnownRequest`  New life to all agents: what is on file of this host?
-`Known`         The answer: the greatest life in any table, the plots that grant cells to the host or keep them
-                shut, and, for a guest, who the agents are and how large plots are.
+`Known`         The answer: the greatest life in any table, the plots that list entries of the host, and, for a
+                guest, who the agents are and how large plots are.
 
 A *guest* (`Guest`) is a host that is not in the scenario. It is a member of no plot, so who joins and leaves
 changes no majority. It enters from nowhere: a standing asks for its first cell and holds nothing. It leaves by

@@ -12,10 +12,12 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Known
+from swarm.wire.messages.traffic import Granted, Known, Left
 
 MOST_AHEAD = 16
 """Cells ahead of itself that a guest is granted at most."""
+_PATIENCE_NS = 3 * NS_PER_S
+"""For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
 """Greatest age that is sent: half of the message's range, so that a push may still add to it."""
 
@@ -27,7 +29,7 @@ class SaveLives:
     lives: list[int]
 
 
-GuestAction = AskKnown | SaveLives | Tell
+GuestAction = AskKnown | SaveLives | Tell | Left
 
 
 class Guest:
@@ -45,7 +47,7 @@ class Guest:
     def __init__(self, plots: Plots, name: str, lives: Sequence[int] = ()) -> None:
         self.vehicle = f"{name}-00"
         self.plots = plots
-        self._host = Host(plots, name, [self.vehicle], lambda vehicle, cells: None)
+        self._host = Host(plots, name, [self.vehicle])
         self._lives = list(lives)
         self._cell: int | None = None
         """Its cell, or the one that it would enter; None while it is away."""
@@ -54,13 +56,15 @@ class Guest:
         self._wish = Wish()
         self._since_ns: int | None = None
         """Since when it has wanted to go somewhere; None while it does not."""
+        self._waits_ns: tuple[int, int] | None = None
+        """The cell behind others before which it waits, and since when."""
 
     # --- what its driver says -------------------------------------------------------------------------------
 
     @property
     def cells(self) -> tuple[int, ...]:
         """The cells that it may stand on and enter, in driving order, its own first."""
-        return () if self.replaced else tuple(self._host.holdings.path(self.vehicle))
+        return () if self.replaced else tuple(self._host.holdings.open(self.vehicle))
 
     @property
     def replaced(self) -> bool:
@@ -100,7 +104,7 @@ class Guest:
 
         Raises ValueError if the path does not begin where it stands, or leaps, or it has not entered.
         """
-        held = self.cells
+        held = () if self.replaced else self._host.holdings.path(self.vehicle)
         if not held or not path or path[0] != held[0]:
             where = f"cell {held[0]}" if held else "no cell"
             raise ValueError(f"the path must begin at the vehicle's cell: it holds {where}")
@@ -156,6 +160,10 @@ class Guest:
         """A warden's word to us. Returns True if the vehicle has entered by it."""
         return bool(self._host.hear_granted(granted, now_ns))
 
+    def hear_left(self, left: Left) -> bool:
+        """Another host's word to us. Returns True if the vehicle has entered by it."""
+        return bool(self._host.hear_left(left))
+
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""
         self._host.hear_token(peer, up=up)
@@ -169,10 +177,23 @@ class Guest:
         if self.replaced:
             # Not that it has ended, as a host would: its vehicle still stands there.
             return [AskKnown()] if self._host.ended_alone(now_ns) and self._cell is not None else []
-        return [*self._host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)]
+        self._wait(now_ns)
+        standings = self._host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)
+        return [*self._host.lefts(now_ns), *standings]
+
+    def _wait(self, now_ns: int) -> None:
+        """Gives back what it waits for in vain, so that no circle of waiting lasts."""
+        held, free = self._host.holdings.path(self.vehicle), len(self.cells)
+        before, self._waits_ns = self._waits_ns, None
+        if len(held) > free:
+            cell, since_ns = before if before and before[0] == held[free] else (held[free], now_ns)
+            if now_ns - since_ns > _PATIENCE_NS:
+                self._host.holdings.give_back(self.vehicle, free)
+            else:
+                self._waits_ns = cell, since_ns
 
     def _wish_now(self, now_ns: int) -> Wish:
-        held, path = self.cells, self._path
+        held, path = self._host.holdings.path(self.vehicle), self._path
         after = path.index(held[-1]) + 1 if held and held[-1] in path else len(path)
         ahead = list(path[after : after + max(MOST_AHEAD + 1 - len(held), 0)])
         self._since_ns = (self._since_ns or now_ns) if ahead else None
@@ -196,7 +217,7 @@ class Removal:
 
     def __init__(self, plots: Plots, name: str) -> None:
         self.plots = plots
-        self._host = Host(plots, name, None, lambda vehicle, cells: None)
+        self._host = Host(plots, name, None)
         self._lives: set[int] = set()
 
     @property

@@ -25,8 +25,8 @@ from swarm.right_of_way.incarnations import MemoryLives
 from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest
-from swarm.wire.topics import GRANTED, KNOWN, STANDING
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
+from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING
 
 _NOBODY_NS = 10 * NS_PER_S
 """Time without a reply after which a guest is informed of it."""
@@ -85,12 +85,14 @@ class GuestService:
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role=_ROLE)
         self._bus.subscribe(GRANTED, self._post, host=self.name)
+        self._bus.subscribe(LEFT, self._post, host=self.name)
         self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
         self._began_ns = now_ns
         self._ask(now_ns)
 
     def stop(self) -> None:
         self._bus.unsubscribe(GRANTED, host=self.name)
+        self._bus.unsubscribe(LEFT, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
         """Asks for the cell on which the vehicle stands. Raises as `Guest.enter`."""
@@ -116,6 +118,9 @@ class GuestService:
             case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
                 if self.guest is not None:
                     self.guest.hear_granted(granted, now_ns)
+            case Heard(topic=topic, message=Left() as left) if topic is LEFT and left.host == self.name:
+                if self.guest is not None:
+                    self.guest.hear_left(left)
             case Replied(tag=self._tag, message=Known() as known):
                 self._hear_known(known)
             case AskEnded(tag=self._tag):
@@ -181,6 +186,8 @@ class GuestService:
                     self._ask(now_ns)
                 case SaveLives(lives):
                     self._lives.save(lives)
+                case Left() as left:
+                    self._bus.publish(LEFT, left, host=left.host, agent=self.name)
                 case Tell(members, standing):
                     for member in members:
                         self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self.name)

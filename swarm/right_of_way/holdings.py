@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, takewhile
 
 import msgspec
 
+from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
+from swarm.wire.messages.traffic import Granted, Left, Number, Stand, Standing
 
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
-_BEFORE_ALL: Stamp = (0, 0)
 _MOST_CELLS = 1 << 12
 """Cells whose plot is remembered: more than the vehicles of one host have near them."""
-Place = Callable[[str, Sequence[int]], int | None]
-"""On which of the cells that it was granted a vehicle of a new life stands; None if it does not stand there."""
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -38,7 +36,6 @@ class Wish(msgspec.Struct, frozen=True):
 
 
 _NO_WISH = Wish()
-_NO_CELLS: Sequence[int] = []
 _NO_STANDS: Mapping[str, _Told] = {}
 
 
@@ -55,9 +52,10 @@ class _View:
     """State of one plot as a host knows it.
 
     warden   of the last grant, and the time when that was received
-    knows    stamp of the table in use; it never goes back, not even when the vehicles leave the plot and return
     heard    the newest standing of ours that the table in use takes into account
-    seen     vehicle -> the cells that the table in use grants it
+    seen     vehicle -> its entries in the table in use
+    followed  other host -> entries of ours behind which its vehicles wait, by the same table
+    left     other host -> those of these that are over, as we told it last, and when
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet    the first standing from which on we want nothing here; None while we do
@@ -67,9 +65,10 @@ class _View:
 
     warden: str = ""
     heard_ns: int = 0
-    knows: Stamp = _BEFORE_ALL
     heard: int = 0
-    seen: dict[str, list[int]] = field(default_factory=dict)
+    seen: dict[str, list[Number]] = field(default_factory=dict)
+    followed: dict[str, list[Number]] = field(default_factory=dict)
+    left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
@@ -116,12 +115,9 @@ class Holdings:
         self.replaced = False
         self.plots: dict[int, None] = {}
         self._dead: list[int] = []
+        self._entries = HostEntries(0, self._plot_of, self._plots.adjacent)
         self._paths: dict[str, list[int]] = {}
-        """Vehicle -> the cells that it holds, in driving order; another list when they change."""
-        self._enters: dict[str, int] = {}
-        """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
-        self._away: set[str] = set()
-        """Vehicles that have left in this life: cells that are still granted to them are released."""
+        """Vehicle that has a place -> the cells that it holds, in driving order; another list when they change."""
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
@@ -134,7 +130,7 @@ class Holdings:
 
     def begin(self, life: int, dead: Sequence[int]) -> None:
         """Begins a life; `dead` are earlier ones that are proved to have ended."""
-        self.life = life
+        self.life = self._entries.life = life
         self._dead = list(dead)
 
     def end_at_once(self) -> None:
@@ -170,39 +166,60 @@ class Holdings:
             occupied |= self._views[plot].others
         return occupied
 
+    def may_enter(self, vehicle: str, cell: int) -> bool:
+        """Returns True if a vehicle may drive into a cell of its path now: those before it have left."""
+        path = self._entries.paths[vehicle]
+        for entry in path[1:]:
+            if not self._entries.may_enter(entry):
+                return False
+            if entry.cell == cell:
+                return True
+        return False
+
+    def open(self, vehicle: str) -> Sequence[int]:
+        """The first cells of a path, up to the first that the vehicle may not enter yet."""
+        path = self.path(vehicle)
+        if not any(entry.after for entry in self._entries.paths.get(vehicle, ())):
+            return path
+        return [*path[:1], *takewhile(lambda cell: self.may_enter(vehicle, cell), path[1:])]
+
     def moved(self, vehicle: str, cell: int) -> None:
-        """It has come to the next cell of its path."""
-        path = self._paths[vehicle]
-        self._paths[vehicle] = path[path.index(cell) :]
+        """It has come to a later cell of its path. Raises ValueError if it must not be there."""
+        while self._paths[vehicle][0] != cell:
+            if not self._entries.enter_next(vehicle):
+                raise ValueError(f"{vehicle} must not enter cell {cell}: it holds {self._paths[vehicle]}")
+            self._set_path(vehicle)
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
         """Keeps only the first cells of the path. The rest must not be entered any more."""
         keep = max(keep, 1)
         if len(self._paths[vehicle]) > keep:
-            self._paths[vehicle] = self._paths[vehicle][:keep]
+            self._entries.give_back(vehicle, keep)
+            self._set_path(vehicle)
+
+    def _set_path(self, vehicle: str) -> None:
+        self._paths[vehicle] = [entry.cell for entry in self._entries.paths[vehicle]]
 
     def enter(self, vehicle: str, cell: int) -> None:
-        """Asks for a first cell for a vehicle that holds none; the newest call counts. If an earlier life of ours
-        was granted cells for it, it takes this one of them and releases all others."""
+        """States the cell of a vehicle that has no place: its body is there, or it would enter there. If an earlier
+        life of ours held it, it takes it, and releases all others. The newest call counts."""
         if vehicle not in self._paths:
-            self._enters[vehicle] = cell
-            self._away.discard(vehicle)
+            self._entries.enter(vehicle, cell)
             self.watch([self._plots.of(cell)])
 
     def leave(self, vehicle: str) -> None:
         """It stands nowhere any more: give back all that it holds."""
-        self._enters.pop(vehicle, None)
+        self._entries.leave(vehicle)
         self._paths.pop(vehicle, None)
         said = self._said.pop(vehicle, None)
         for plot in () if said is None else said.stands:
             del self._stands[plot][vehicle]
             self._views[plot].same = False
-        self._away.add(vehicle)
 
     @property
     def gone(self) -> bool:
         """True if no vehicle of ours holds or requests a cell, and all wardens that we contacted know it."""
-        return not (self.plots or self._paths or self._enters)
+        return not (self.plots or self._entries.paths or self._entries.bodies)
 
     @property
     def answered(self) -> bool:
@@ -214,7 +231,7 @@ class Holdings:
         return any(vehicle in view.seen for view in self._views.values())
 
     def waiting(self, plot: int) -> list[str]:
-        """The vehicles that hold cells of a plot, as far as its table in use tells."""
+        """The vehicles that have entries in a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []
 
     def heard_ns(self, plot: int) -> int:
@@ -229,74 +246,56 @@ class Holdings:
             self.plots.setdefault(plot)
             self._views.setdefault(plot, _View())
 
-    def hear_granted(self, granted: Granted, place: Place, now_ns: int) -> list[str]:
+    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
         """Act on what a warden says to us, if it is newer than what we know. Returns the vehicles that have found
-        their place.
-
-        place  tells on which of the cells that it was granted a vehicle stands
-        """
+        their place."""
         view = self._views.setdefault(granted.plot, _View())
-        if granted.epoch > view.knows[0] + FURTHEST_EPOCH or granted.seq > _FURTHEST_SEQ:
+        knows = self._entries.knows.get(granted.plot, BEFORE_ALL)
+        if granted.epoch > knows[0] + FURTHEST_EPOCH or granted.seq > _FURTHEST_SEQ:
             self.refused.append(f"{granted.agent} names a table that is implausibly far ahead: {granted.stamp}")
             return []
-        if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < view.knows:
+        if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < knows:
             return []
         view.warden, view.heard_ns = granted.agent, now_ns
         self.newest = max(self.newest, granted.life)
         if granted.life > self.life and not self.replaced:
             self.replaced = True
             self._say_all_again()
-        if granted.stamp == view.knows or granted.life != self.life:
+        if granted.stamp == knows or granted.life != self.life or self.replaced:
             return []  # what it grants was granted to another life
-        view.knows, view.heard = granted.stamp, granted.heard
-        view.same = False
+        view.heard, view.same = granted.heard, False
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
+        view.followed = granted.followed
         self._pushed = None
-        return self._take(view, granted, place)
+        ours = {
+            id: entries
+            for id, entries in granted.grants.items()
+            if (self._vehicles is None or id in self._vehicles)
+            and {self._plot_of(entry.cell) for entry in entries} == {granted.plot}
+        }
+        before, view.seen = view.seen, {id: [entry.number for entry in entries] for id, entries in ours.items()}
+        changed = self._entries.hear_granted(granted.plot, granted.stamp, granted.life, ours)
+        self._seen_anew.update(changed, [id for id in before if before[id] != view.seen.get(id)])
+        for vehicle in changed & self._paths.keys():
+            self._set_path(vehicle)
+        return self._place()
 
-    def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
-        """Takes in the cells that are granted to each vehicle."""
-        before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of
-        view.seen = grants
-        changed = [id for id, cells in grants.items() if before.get(id) != cells or id not in paths]
-        self._seen_anew.update(changed, [id for id in before if id not in grants])
-        placed = []
-        for vehicle in changed:
-            cells, seen = grants[vehicle], before.get(vehicle, _NO_CELLS)
-            ours = self._vehicles is None or vehicle in self._vehicles
-            if not ours or {*map(plot_of, cells)} != {granted.plot}:
-                view.seen = {id: each for id, each in view.seen.items() if id != vehicle}
-            elif vehicle in paths:
-                self._extend(vehicle, cells, seen)
-            elif (cell := self._first_cell(vehicle, cells, seen, place)) is not None:
-                paths[vehicle] = [cell]
-                placed.append(vehicle)
+    def hear_left(self, left: Left) -> list[str]:
+        """Another host says what its vehicles have left. Returns the vehicles that have found their place."""
+        self._entries.hear_left(left.agent, left.entries)
+        return self._place()
+
+    def _place(self) -> list[str]:
+        """Puts vehicles that are nowhere on the first cell of their paths, where they may."""
+        entries = self._entries
+        for vehicle in entries.paths.keys() - self._paths.keys():
+            entries.place(vehicle)
+        placed = [vehicle for vehicle in entries.paths if vehicle in entries.placed and vehicle not in self._paths]
+        for vehicle in placed:
+            entries.bodies.pop(vehicle, None)
+            self._set_path(vehicle)
         return placed
-
-    def _first_cell(self, vehicle: str, cells: Sequence[int], seen: Sequence[int], place: Place) -> int | None:
-        """Returns the first cell of a vehicle that holds none, from the cells granted to it; None if there is none.
-        A grant to a life before it was replaced may come late: its successor may have released that cell."""
-        if vehicle in self._away or self.replaced:
-            return None
-        cell = self._enters.get(vehicle)
-        if cell is None:
-            return place(vehicle, cells)
-        if cell not in cells or cell in seen:  # one that was seen before may be about to be freed
-            return None
-        del self._enters[vehicle]
-        return cell
-
-    def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
-        """Adds newly granted cells. One that does not follow the path is left, and so given back."""
-        path = self._paths[vehicle]
-        first = len(cells)
-        while first and cells[first - 1] not in path:
-            first -= 1
-        for cell in cells[first:]:
-            if cell in seen or not self._plots.adjacent(path[-1], cell):
-                return
-            path = self._paths[vehicle] = [*path, cell]
 
     # --- what to say ----------------------------------------------------------------------------------------
 
@@ -307,17 +306,39 @@ class Holdings:
         self._say_changed(wishes)
         by_plot = {plot: self._stands.get(plot, _NO_STANDS) for plot in self.plots}
         by_plot.update((plot, stands) for plot, stands in self._stands.items() if stands)
-        for vehicle, cell in self._enters.items():
-            if not any(cell in view.seen.get(vehicle, ()) for view in self._views.values()):
-                plot, stand = self._plots.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
-                by_plot[plot] = {**by_plot.get(plot, _NO_STANDS), vehicle: (stand, stand)}
-                self._views[plot].same = False
+        entries = self._entries
+        for vehicle, cell in entries.bodies.items():
+            if vehicle not in entries.paths:
+                self._say_entering(by_plot, self._plots.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0))
+        for vehicle, path in entries.paths.items():
+            if vehicle not in self._paths:
+                cell, end = path[0].cell, path[-1].cell
+                for plot, held in entries.of(vehicle).items():
+                    self._say_entering(by_plot, plot, Stand(vehicle, cell, end, held, [], [cell], 1, 0))
         self._forget_left(by_plot)
         return [
             Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for stand, _ in stands.values()]))
             for plot, stands in by_plot.items()
             if self._is_news(plot, stands, now_ns)
         ]
+
+    def _say_entering(self, by_plot: dict[int, Mapping[str, _Told]], plot: int, stand: Stand) -> None:
+        """States what a vehicle that is nowhere has and wants of a plot."""
+        by_plot[plot] = {**by_plot.get(plot, _NO_STANDS), stand.vehicle: (stand, stand)}
+        self._views.setdefault(plot, _View()).same = False
+
+    def lefts(self, now_ns: int) -> list[Left]:
+        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a beat old."""
+        words: dict[str, list[Number]] = {}
+        for plot, view in self._views.items():
+            over = self._entries.over.get(plot, set())
+            for host, numbers in view.followed.items():
+                told, told_ns = view.left.get(host, (None, 0))
+                left = [number for number in numbers if number in over]
+                if left and (left != told or not 0 <= now_ns - told_ns < BEAT_NS):
+                    view.left[host] = left, now_ns
+                    words.setdefault(host, []).extend(left)
+        return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
 
     def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
         """Rebuilds the statements about vehicles of which path, wish or granted cells have changed."""
@@ -356,7 +377,7 @@ class Holdings:
             agent=self._agent,
             life=self.life,
             seq=self._seq,
-            knows=self._views[plot].knows,
+            knows=self._entries.knows.get(plot, BEFORE_ALL),
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
@@ -372,9 +393,10 @@ class Holdings:
         view = self._views[plot]
         lately = 0 <= now_ns - view.told_ns < BEAT_NS
         if not view.same:
-            # A granted cell that we do not hold is freed only if we state so, knowing that table.
+            # An entry that we do not hold is freed only if we state so, knowing that table.
             in_step = view.seen == {id: stand.holds for id, (stand, _) in stands.items() if stand.holds}
-            knows = view.knows[0] if in_step else view.knows
+            stamp = self._entries.knows.get(plot, BEFORE_ALL)
+            knows = stamp[0] if in_step else stamp
             told = (self.replaced, knows, [news for _, news in stands.values()])
             lately = lately and told == view.told
             view.told, view.same = told, True
@@ -384,39 +406,21 @@ class Holdings:
         return True
 
     def _say(self, vehicle: str, path: list[int], wish: Wish) -> _Said:
-        asked = self._askable(vehicle, path, wish)
-        ahead, wants, better = [*asked.ahead], list[int](), 0
+        ahead, wants, better = [*wish.ahead], list[int](), 0
         if len(path) == 1:
-            wants, better = [*asked.wants], asked.better
+            wants, better = [*wish.wants], wish.better
         plot_of = self._plot_of
         concerned = [*path, *ahead[:1], *wants]
         near: Collection[int] = {*map(plot_of, concerned)}
         if len(near) > 1:
             near = dict.fromkeys(plot for plot in map(plot_of, concerned) if plot >= 0)
         stands: dict[int, _Told] = {}
+        held = [entry.number for entry in self._entries.paths[vehicle]]
         for plot in near:
-            holds = path if len(near) == 1 else [cell for cell in path if plot_of(cell) == plot]
-            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
+            holds = held if len(near) == 1 else [number for number in held if plot_of(number[0]) == plot]
+            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms)
             stands[plot] = stand, (vehicle, path[0], holds, ahead, better)
         return _Said(wish, path, stands)
-
-    def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
-        """Excludes released cells which a table still grants: granted again, such a cell could not be told from one
-        that is about to be freed."""
-        wanted = {*wish.ahead, *wish.wants}
-        if not wanted:
-            return wish
-        lapsed: set[int] = set()
-        for plot in set(map(self._plot_of, wanted)):
-            view = self._views.get(plot)
-            if view is not None and vehicle in view.seen:
-                lapsed.update(wanted.intersection(view.seen[vehicle]))
-        lapsed.difference_update(path)
-        if not lapsed:
-            return wish
-        ahead = list(takewhile(lambda cell: cell not in lapsed, wish.ahead))
-        better = sum(cell not in lapsed for cell in wish.wants[: wish.better])
-        return Wish(ahead, [cell for cell in wish.wants if cell not in lapsed], better, wish.age_ms)
 
     def _forget_left(self, by_plot: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leaves the plots where we hold and want nothing, once their tables show that they know it."""

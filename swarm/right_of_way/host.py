@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer, Roster
-from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
+from swarm.right_of_way.holdings import Holdings, Tell, Wish
 from swarm.right_of_way.incarnations import first_life, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted
+from swarm.wire.messages.traffic import Granted, Left
 
 LIVES_KEPT = 32
 """Numbers of lives on file, as many as a `Standing` has room for."""
@@ -19,11 +19,6 @@ _ALONE_NS = NS_PER_S // 2
 """A life that has been replaced begins again once no other process of its host has been alive for so long."""
 _UNLED_NS = 2 * NS_PER_S
 """A plot that is silent for so long has no warden; another one takes over within a second where it can."""
-
-
-def first_of(vehicle: str, cells: Sequence[int]) -> int:
-    """A `Place` of hosts that remember nothing."""
-    return cells[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +29,15 @@ class AskKnown:
 class Host:
     """A host's part in right of way; whether it is also a member of plots is nothing to it.
 
-    name   of the agent or guest
-    place  tells on which of the cells that it was granted a vehicle of a new life stands
+    name  of the agent or guest
 
     holdings  which cells our vehicles hold: none before `begin`
     """
 
-    def __init__(self, plots: Plots, name: str, vehicles: Collection[str] | None, place: Place = first_of) -> None:
+    def __init__(self, plots: Plots, name: str, vehicles: Collection[str] | None) -> None:
         self.name = name
         self.plots = plots
         self.holdings = Holdings(plots, name, vehicles)
-        self._place = place
         self._known_life = 0
         self._told_by: set[str] = set()
         """Agents that have sent us their knowledge of us."""
@@ -84,10 +77,14 @@ class Host:
         """A warden's word to us. Returns the vehicles that have found their place."""
         if not self.holdings.life or granted.plot not in self.holdings.plots:
             return []
-        placed = self.holdings.hear_granted(granted, self._place, now_ns)
+        placed = self.holdings.hear_granted(granted, now_ns)
         if self.holdings.heard_ns(granted.plot) == now_ns:
             self._led_ns[granted.plot] = now_ns
         return placed
+
+    def hear_left(self, left: Left) -> list[str]:
+        """Another host's word to us. Returns the vehicles that have found their place."""
+        return self.holdings.hear_left(left) if left.host == self.name and self.holdings.life else []
 
     def have_left(self, vehicles: Iterable[str]) -> bool:
         """Returns True if these vehicles left in an earlier life: each plot which concerns us has answered this
@@ -102,6 +99,10 @@ class Host:
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
         """Returns the statements of our vehicles to publish now."""
         return self.holdings.standings(wishes, now_ns) if self.holdings.life else []
+
+    def lefts(self, now_ns: int) -> list[Left]:
+        """Returns the words to publish now that vehicles of other hosts wait for."""
+        return self.holdings.lefts(now_ns) if self.holdings.life and not self.holdings.replaced else []
 
     def ended_alone(self, now_ns: int) -> bool:
         """Returns True if a replaced life is to begin again, as its successor has ended. It holds and knows nothing

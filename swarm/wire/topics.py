@@ -257,6 +257,13 @@ GRANTED = Topic(
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
+LEFT = Topic(
+    "left", "left/{host}/{agent}", traffic.Left,
+    "which cells vehicles of a host have left, for another host whose vehicles follow them; each counts",
+    "on change, and at 5 Hz until the warden has counted it",
+    access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False, trusted=True,
+    priority=Priority.INTERACTIVE, put_bytes=_LONG,
+)  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
     "per table by one member, 5 Hz by the other; 5 Hz by the warden, instead of a table that both have on file",
@@ -429,8 +436,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
-    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, LEFT, STORED,
+    KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES, SHORT_ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip

@@ -122,6 +122,11 @@ def as_written(message: Message) -> Fields | None:
     return {"schema": _before(newest)} | step.lowered(fields)
 
 
+FIRST_SHARED = 10
+"""Builds of this wire version and later share no run with those before, which have other rules of right of way:
+vehicles of the two would meet."""
+
+
 def are_neighbours(one: int, other: int) -> bool:
     """Returns True if builds of two wire versions may share a run."""
-    return abs(one - other) <= 1
+    return abs(one - other) <= 1 and (one < FIRST_SHARED) == (other < FIRST_SHARED)

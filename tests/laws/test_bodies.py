@@ -11,6 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.plot_tables import grants_of
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
@@ -208,9 +209,9 @@ def agent_at(cells: list[int]) -> Agent:
 
 
 def grant(agent: Agent, seq: int, cells: dict[str, list[int]]) -> None:
-    warden = PLOTS.warden(0, 1)
-    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=cells)
-    agent.place(agent.holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
+    warden, grants = PLOTS.warden(0, 1), grants_of(agent.holdings, seq, cells)
+    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+    agent.place(agent.holdings.hear_granted(granted, seq))
 
 
 @dataclass

@@ -16,9 +16,10 @@ from support.guest_world import GuestProcess, GuestWorld
 from support.traffic_world import Faults, random_faults
 
 from swarm.config.agents import agent_of
+from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.guest import Guest
-from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.host import Host
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.warden import SILENT_NS, Warden
 
 QUIET_S = 12.0
@@ -85,32 +86,27 @@ def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
         for process in world.processes:
             for member in process.rights._members.values():
                 if member.warden is not None:
-                    held = [*member.stored.grants, *(each.agent for each in member.stored.shut if each.cells)]
+                    held = [*member.stored.grants, *(each.agent for each in member.stored.fences)]
                     assert not set(map(agent_of, held)).intersection(world.robots)
 
 
 # --- the rules, each taken out ------------------------------------------------------------------------------
 
 
-def first_cells_are_granted_to_whoever_asks(patch: pytest.MonkeyPatch) -> None:
-    grant = Warden._grant
-
-    def generous(self: Warden, stand, ahead, held, taken):  # type: ignore[no-untyped-def]
-        entering = not stand.holds and list(ahead[:1]) == [stand.cell]
-        grant(self, stand, ahead, set() if entering else held, {} if entering else taken)
-
-    patch.setattr(Warden, "_grant", generous)
+def first_cells_are_entered_while_others_are_there(patch: pytest.MonkeyPatch) -> None:
+    may = Warden._may_follow
+    patch.setattr(Warden, "_may_follow", lambda self, stand, order: not stand.holds or may(self, stand, order))
+    patch.setattr(HostEntries, "place", lambda self, vehicle: self.placed.add(vehicle))
 
 
 def a_silent_guest_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
     tick = Warden.tick
 
     def leasing(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
-        for host in self._grants.by_host.keys() - self._fleets.keys():
+        for host in self._orders.by_host.keys() - self._fleets.keys():
             heard = self._hosts.get(host)
             if heard is not None and now_ns - heard.spoke_ns > SILENT_NS:
-                for vehicle in self._granted_to(host):
-                    self._grants.set(vehicle, [], self._next_stamp)
+                self._orders.remove(host, {}, (1 << 60, 0))
         return tick(self, now_ns)
 
     patch.setattr(Warden, "tick", leasing)
@@ -121,24 +117,20 @@ def a_new_life_speaks_before_it_knows_where_it_stands(patch: pytest.MonkeyPatch)
 
     def rash(self: Guest, chance: int):  # type: ignore[no-untyped-def]
         actions = begin(self, chance)
-        self._host.holdings._enters.clear()
+        self._host.holdings._entries.bodies.clear()
         return actions
 
     patch.setattr(Guest, "begin", rash)
 
 
 def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.MonkeyPatch) -> None:
-    first = Holdings._first_cell
-    patch.setattr(
-        Holdings, "_first_cell", lambda self, vehicle, cells, seen, place: first(self, vehicle, cells, (), place)
-    )
-    take = Holdings._take
+    hear = HostEntries.hear_granted
 
-    def again(self: Holdings, view, granted, place):  # type: ignore[no-untyped-def]
-        view.seen = {vehicle: cells for vehicle, cells in view.seen.items() if vehicle in self._paths}
-        return take(self, view, granted, place)
+    def again(self: HostEntries, *what):  # type: ignore[no-untyped-def]
+        self.over.clear()
+        return hear(self, *what)
 
-    patch.setattr(Holdings, "_take", again)
+    patch.setattr(HostEntries, "hear_granted", again)
 
 
 def a_robot_that_is_replaced_says_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
@@ -155,14 +147,15 @@ def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
     hear = Host.hear_granted
 
     def unfenced(self: Host, granted, now_ns):  # type: ignore[no-untyped-def]
-        self.holdings.life = max(self.holdings.life, granted.life)
+        self.holdings.life = self.holdings._entries.life = max(self.holdings.life, granted.life)
         return hear(self, granted, now_ns)
 
     patch.setattr(Host, "hear_granted", unfenced)
 
 
 def a_cell_that_was_shut_for_a_guest_is_anybodys(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Warden, "_enter_again", lambda self, standing, opened: None)
+    opened = Orders._open
+    patch.setattr(Orders, "_open", lambda self, host, life, bodies, but=(): opened(self, host, life, {}, but))
 
 
 def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPatch) -> None:
@@ -177,7 +170,7 @@ def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPat
 
 
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
-    first_cells_are_granted_to_whoever_asks,
+    first_cells_are_entered_while_others_are_there,
     a_silent_guest_loses_its_cells,
     a_new_life_speaks_before_it_knows_where_it_stands,
     a_first_cell_is_taken_from_a_table_that_is_about_to_free_it,

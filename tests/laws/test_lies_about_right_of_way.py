@@ -14,8 +14,8 @@ from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import Granted, Shut, Standing, Stored, Table
-from swarm.wire.topics import GRANTED, STANDING, STORED, TABLE
+from swarm.wire.messages.traffic import Entry, Fence, Granted, Left, Standing, Stored, Table
+from swarm.wire.topics import GRANTED, LEFT, STANDING, STORED, TABLE
 from vehicle_agent.service import AgentService
 
 LEAPS = (-1, 1, 2, 3, 100, 1 << 20, 1 << 32, (1 << 33) + 5, 1 << 40, 1 << 47)
@@ -37,27 +37,29 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
             )
         case Table():
             later = {agent: (life + leap, seq + abs(leap)) for agent, (life, seq) in said.hosts.items()}
-            anywhere = [chance.randrange(cells) for _ in range(5)]
+            anywhere = {"a0-00": [(chance.randrange(cells), 0, 1) for _ in range(5)]}
             return chance.choice(
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),
                     replace(said, seq=said.seq + leap),
                     replace(said, seq=said.seq + 1, grants={}),
                     replace(said, seq=said.seq + 1, hosts=later),
-                    replace(said, seq=said.seq + 1, shut=[Shut(each, 1, anywhere) for each in said.hosts]),
+                    replace(said, seq=said.seq + 1, fences=[Fence(each, 1, anywhere) for each in said.hosts]),
                 )
             )
         case Granted():
-            anywhere = [chance.randrange(cells) for _ in range(5)]
+            somewhere = [Entry((chance.randrange(cells), 0, 1), [(0, 1, "a1-00")]) for _ in range(5)]
             return chance.choice(
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),
                     replace(said, seq=said.seq + abs(leap)),
                     replace(said, seq=said.seq + 1, life=said.life + leap),
                     replace(said, seq=said.seq + 1, heard=said.heard + abs(leap), grants={}),
-                    replace(said, seq=said.seq + 1, grants=dict.fromkeys(said.grants, anywhere)),
+                    replace(said, seq=said.seq + 1, grants=dict.fromkeys(said.grants, somewhere)),
                 )
             )
+        case Left():
+            return replace(said, entries=[(cell, epoch + leap, seq) for cell, epoch, seq in said.entries])
         case Stored():
             return replace(said, epoch=said.epoch + leap) if leap % 2 else replace(said, seq=said.seq + leap)
     raise TypeError(said)
@@ -74,7 +76,7 @@ def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> in
         if isinstance(event, Heard) and encode(event.message) not in lies:
             heard.append(event)
 
-    for topic in (STANDING, TABLE, GRANTED, STORED):
+    for topic in (STANDING, TABLE, GRANTED, LEFT, STORED):
         bus.subscribe(topic, post)
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:

@@ -180,7 +180,10 @@ def test_no_step_outlives_its_neighbours_and_what_introduces_a_build_never_takes
 
 
 def test_every_message_that_the_version_before_has_written_is_read_as_it_was_meant() -> None:
-    specimens = [line for path in SPECIMENS.glob("wire-*.txt") for line in path.read_text().splitlines()]
+    paths = [path for path in SPECIMENS.glob("wire-*.txt") if are_neighbours(int(path.stem[5:]), WIRE_VERSION)]
+    if not paths:
+        pytest.skip("no build of another version shares a run with this one")
+    specimens = [line for path in paths for line in path.read_text().splitlines()]
     assert {line.split()[0] for line in specimens} <= set(KINDS)
     assert len(specimens) > 100
     for line in specimens:

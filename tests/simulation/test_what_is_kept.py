@@ -4,6 +4,7 @@ a recomputed one, in every tick, under faults, in crowds and among bodies."""
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Iterator
 
 import msgspec
@@ -16,13 +17,12 @@ from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
-from swarm.wire.messages.traffic import Granted, Table
+from swarm.wire.messages.traffic import Entry, Granted, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.grants import Grants
-from vehicle_agent.traffic.pibt import Mover, Round
-from vehicle_agent.traffic.warden import SILENT_NS, Warden, _is_entering, _turn
+from vehicle_agent.traffic.warden import Warden
 
 ROVERS = (
     RoverConfig(name="quick", count=3, speed_m_per_s=3.0, radius_m=4.0),
@@ -95,49 +95,34 @@ def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeyp
     assert kept_wishes > 100
 
 
-def plan_all(warden: Warden, now_ns: int) -> None:
-    """The twin of a warden's plan: it looks at all vehicles of the plot and all their cells."""
-    hosts = [each for each in warden._hosts.values() if each.standing and now_ns - each.heard_ns <= SILENT_NS]
-    stands = sorted((stand for host in hosts for stand in host.stands.values()), key=_turn)
-    shut = {cell for cells in warden._shut.values() for cell in cells}
-    held = shut.union(*(grant.cells for grant in warden._grants.of.values()))
-    closed = set(held)
-    movers: dict[str, Mover] = {}
-    for stand in stands:
-        cells = warden._grants.cells_of(stand.vehicle)
-        if not cells and _is_entering(stand):
-            continue
-        if stand.cell != stand.end or (cells and cells != [stand.cell]):
-            closed.difference_update(cells[:-1] if stand.end in cells else cells)
-            continue
-        closed.difference_update(cells)
-        movers[stand.vehicle] = Mover(
-            stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
-        )
-    closed |= shut
-    plots, plot = warden._plots, warden._plot
-    round = Round([*movers.values()], closed.__contains__, lambda cell: plots.of(cell) == plot)
-    for stand in stands:
-        if stand.vehicle in movers:
-            round.plan(movers[stand.vehicle])
-        elif stand.ahead:
-            warden._grant(stand, warden._next_ahead(stand), held, round.taken)
-    for stand in stands:
-        to = round.to.get(stand.vehicle)
-        if to is not None and to != stand.cell:
-            ahead = stand.ahead if stand.ahead[:1] == [to] else [to]
-            warden._grant(stand, ahead, held, round.taken)
-    warden._pushed = round.pushed
+def made_anew(warden: Warden) -> Warden:
+    """The twin of a warden, which has read its table, and looks at all vehicles of the plot."""
+    twin = copy.copy(warden)
+    twin._orders = Orders(warden._orders.table(warden._plot, "twin", (0, 0), {}))
+    twin._hosts = {
+        name: dataclasses.replace(host, asking=list(host.stands.values())) for name, host in warden._hosts.items()
+    }
+    return twin
 
 
-def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[int]], list[int]]:
-    """The cells that a table grants to a host, and the cells around its vehicles that others hold."""
-    grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if agent_of(vehicle) == host}
+def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[Entry]], list[int]]:
+    """The entries that a table lists of a host, and the cells around its vehicles that others hold."""
+    every = [*table.grants.items(), *(each for fence in table.fences for each in fence.entries.items())]
+    ours = {vehicle: numbers for vehicle, numbers in table.grants.items() if agent_of(vehicle) == host}
+    before = [(number, vehicle) for vehicle, numbers in every for number in numbers]
+    before.sort(key=lambda each: each[0][1:])
+
+    def entry(number: Number, vehicle: str) -> Entry:
+        earlier = [each for each in before if each[0][0] == number[0] and each[0][1:] < number[1:]]
+        return Entry(number, [(n[1], n[2], of) for n, of in earlier if of != vehicle])
+
     standing, cols = warden._hosts[host].standing, warden._plots.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]
     near = {stand.end + step for stand in (standing.vehicles if standing else ()) for step in steps}
-    held = {cell for id, grant in table.grants.items() if id not in grants for cell in grant.cells}
-    return grants, sorted(near & (held | {cell for shut in table.shut for cell in shut.cells}))
+    held = {number[0] for _, numbers in every for number in numbers}
+    own = {number[0] for numbers in ours.values() for number in numbers}
+    grants = {vehicle: [entry(number, vehicle) for number in numbers] for vehicle, numbers in ours.items()}
+    return grants, sorted(near & (held - own))
 
 
 @WORLDS
@@ -146,11 +131,14 @@ def test_wardens_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name,
 
     def plan_twice(warden: Warden, now_ns: int) -> None:
         nonlocal compared
-        twin = copy.copy(warden)
-        twin._grants = Grants(warden._grants.of)
-        plan_all(twin, now_ns)
+        twin = made_anew(warden)
+        plan(twin, now_ns)
         plan(warden, now_ns)
-        assert warden._grants.of == twin._grants.of
+        kept, anew = warden._orders, twin._orders
+        assert kept.of == anew.of
+        assert {cell: [*order.items()] for cell, order in kept.orders.items()} == {
+            cell: [*order.items()] for cell, order in anew.orders.items()
+        }
         assert warden._pushed == twin._pushed
         compared += 1
 

@@ -12,7 +12,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.guest import Guest, GuestAction, Removal, SaveLives
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 _ANOTHER_CELL_NS = 2 * NS_PER_S
@@ -61,11 +61,17 @@ class GuestProcess(Process):
                     self.disk.own = OwnRecord(disk=self.disk.own.disk, lives=lives)
                 case AskKnown():
                     self.world.begin(self)
-                case Tell():
+                case Tell() | Left():
                     self.perform([action])
 
     def hear_granted(self, granted: Granted) -> None:
-        if self.guest.hear_granted(granted, self.now_ns):
+        self.enter_if(self.guest.hear_granted(granted, self.now_ns))
+
+    def hear_left(self, left: Left) -> None:
+        self.enter_if(self.guest.hear_left(left))
+
+    def enter_if(self, entered: bool) -> None:
+        if entered:
             if self.body is None:
                 self.world.entered += 1
             self.disk.bodies[self.guest.vehicle] = self.guest.cells[0]
@@ -128,9 +134,7 @@ class AddedProcess(Process):
         world, disk = self.world, self.disk
         vehicles = world.added[self.agent]
         self.asked_ns: dict[str, int] = {}
-        rights = RightOfWay(
-            self.agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body, vehicles=vehicles
-        )
+        rights = RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved, vehicles=vehicles)
         assert not rights._members
         return rights
 

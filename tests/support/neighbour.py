@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import subprocess
 import tarfile
 from functools import cache
 from pathlib import Path
 
 import pytest
+
+from swarm.wire.messages import WIRE_VERSION
+from swarm.wire.versions import are_neighbours
 
 ROOT = Path(__file__).parents[2]
 NAMED_IN = ROOT / "tests" / "live" / "neighbour_version.txt"
@@ -32,7 +36,8 @@ def _archive(commit: str) -> bytes | None:
 
 
 def neighbour_tree(folder: Path) -> Path:
-    """The files of the version before, below `folder`. Skips the test where git has not got them."""
+    """The files of the version before, below `folder`. Skips the test where git has not got them, or the two share
+    no run."""
     commit = neighbour_commit()
     archive = _archive(commit)
     if archive is None:
@@ -40,6 +45,10 @@ def neighbour_tree(folder: Path) -> Path:
     tree = folder / f"tree-{commit[:8]}"
     with tarfile.open(fileobj=io.BytesIO(archive)) as files:
         files.extractall(tree, filter="data")
+    messages = (tree / "swarm" / "wire" / "messages" / "__init__.py").read_text(encoding="utf-8")
+    found = re.search(r"^WIRE_VERSION = (\d+)", messages, re.MULTILINE)
+    if found is None or not are_neighbours(int(found[1]), WIRE_VERSION):
+        pytest.skip("the version before this one shares no run with it")
     return tree
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Grant, Granted, Stand, Standing, Table
+from swarm.wire.messages.traffic import Entry, Granted, Number, Stand, Standing, Table
 from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
@@ -17,15 +19,31 @@ MEMBERS = PLOTS.members(0)
 S = NS_PER_S
 
 
-def table_of(epoch: int, seq: int, **grants: list[int]) -> Table:
-    """Vehicles are named by their host: a0=[5] is the vehicle a0-00 on cell 5."""
-    held = {f"{host}-00": Grant(cells, (epoch, seq)) for host, cells in grants.items()}
+def entries(epoch: int, seq: int, *cells: int) -> list[Number]:
+    """Entries that one table added."""
+    return [(cell, epoch, seq) for cell in cells]
+
+
+def table_of(epoch: int, seq: int, **grants: list[int | Number]) -> Table:
+    """Vehicles are named by their host: a0=[5] is the vehicle a0-00 on cell 5. A cell is an entry that the table
+    (epoch, 1) added."""
+    held = {
+        f"{host}-00": [(cell, epoch, 1) if isinstance(cell, int) else cell for cell in cells]
+        for host, cells in grants.items()
+    }
     hosts = dict.fromkeys(grants, (1, seq))
     return Table(plot=0, agent=PLOTS.warden(0, epoch), epoch=epoch, seq=seq, hosts=hosts, grants=held)
 
 
-def standing(host: str, cells: list[int], seq: int, knows: tuple[int, int] = (0, 0), **more: object) -> Standing:
-    stand = Stand(f"{host}-00", cells[0], cells[-1], cells, [], [], 0, 0)
+def cells_of(table: Table | None, vehicle: str) -> list[int]:
+    """The cells of a vehicle's entries."""
+    assert table is not None
+    return [number[0] for number in table.grants.get(vehicle, ())]
+
+
+def standing(host: str, holds: list[Number], seq: int, knows: tuple[int, int] = (0, 0), **more: object) -> Standing:
+    cells = [number[0] for number in holds]
+    stand = Stand(f"{host}-00", cells[0], cells[-1], holds, [], [], 0, 0)
     fields = {"life": 1, "vehicles": [stand], **more}
     return Standing(plot=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
 
@@ -40,15 +58,29 @@ def holdings_of() -> Holdings:
 def granted_of(table: Table, host: str = "a0") -> Granted:
     """The message of a table to one host."""
     life, heard = table.hosts.get(host, (0, 0))
-    grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if vehicle.startswith(host)}
+    grants = {
+        vehicle: [Entry(number) for number in numbers]
+        for vehicle, numbers in table.grants.items()
+        if vehicle.startswith(host)
+    }
     return Granted(
         plot=table.plot, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, life=life, heard=heard,
         grants=grants,
     )  # fmt: skip
 
 
+def grants_of(holdings: Holdings, seq: int, cells: Mapping[str, Sequence[int]]) -> dict[str, list[Entry]]:
+    """Entries of cells: those that a vehicle holds, and new ones of table (1, seq)."""
+    paths = holdings._entries.paths
+    held = {vehicle: {entry.cell: entry.number for entry in path} for vehicle, path in paths.items()}
+    return {
+        vehicle: [Entry(held.get(vehicle, {}).get(cell, (cell, 1, seq))) for cell in each]
+        for vehicle, each in cells.items()
+    }
+
+
 def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
-    holdings.hear_granted(granted_of(table), lambda vehicle, cells: cells[0], now_ns)
+    holdings.hear_granted(granted_of(table), now_ns)
 
 
 def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:

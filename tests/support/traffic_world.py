@@ -15,7 +15,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Stored, Table
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -88,7 +88,7 @@ class Process:
 
     def make_rights(self) -> RightOfWay:
         world, disk = self.world, self.disk
-        return RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
+        return RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved)
 
     @property
     def now_ns(self) -> int:
@@ -103,15 +103,13 @@ class Process:
         self.rights.trips.measure(known.agent, TICK_NS // 10)
         self.perform(self.rights.hear_known(known))
 
-    def find_body(self, vehicle: str, cells: list[int]) -> int:
-        known = self.disk.bodies.get(vehicle)
-        return known if known in cells else cells[0]
-
     def begin(self) -> None:
         for vehicle in list(self.disk.bodies):
             if self.world.driver[vehicle] is not self.disk:
                 del self.disk.bodies[vehicle]  # it has been driven from elsewhere since
         self.perform(self.rights.begin(self.world.chance.getrandbits(32)))
+        for vehicle, cell in self.disk.bodies.items():
+            self.rights.holdings.enter(vehicle, cell)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
@@ -134,6 +132,8 @@ class Process:
                         self.world.send(self, member, lambda to, s=action: to.hear_stored(s))
                 case Granted():
                     self.world.send(self, action.host, lambda to, g=action: to.hear_granted(g))
+                case Left():
+                    self.world.send(self, action.host, lambda to, left=action: to.hear_left(left))
                 case OwnRecord():
                     self.disk.own = action
                 case Refused():
@@ -147,6 +147,9 @@ class Process:
 
     def hear_granted(self, granted: Granted) -> None:
         self.place(self.rights.host.hear_granted(granted, self.now_ns))
+
+    def hear_left(self, left: Left) -> None:
+        self.place(self.rights.host.hear_left(left))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
@@ -184,10 +187,14 @@ class Process:
 
     def drive(self, vehicle: str) -> None:
         holdings, chance = self.rights.holdings, self.world.chance
-        if chance.random() < 0.05:
+        path = holdings.path(vehicle)
+        waits = len(path) > 1 and not holdings.may_enter(vehicle, path[1])
+        if chance.random() < (0.15 if waits else 0.05):
             holdings.give_back(vehicle)
         while len(holdings.path(vehicle)) > 1 and chance.random() < 0.7:
             cell = holdings.path(vehicle)[1]
+            if not holdings.may_enter(vehicle, cell):
+                return
             holdings.moved(vehicle, cell)
             self.disk.bodies[vehicle] = cell
             self.world.moves[vehicle] = self.world.moves.get(vehicle, 0) + 1
@@ -207,7 +214,8 @@ class Process:
             at = min(world.next_to(at), key=cost.__getitem__)
             ahead.append(at)
         here = path[0]
-        wants = sorted(world.next_to(here), key=lambda cell: (cost[cell], cell))[:8]
+        held = self.rights.holdings.occupied()
+        wants = sorted(world.next_to(here), key=lambda cell: (cost[cell] + 0.9 * (cell in held), cell))[:8]
         better = sum(cost[cell] < cost[here] for cell in wants)
         pushed = self.rights.holdings.pushed.get(vehicle, 0)
         if pushed:

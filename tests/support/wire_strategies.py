@@ -26,8 +26,7 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.traffic import (
-    Grant,
-    Shut,
+    Fence,
     Stand,
     Standing,
     Table,
@@ -77,11 +76,11 @@ _NAMED: tuple[Message, ...] = (
     ),
     Standing(
         plot=0, agent="a0", life=1 << 32, seq=9, knows=(3, 17), dead=[5],
-        vehicles=[Stand("a0-00", 4, 5, [4, 5], [6], [], 0, 1200)],
+        vehicles=[Stand("a0-00", 4, 5, [(4, 3, 16), (5, 3, 16)], [6], [], 0, 1200)],
     ),
     Table(
-        plot=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)}, grants={"a0-00": Grant([4, 5], (3, 16))},
-        shut=[Shut("a2", 1 << 32, [9])], pushed={"a0-00": 900},
+        plot=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)}, grants={"a0-00": [(4, 3, 16), (5, 3, 16)]},
+        fences=[Fence("a2", 1 << 32, {"a2-00": [(9, 1, 1)]})], pushed={"a0-00": 900},
     ),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(

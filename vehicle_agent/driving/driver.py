@@ -7,6 +7,7 @@ from functools import partial
 from itertools import pairwise
 
 from shared_map.terrain.step_climb import Climb, may_be_pulled
+from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
@@ -23,6 +24,7 @@ class Driver:
               and not what the cell that it enters does
     measures  whether to note how fast they drove
 
+    patience_ns  how long one waits for others that do not go on
     driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs, and the
               wind, taken out:
               what vehicles measure; the owner empties it
@@ -52,6 +54,9 @@ class Driver:
         self._cols = local_map.grid.cols
         self._pulled = pulled and may_be_pulled(local_map.climb)
         self._left_s: dict[str, float] = {}
+        self.patience_ns = NS_PER_S
+        self._waits: dict[str, tuple[int, int]] = {}
+        """Vehicle -> the cell before which it waits for others, and since when."""
         self._rolling: set[str] = set()
         """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
         measured."""
@@ -63,7 +68,8 @@ class Driver:
             self._dynamics.begin(seconds)
 
     def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
-        """Makes each drive until it comes to another cell, or its time is over.
+        """Makes each drive until it comes to another cell, or to the border of one that another has not left, or
+        its time is over.
 
         stopped  whether a vehicle has to stand
         """
@@ -82,7 +88,9 @@ class Driver:
                     self._rolling.discard(vehicle.id)
                     return 0.0
                 path = self._holdings.path(vehicle.id)
-                if len(path) < 2 or not self._passable(path[0], path[1]):
+                waits = len(path) < 2 or not self._passable(path[0], path[1])
+                # With dynamics of its own a vehicle could not stop at the border.
+                if waits or not (self._dynamics is None or self._holdings.may_enter(vehicle.id, path[1])):
                     self._rolling.discard(vehicle.id)
                     return 0.0
                 motion.set_out(path[1], self._passes(vehicle, path[1]))
@@ -96,9 +104,14 @@ class Driver:
             climbing = 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
             pace_s_per_m = self._physics.item(before if self._pulled else head) * climbing
             if self._dynamics is None:
-                left_s = motion.advance(left_s, pace_s_per_m)
+                entering = motion.entering
+                enters = entering is None or self._holdings.may_enter(vehicle.id, entering)
+                left_s = motion.advance(left_s, pace_s_per_m, enters=enters)
+                if not enters and left_s > 0.0:
+                    self._steps.pop(vehicle.id, None)
+                    return left_s  # in this tick another of ours may leave yet
             else:
-                path = self._holdings.path(vehicle.id)
+                path = self._holdings.open(vehicle.id)
                 passes = partial(self._passes, vehicle)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
@@ -144,6 +157,20 @@ class Driver:
                     vehicle.motion.turn_back()
                 self._holdings.give_back(vehicle.id, index)
                 return
+
+    def wait(self, vehicle: Vehicle, now_ns: int) -> None:
+        """Gives back entries behind others that have not gone on for long, so that no circle of waiting lasts."""
+        path = self._holdings.path(vehicle.id)
+        if len(path) < 2 or self._holdings.may_enter(vehicle.id, path[1]):
+            self._waits.pop(vehicle.id, None)
+            return
+        since = self._waits.setdefault(vehicle.id, (path[1], now_ns))
+        if since[0] != path[1]:
+            self._waits[vehicle.id] = path[1], now_ns
+        elif now_ns - since[1] > self.patience_ns:
+            del self._waits[vehicle.id]
+            vehicle.motion.turn_back()
+            self._holdings.give_back(vehicle.id)
 
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
         """Gives back all but the first cells, and the one that it drives into."""

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from swarm.grid import GridSpec
 
+_BEFORE_BORDER = 1.0 - 1e-9
+"""Share of the way to a border at which one stops that must not pass it."""
 Point = tuple[float, float]
 """Row and col, whole numbers in the middles of cells."""
 Stop = tuple[int, Point]
@@ -89,12 +91,20 @@ class Motion:
             self.heading_rad = (self.heading_rad + math.pi) % math.tau
             self._settle()
 
-    def advance(self, seconds: float, pace_s_per_m: float) -> float:
+    def advance(self, seconds: float, pace_s_per_m: float, *, enters: bool = True) -> float:
         """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to the end.
+
+        enters  whether it may enter `head`; else it stops before the border
 
         Returns the seconds that are left.
         """
         goal_m = self.border_m if self.done_m < self.border_m else self.length_m
+        if not enters and self.entering is not None:
+            goal_m = max(goal_m * _BEFORE_BORDER, self.done_m)
+            needed_s = (goal_m - self.done_m) * pace_s_per_m
+            if needed_s <= seconds:
+                self.done_m = goal_m
+                return seconds - needed_s
         needed_s = (goal_m - self.done_m) * pace_s_per_m
         if needed_s > seconds:
             self.done_m += seconds / pace_s_per_m

@@ -5,8 +5,8 @@ them is its warden. The host's part is in `swarm.right_of_way`; docs/design/righ
 
 1. A host tells the warden where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
    around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.
-2. The warden plans all vehicles at rest at once (`pibt`) and appends free cells to their grants (`Grants`). No cell
-   is in two vehicles' grants, and a grant is never revoked: only its host's word frees a cell.
+2. The warden plans all vehicles without a next cell at once (`pibt`) and appends entries to the orders of cells
+   (`cell_orders`): a vehicle follows one that goes on. An entry is never revoked: only its host's word ends it.
 3. The warden sends its table to the other members, under (epoch, number). A member puts it on file and says so
    (`Stored`). With the warden's own file one is a majority: then hosts receive the grants of the table.
 4. A warden that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store

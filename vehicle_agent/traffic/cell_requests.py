@@ -18,7 +18,7 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from vehicle_agent.agent_maps import meet
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.traffic.grants import cells_beside
+from vehicle_agent.traffic.cell_orders import cells_beside
 from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S

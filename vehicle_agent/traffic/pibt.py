@@ -1,15 +1,15 @@
 """Order of moves: priority inheritance with backtracking (Okumura et al., 2019 and 2022), for vehicles that need
-different times for their steps.
+different times for their steps, and of which some wait for others already.
 
 The vehicle of the highest priority takes the best cell that it can get. If another vehicle is there, that one is
 planned next, with the inherited priority, and must go anywhere else; if it cannot, the first takes its second
-choice. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places and
-none go around in a ring.
+choice. Vehicles follow each other, but no two exchange places and none go around in a ring, nor by way of those
+that wait: each would wait for itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 _DEEPEST = 200
@@ -38,6 +38,7 @@ class Round:
     movers  all that are at rest
     closed  whether a cell stays occupied under any plan
     inside  whether a cell belongs to the plot
+    onward  the cells for which those wait that are on a cell, or go there first
 
     to      vehicle -> the cell that it is to go to; its own if it stays
     taken   cell -> the vehicle that is to go there
@@ -45,7 +46,11 @@ class Round:
     """
 
     def __init__(
-        self, movers: Sequence[Mover], closed: Callable[[int], bool], inside: Callable[[int], bool]
+        self,
+        movers: Sequence[Mover],
+        closed: Callable[[int], bool],
+        inside: Callable[[int], bool],
+        onward: Callable[[int], Iterable[int]] = lambda cell: (),
     ) -> None:
         self.to: dict[str, int] = {}
         self.taken: dict[int, str] = {}
@@ -53,6 +58,7 @@ class Round:
         self._standing = {mover.cell: mover for mover in movers if not mover.outside}
         self._closed = closed
         self._inside = inside
+        self._onward = onward
         self._chain: set[int] = set()
 
     def plan(self, mover: Mover) -> None:
@@ -84,10 +90,25 @@ class Round:
             if cell in self.taken or cell in self._chain or self._closed(cell):
                 continue
             other = self._standing.get(cell)
-            if other is not None and (self.to.get(other.id) == mover.cell or len(self._chain) >= _DEEPEST):
+            if (other is not None and len(self._chain) >= _DEEPEST) or self._comes_back(cell):
                 continue
             self.to[mover.id] = cell
             self.taken[cell] = mover.id
             if other is None or other.id in self.to or self._plan(other, age, pushed=True):
                 return True
+        return False
+
+    def _comes_back(self, cell: int) -> bool:
+        """Returns True if a cell is left only after one in which a vehicle of this chain stands."""
+        left, seen = [cell], {cell}
+        while left:
+            at = left.pop()
+            if at in self._chain:
+                return True
+            mover = self._standing.get(at)
+            further = self._onward(at) if mover is None else (self.to.get(mover.id, at),)
+            for each in further:
+                if each not in seen:
+                    seen.add(each)
+                    left.append(each)
         return False

@@ -15,10 +15,10 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
-from swarm.right_of_way.holdings import Place, Tell, Wish
-from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
+from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.messages.traffic import Known, KnownRequest, Left, Standing, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
 
@@ -39,7 +39,7 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     plot_cells: int = REGION_CELLS
 
 
-Action = MemberAction | Tell | OwnRecord | Known | AskKnown
+Action = MemberAction | Tell | Left | OwnRecord | Known | AskKnown
 
 
 class RightOfWay:
@@ -48,7 +48,6 @@ class RightOfWay:
     spawns  agent -> vehicle -> the cell where it stands when the run begins
     own     what this agent's file holds: of itself,
     saved   and of plots: (promised epoch, stored table)
-    place   tells on which of the cells that it was granted a vehicle of a new life stands
     vehicles  of an agent that is not in `spawns`, a guest: it has no seat, and its vehicles enter one by one
     tick_ns   between two ticks
 
@@ -68,7 +67,6 @@ class RightOfWay:
         spawns: Mapping[str, Mapping[str, int]],
         own: OwnRecord,
         saved: Mapping[int, tuple[int, Table]],
-        place: Place = first_of,
         vehicles: Collection[str] = (),
         tick_ns: int = NS_PER_S // 10,
     ) -> None:
@@ -85,7 +83,7 @@ class RightOfWay:
             )
         self.own = own
         self._is_guest = agent not in spawns
-        self.host = Host(plots, agent, vehicles if self._is_guest else spawns[agent], place)
+        self.host = Host(plots, agent, vehicles if self._is_guest else spawns[agent])
         self.holdings = self.host.holdings
         self._spawns = spawns
         self._saved = dict(saved)
@@ -165,7 +163,7 @@ class RightOfWay:
             plot
             for plot, table in stored.items()
             if any(agent_of(vehicle) == agent for vehicle in table.grants)
-            or any(shut.agent == agent for shut in table.shut)
+            or any(fence.agent == agent for fence in table.fences)
         )
 
     def _stored(self) -> dict[int, Table]:
@@ -177,7 +175,7 @@ class RightOfWay:
     def _lives_of(self, agent: str) -> list[int]:
         """All lives of an agent that stored tables name, the newest ones."""
         lives = {table.hosts[agent][0] for table in self._stored().values() if agent in table.hosts}
-        lives.update(shut.life for table in self._stored().values() for shut in table.shut if shut.agent == agent)
+        lives.update(each.life for table in self._stored().values() for each in table.fences if each.agent == agent)
         return sorted(lives)[-LIVES_KEPT:]
 
     # --- what is heard --------------------------------------------------------------------------------------
@@ -215,6 +213,7 @@ class RightOfWay:
             actions += member.tick(now_ns)
         if self.holdings.replaced:
             self.holdings.watch(self._known(self.agent)[1])
+        actions += self.host.lefts(now_ns)
         actions += self.host.standings(wishes, now_ns)
         if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
@@ -242,7 +241,7 @@ class RightOfWay:
     def _at_start(self, plot: int) -> Table:
         """The table from before any warden: vehicles stand where the run begins."""
         grants = {
-            vehicle: Grant([cell], (0, 0))
+            vehicle: [(cell, 0, 1)]
             for fleet in self._spawns.values()
             for vehicle, cell in fleet.items()
             if self.plots.of(cell) == plot

@@ -1,13 +1,12 @@
-"""The warden of a plot: it grants cells to vehicles, and frees them only by their host's own word.
+"""The warden of a plot: it appends vehicles to the orders of cells, and removes them only by their host's own word.
 
-No cell is in two vehicles' grants; a grant is never revoked. The vehicle with a table that a majority has stored is
-therefore alone on its cells (see docs/design/right-of-way.md for the proof).
+An entry is never revoked, and no other is put before it (see docs/design/right-of-way.md for the proof). No vehicle
+waits for one that stays: it follows only those that have an entry behind the cell.
 """
 
 from __future__ import annotations
 
-from collections import ChainMap
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
@@ -17,8 +16,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Shut, Stamp, Stand, Standing, Table
-from vehicle_agent.traffic.grants import Grants, cells_beside
+from swarm.wire.messages.traffic import Granted, Number, Stamp, Stand, Standing, Table
+from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
@@ -36,8 +35,9 @@ MOST_CELLS_OF_GUEST = 1024
 MOST_CELLS_OF_GUESTS = 1 << 14
 """Cells of one plot that all guests together hold: a quarter of one as large as a region
 (docs/design/external-vehicles.md)."""
-_NO_CELLS: Sequence[int] = []
-_NO_GRANTS: Mapping[str, list[int]] = {}
+_NO_ENTRIES: Sequence[Number] = []
+_MOST_BEFORE = 2
+"""Entries that one may wait for: each more would hold up those behind it for longer."""
 _MOST_CELLS = 64
 """Limit for one vehicle: the largest `Grant`."""
 
@@ -59,9 +59,9 @@ def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
 
 
-def _rests(stand: Stand, cells: Sequence[int]) -> bool:
-    """Returns True if a vehicle is at rest, with nothing granted to it but its cell."""
-    return stand.cell == stand.end and (not cells or cells == [stand.cell])
+def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
+    """Returns True if a vehicle has no entry but that of its cell."""
+    return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
 
 
 @dataclass(slots=True)
@@ -103,13 +103,11 @@ class Warden:
         self._plot = table.plot
         self._me = me
         self._fleets = fleets
-        self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
-        self._grants = Grants(table.grants)
-        self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
+        self._orders = Orders(table)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
-        self._before: dict[str, Sequence[int]] = {}
-        """Vehicle -> what it was granted before the plan that is being made has granted it more."""
+        self._stands: dict[str, Stand] = {}
+        """Vehicle -> its stand, by the hosts that have spoken lately."""
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
         self._told: Table | None = None
@@ -130,10 +128,10 @@ class Warden:
             return
         known = self._hosts.setdefault(host, _Host(now_ns))
         known.spoke_ns = now_ns
-        life, seq = self._lives.get(host, (0, 0))
+        life, seq = self._orders.hosts.get(host, (0, 0))
         if standing.ended:
-            self._open(standing)
-            self._ended(host, standing.life, life)
+            for ended in (*standing.dead, standing.life):
+                self._granted |= self._orders.end(host, ended)
             return
         if (standing.life, standing.seq) <= (life, seq):
             return
@@ -141,57 +139,36 @@ class Warden:
             self.refused.append(f"{host} names a life that is implausibly far ahead: {standing.life}")
             return
         if standing.life != life:
-            self._succeed(host, life)
-        self._lives[host] = (standing.life, standing.seq)
+            known.told = None
+            self.seq += 1  # two lives of one tick are given different entries
         if not standing.vehicles and (known.standing is None or known.standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
         stands = self._stands_of(standing)
-        for vehicle, cells in list(self._grants.by_host.get(host, _NO_GRANTS).items()):
-            stand = stands.get(vehicle)
-            if stand is None or stand.holds != cells:
-                self._free(vehicle, _NO_CELLS if stand is None else stand.holds, standing.knows)
+        holds = {id: stand.holds for id, stand in stands.items()}
+        bodies = {id: stand.cell for id, stand in stands.items() if _is_entering(stand)}
+        placed = {id for id, stand in stands.items() if stand.holds and stand.cell not in stand.wants}
+        before = self._orders.by_host_count(host)
+        self._granted |= self._orders.take_standing(
+            host,
+            standing.life,
+            standing.seq,
+            holds,
+            standing.knows,
+            standing.dead,
+            bodies,
+            placed,
+            self._next_stamp,
+        )
+        self._changed |= self._orders.by_host_count(host) != before
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
-        # Only now: a life that is itself replaced and has not stopped must not open what a vehicle may stand on.
-        self._enter_again(standing, self._open(standing))
-        if standing.life in standing.dead:
-            self._shut[host, standing.life] = []  # no host has acted on it: no need to wait
-
-    def _open(self, standing: Standing) -> set[int]:
-        """Opens cells that are shut for lives that are proved to have ended. Returns the cells."""
-        opened: set[int] = set()
-        for dead in standing.dead:
-            cells = self._shut.pop((standing.agent, dead), None)
-            if cells is not None:
-                opened.update(cells)
-                self._granted = self._granted or dead != standing.life
-        return opened
-
-    def _enter_again(self, standing: Standing, opened: set[int]) -> None:
-        """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
-        if not opened:
-            return
-        opened.difference_update(cell for grant in self._grants.of.values() for cell in grant.cells)
-        for (host, _), cells in self._shut.items():
-            if host != standing.agent:
-                opened.difference_update(cells)
-        for stand in standing.vehicles:
-            before = self._grants.cells_of(stand.vehicle)
-            ours = self._is_of(stand.vehicle, standing.agent)
-            if ours and _is_entering(stand) and stand.cell in opened and len(before) < _MOST_CELLS:
-                self._grants.set(stand.vehicle, [*before, stand.cell], self._next_stamp)
-                self._granted = True
 
     def _is_welcome(self, host: str) -> bool:
         """Returns True if there is room for this host: for each of the scenario, and for a number of guests."""
-        if host in self._fleets or host in self._lives or host in self._hosts:
+        if host in self._fleets or host in self._orders.hosts or host in self._hosts:
             return True
-        known = self._lives.keys() | self._hosts.keys()
+        known = self._orders.hosts.keys() | self._hosts.keys()
         return len(known - self._fleets.keys()) < MOST_GUESTS
-
-    def _is_of(self, vehicle: str, host: str) -> bool:
-        """Returns True if the host may speak for a vehicle."""
-        return vehicle in self._fleets[host] if host in self._fleets else agent_of(vehicle) == host
 
     def _stands_of(self, standing: Standing) -> dict[str, Stand]:
         """Returns vehicle -> its stand, for vehicles that the host may speak for."""
@@ -199,48 +176,6 @@ class Warden:
         if fleet is None:
             return {each.vehicle: each for each in standing.vehicles if agent_of(each.vehicle) == standing.agent}
         return {each.vehicle: each for each in standing.vehicles if each.vehicle in fleet}
-
-    def _granted_to(self, host: str) -> list[str]:
-        """The vehicles of a host that are granted cells."""
-        vehicles = self._fleets[host] if host in self._fleets else self._grants.by_host.get(host, ())
-        return [vehicle for vehicle in vehicles if vehicle in self._grants.of]
-
-    def _ended(self, host: str, ended: int, life: int) -> None:
-        """A life's own word that it drives no more."""
-        if (host, ended) in self._shut:
-            self._granted = self._granted or bool(self._shut[host, ended])
-            if ended == life:
-                return
-            del self._shut[host, ended]
-        elif ended == life:
-            self._shut[host, ended] = []  # its successor need not wait for it
-            self._granted = True
-
-    def _succeed(self, host: str, before: int) -> None:
-        """A new life of a host speaks. Cells granted to the life before it stay shut until that is known to have
-        ended; the new one is granted the same cells, and has to see that before it can release any."""
-        mine = self._granted_to(host)
-        if (host, before) in self._shut:
-            del self._shut[host, before]
-        elif before and mine:
-            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants.cells_of(vehicle)]
-        for vehicle in mine:
-            self._grants.set(vehicle, self._grants.of[vehicle].cells, self._next_stamp)
-        self._hosts[host].standing = self._hosts[host].told = None
-        self._granted = True
-
-    def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
-        """Drops what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
-        cells, stamp = self._grants.of[vehicle].cells, self._grants.of[vehicle].stamp
-        if knows >= stamp:
-            kept = [cell for cell in cells if cell in holds]
-        elif holds and holds[0] in cells:
-            kept = cells[cells.index(holds[0]) :]
-        else:
-            return
-        if len(kept) < len(cells):
-            self._changed = True
-            self._grants.set(vehicle, kept, stamp)
 
     # --- what is granted ------------------------------------------------------------------------------------
 
@@ -252,22 +187,10 @@ class Warden:
             return None
         if self._told is None or self._granted or self._changed:
             self.seq += 1
-            self._told = self._table()
+            self._told = self._orders.table(self._plot, self._me, (self.epoch, self.seq), self._pushed)
         self._changed = self._granted = False
         self._told_ns = now_ns
         return self._told
-
-    def _table(self) -> Table:
-        return Table(
-            plot=self._plot,
-            agent=self._me,
-            epoch=self.epoch,
-            seq=self.seq,
-            hosts=dict(self._lives),
-            grants=dict(self._grants.of),
-            shut=[Shut(host, life, list(cells)) for (host, life), cells in self._shut.items()],
-            pushed=dict(self._pushed),
-        )
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
@@ -276,21 +199,21 @@ class Warden:
             return
         self._said_of, self._said_ns = table, now_ns
         current = table is self._told and not (self._granted or self._changed)
-        grants_of = self._grants if current else Grants(table.grants)
-        shut = {cell for shut in table.shut for cell in shut.cells}
-        held, cols = shut.union(*grants_of.cells.values()), self._plots.grid.cols
+        orders = self._orders if current else Orders(table)
+        held, cols, followed = orders.orders.keys(), self._plots.grid.cols, orders.followed()
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
-            grants = dict(grants_of.by_host.get(name, _NO_GRANTS))
+            grants = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
-            others = held.difference(grants_of.cells.get(name, ())) | shut
+            others = held - {each.cell for entries in grants.values() for each in entries}
             near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
-            says = (life, grants, pushed, occupied, 0 if stands else heard)
+            behind = followed.get(name, {})
+            says = (life, grants, behind, pushed, occupied, 0 if stands else heard)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
                 continue
             host.told, host.told_ns = says, now_ns
@@ -303,6 +226,7 @@ class Warden:
                 life=life,
                 heard=heard,
                 grants=grants,
+                followed=behind,
                 pushed=pushed,
                 occupied=occupied,
             )
@@ -315,74 +239,104 @@ class Warden:
         ]
         # The vehicle that has been on its way for longest goes first.
         asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
-        shut = {cell for cells in self._shut.values() for cell in cells}
-        held = ChainMap(self._grants.holders, dict.fromkeys(shut, ""))
-        self._before.clear()
         movers: dict[str, Mover] = {}
         for stand in asking:
-            cells = self._grants.cells_of(stand.vehicle)
-            if not cells and _is_entering(stand):
+            entries = self._orders.entries(stand.vehicle)
+            if not entries and _is_entering(stand):
                 continue  # no vehicle makes way for it
-            if _rests(stand, cells):
+            if _rests(stand, entries):
+                outside = not entries or stand.cell in stand.wants  # it waits to come to its first cell
                 movers[stand.vehicle] = Mover(
-                    stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
+                    stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=outside
                 )
-        stands: Mapping[str, Stand] = ChainMap(*[host.stands for host in hosts])
+        self._stands = {id: stand for host in hosts for id, stand in host.stands.items()}
         round = Round(
             list(movers.values()),
-            lambda cell: cell in shut or self._stays(cell, stands),
+            lambda cell: self._stays(cell, movers),
             lambda cell: self._plots.of(cell) == self._plot,
+            self._orders.onward,
         )
         for stand in asking:
             mover = movers.get(stand.vehicle)
             if mover is not None:
                 round.plan(mover)
-            elif stand.ahead:
-                self._grant(stand, self._next_ahead(stand), held, round.taken)
+            elif stand.ahead and not self._orders.waits(stand.vehicle):
+                self._grant(stand, self._next_ahead(stand), round.taken)
+        # Who makes way first, so that others may follow it.
+        standing = {mover.cell: id for id, mover in movers.items() if not mover.outside}
+        granted: set[str] = set()
         for stand in asking:
-            to = round.to.get(stand.vehicle)
-            if to is not None and to != stand.cell:
-                ahead = stand.ahead if stand.ahead[:1] == [to] else [to]
-                self._grant(stand, ahead, held, round.taken)
+            chain_of = [stand.vehicle]
+            while (ahead := standing.get(round.to.get(chain_of[-1], -1))) is not None and ahead not in chain_of:
+                chain_of.append(ahead)
+            for vehicle in reversed(chain_of):
+                to = round.to.get(vehicle)
+                if to is not None and vehicle not in granted:
+                    granted.add(vehicle)
+                    each = self._stands[vehicle]
+                    if to != each.cell:
+                        self._grant(each, each.ahead if each.ahead[:1] == [to] else [to], round.taken)
         if round.pushed != self._pushed:
             self._pushed = round.pushed
             self._granted = True
 
-    def _stays(self, cell: int, stands: Mapping[str, Stand]) -> bool:
-        """Returns True if a cell stays occupied under any plan. A vehicle may wait for a cell that another under
-        way will leave; one at rest can be pushed.
-
-        stands  vehicle -> its stand, by the hosts that have spoken lately
-        """
-        vehicle = self._grants.holders.get(cell)
-        if vehicle is None:
+    def _stays(self, cell: int, movers: Mapping[str, Mover]) -> bool:
+        """Returns True if the last in a cell's order stays there under any plan: it neither goes on nor may be
+        pushed."""
+        order = self._orders.order(cell)
+        if not order:
             return False
-        stand = stands.get(vehicle)
-        if stand is None:
-            return True
-        cells = self._before.get(vehicle) or self._grants.cells_of(vehicle)
-        return cell == cells[-1] and stand.end in cells and not _rests(stand, cells)
+        number = [*order][-1]
+        mover = movers.get(order[number])
+        if mover is not None and mover.cell == cell and not mover.outside:
+            return self._orders.is_fenced(cell)
+        return not self._goes_on(order[number], number)
+
+    def _goes_on(self, vehicle: str, number: Number) -> bool:
+        """Returns True if a vehicle of which the host has spoken lately has an entry behind this one."""
+        stand, entries = self._stands.get(vehicle), self._orders.entries(vehicle)
+        if stand is None or number not in entries or self._orders.is_fenced(number[0]):
+            return False
+        # Into a plot of a greater number only: no warden sees circles over two, and so there are none.
+        return number != entries[-1] or (
+            number[0] != stand.end and number in stand.holds and self._plots.of(stand.end) > self._plot
+        )
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
-        cells = self._grants.cells_of(stand.vehicle)
+        cells = [number[0] for number in self._orders.entries(stand.vehicle)]
         if not cells or cells[-1] == stand.end or stand.end not in cells:
             return stand.ahead if not cells or stand.end in cells else []
         last = cells[-1]
         return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
 
-    def _grant(self, stand: Stand, ahead: Sequence[int], held: Container[int], taken: dict[int, str]) -> None:
-        """Append free cells, up to the first that is not."""
+    def _grant(self, stand: Stand, ahead: Sequence[int], taken: dict[int, str]) -> None:
+        """Append entries up to the first that is not possible, or that waits: none goes behind that."""
+        orders, vehicle = self._orders, stand.vehicle
         for cell in ahead:
-            mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
-            if not mine or cell in held or self._plots.of(cell) != self._plot:
+            mine = taken.setdefault(cell, vehicle) == vehicle
+            if not mine or self._plots.of(cell) != self._plot:
                 return
-            cells = self._grants.cells_of(stand.vehicle)
-            if len(cells) >= _MOST_CELLS or not self._guest_may_hold_more(stand.vehicle):
+            order = orders.order(cell)
+            if order and not self._may_follow(stand, order):
                 return
-            self._before.setdefault(stand.vehicle, cells)
-            self._grants.set(stand.vehicle, [*cells, cell], self._next_stamp)
+            if len(orders.entries(vehicle)) >= _MOST_CELLS or not self._guest_may_hold_more(vehicle):
+                return
+            if not orders.append(vehicle, cell, self._next_stamp):
+                return
             self._granted = True
+            if len(order) > 1:
+                return
+
+    def _may_follow(self, stand: Stand, order: Mapping[Number, str]) -> bool:
+        """Returns True if a vehicle may be put behind those in an order."""
+        number = [*order][-1]
+        return (
+            len(order) <= _MOST_BEFORE
+            and not _is_entering(stand)
+            and self._goes_on(order[number], number)
+            and not self._orders.would_circle(stand.vehicle, number[0])
+        )
 
     def _guest_may_hold_more(self, vehicle: str) -> bool:
         """Returns True if neither this guest nor all together hold their share; true of vehicles of the
@@ -390,8 +344,7 @@ class Warden:
         host = agent_of(vehicle)
         if host in self._fleets:
             return True
-        held, fleets = self._grants.by_host, self._fleets
-        if sum(map(len, held.get(host, _NO_GRANTS).values())) >= MOST_CELLS_OF_GUEST:
+        fleets, count = self._fleets, self._orders.by_host_count
+        if count(host) >= MOST_CELLS_OF_GUEST:
             return False
-        together = sum(sum(map(len, cells.values())) for guest, cells in held.items() if guest not in fleets)
-        return together < MOST_CELLS_OF_GUESTS
+        return sum(count(guest) for guest in self._orders.by_host if guest not in fleets) < MOST_CELLS_OF_GUESTS

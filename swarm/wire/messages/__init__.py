@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from swarm.wire.fields import Bounded
 
-WIRE_VERSION = 9
+WIRE_VERSION = 10
 """The wire that this build speaks. It rises by one, once a release, where a message steps to a version that builds
 before it do not read, or where a key changes (`swarm.wire.versions`, docs/design/wire-format.md). Two neighbours
 share a run."""

@@ -14,8 +14,12 @@ from swarm.wire.messages import Message, schema_of
 
 Stamp = tuple[Natural, Natural]
 """(epoch, seq): which table of a plot. Later ones compare greater."""
-Held = Annotated[list[Cell], Meta(max_length=64)]
-"""Cells of one vehicle in driving order."""
+Number = tuple[Cell, Natural, Natural]
+"""(cell, epoch, seq): an entry in the order of vehicles for a cell, by the table that added it."""
+Held = Annotated[list[Number], Meta(max_length=64)]
+"""Entries of one vehicle in driving order."""
+Before = tuple[Natural, Natural, VehicleId]
+"""(epoch, seq, vehicle) of another entry of the same cell."""
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
 PlotSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_PLOT_REGIONS * REGION_CELLS, multiple_of=REGION_CELLS)]
 """In cells."""
@@ -25,7 +29,7 @@ class Stand(Part, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one plot.
 
     cell    where it stands, and `end` where what it holds ends; both may lie in another plot
-    holds   the cells of this plot that it holds, in driving order
+    holds   the entries of this plot that it holds, in driving order
     ahead   its next cells after `end`
     wants   where else it could go from its cell, the best first; only while it stands
     better  how many of those are better than to stay; the others serve to make way
@@ -42,13 +46,13 @@ class Stand(Part, frozen=True, array_like=True):
     age_ms: Milliseconds
 
 
-class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
+class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing", 9)):
     """All vehicles of a host that hold or request a cell of one plot, sent to one of its members. The newest
     replaces the older.
 
     life   number of the host's start (glossary: life) that sends this; a later start has a greater number
-    knows  number of the newest table that the host has used. It has given up every cell which that table, or an
-           older one, granted and which is not listed in `vehicles`
+    knows  number of the newest table that the host has used. It has left or given back every entry which that
+           table, or an older one, added and which is not listed in `vehicles`
     dead   numbers of earlier starts of this host that have certainly ended: they had locked the host's file, which
            this start has locked now
     ended  this start of the host has stopped driving, for good
@@ -64,31 +68,35 @@ class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
     ended: bool = False
 
 
-class Grant(msgspec.Struct, frozen=True, array_like=True):
-    """The cells that one vehicle may stand on or enter, in driving order.
+class Entry(msgspec.Struct, frozen=True, array_like=True):
+    """A vehicle's place in the order of vehicles for one cell.
 
-    stamp  of the table that last added one
+    after  the entries before it that the table which says this still lists: the vehicle waits for each
     """
 
-    cells: Annotated[list[Cell], Meta(min_length=1, max_length=64)]
-    stamp: Stamp
+    number: Number
+    after: Annotated[list[Before], Meta(max_length=64)] = []
+
+    @property
+    def cell(self) -> int:
+        return self.number[0]
 
 
-class Shut(Bounded, frozen=True, array_like=True):
-    """Cells on which vehicles of an earlier life of a host may still stand."""
+class Fence(Bounded, frozen=True, array_like=True):
+    """The entries of an earlier life of a host, on which its vehicles may still be."""
 
     agent: Id
     life: Natural
-    cells: Annotated[list[Cell], LARGE]
+    entries: Annotated[dict[VehicleId, Held], LARGE]
 
 
-class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
-    """Granted cells of one plot, for its members. In a publication its author is the plot's warden; in a reply, a
-    member which tells what it has stored.
+class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
+    """Entries of one plot, for its members. In a publication its author is the plot's warden; in a reply, a member
+    which tells what it has stored. The entries of a cell are in the order of their numbers.
 
     hosts   agent -> [life, seq] of the newest standing that counts in this table
-    grants  vehicle -> its cells
-    shut    cells that no vehicle may enter
+    grants  vehicle -> its entries in driving order
+    fences  entries of lives that may still drive
     pushed  vehicle -> the age with which it is to make way into another plot
     """
 
@@ -97,8 +105,8 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
     epoch: Natural
     seq: Natural
     hosts: Annotated[dict[Id, tuple[Natural, Natural]], IDS]
-    grants: Annotated[dict[VehicleId, Grant], LARGE]
-    shut: Annotated[list[Shut], IDS] = []
+    grants: Annotated[dict[VehicleId, Annotated[Held, Meta(min_length=1)]], LARGE]
+    fences: Annotated[list[Fence], IDS] = []
     pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
 
     @property
@@ -115,13 +123,14 @@ class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
     seq: Natural
 
 
-class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
+class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     """Content of a plot's table for one host, once a majority of the plot's members has it on file.
 
     agent        the plot's warden
     epoch, seq   of the table
     life, heard  the newest standing of the host that counts in the table; 0 if none does
-    grants       vehicle of the host -> its cells, in driving order
+    grants       vehicle of the host -> its entries, in driving order
+    followed     other host -> entries of this one behind which its vehicles wait
     pushed       vehicle of the host -> the age with which it is to make way into another plot
     occupied     of the cells around where vehicles of the host end, those that others hold
     """
@@ -133,13 +142,23 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
     seq: Natural
     life: Natural
     heard: Natural
-    grants: Annotated[dict[VehicleId, Annotated[list[Cell], Meta(min_length=1, max_length=64)]], SMALL] = {}
+    grants: Annotated[dict[VehicleId, Annotated[list[Entry], Meta(min_length=1, max_length=64)]], SMALL] = {}
+    followed: Annotated[dict[Id, Annotated[list[Number], SMALL]], IDS] = {}
     pushed: Annotated[dict[VehicleId, Milliseconds], SMALL] = {}
     occupied: Annotated[list[Cell], LARGE] = []
 
     @property
     def stamp(self) -> Stamp:
         return self.epoch, self.seq
+
+
+class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
+    """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
+    for good, so no order, loss or repetition matters."""
+
+    agent: Id
+    host: Id
+    entries: Annotated[list[Number], SMALL]
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):

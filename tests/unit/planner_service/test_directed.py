@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from support.plot_tables import grants_of
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -156,9 +157,9 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
 
     def grant(seq: int, cells: list[int]) -> None:
         """Acts as the warden of the only plot, which has no other host to consider."""
-        warden, grants = plots.warden(0, 1), {"a0-00": cells}
+        warden, grants = plots.warden(0, 1), grants_of(holdings, seq, {"a0-00": cells})
         granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
-        agent.place(holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
+        agent.place(holdings.hear_granted(granted, seq))
 
     grant(1, [start])
     agent.set_planners({"t": 1}, 0)

@@ -333,7 +333,8 @@ def test_marks_of_a_program_whose_clock_is_an_hour_off_count_and_end_as_those_of
 
 
 def test_most_processes_say_which_run_it_is_and_what_time() -> None:
-    ours, other = keeper_info(GRID), keeper_info(GRID, "other")
+    infos = keeper_info(GRID), keeper_info(GRID, "other")
+    ours, other = (msgspec.structs.replace(info, wire_version=WIRE_VERSION) for info in infos)
     router = msgspec.structs.replace(ours, role="router", run_id="", rows=0, cols=0)
 
     def at(info: RunInfo, ahead_s: float) -> tuple[RunInfo, int]:

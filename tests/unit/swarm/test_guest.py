@@ -14,7 +14,7 @@ from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.incarnations import LifeFile, MemoryLives
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.traffic import Granted, Known, Shut, Stand, Standing, Table
+from swarm.wire.messages.traffic import Fence, Granted, Known, Stand, Standing, Table
 from vehicle_agent.traffic import warden as wardens
 from vehicle_agent.traffic.warden import Warden
 
@@ -110,16 +110,17 @@ def test_no_guest_and_not_all_together_take_all_cells(monkeypatch: pytest.Monkey
     warden.take_standing(entering("rover", 0), 0)
     warden.tick(0)
     for seq in range(2, 12):  # one vehicle that never moves and always wants more
-        cells = warden._grants.of["rover-00"].cells
-        ahead = list(range(cells[-1] + 1, cells[-1] + 13))
-        stand = Stand("rover-00", 0, cells[-1], cells, ahead, ahead[:1], 1, 0)
+        held = list(warden._orders.of["rover-00"])
+        end = held[-1][0]
+        ahead = list(range(end + 1, end + 13))
+        stand = Stand("rover-00", 0, end, held, ahead, ahead[:1], 1, 0)
         warden.take_standing(
             Standing(plot=0, agent="rover", life=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0
         )
         warden.tick(0)
     table = warden.tick(1 << 40)
     assert table is not None
-    assert len(table.grants["rover-00"].cells) == 64
+    assert len(table.grants["rover-00"]) == 64
     decode(encode(table), Table)
 
     monkeypatch.setattr(wardens, "MOST_CELLS_OF_GUEST", 3)
@@ -129,7 +130,7 @@ def test_no_guest_and_not_all_together_take_all_cells(monkeypatch: pytest.Monkey
         warden.take_standing(entering(f"r{n}", 8 * n, ahead=[8 * n, 8 * n + 1, 8 * n + 2, 8 * n + 3]), 0)
     table = warden.tick(0)
     assert table is not None
-    held = sorted(len(grant.cells) for grant in table.grants.values())
+    held = sorted(len(numbers) for numbers in table.grants.values())
     assert sum(held) == 5
     assert held[-1] == 3
 
@@ -151,8 +152,8 @@ def test_a_plot_knows_so_many_guests_and_says_whom_it_refuses(monkeypatch: pytes
 
 def test_an_operator_frees_what_all_lives_of_a_guest_hold_and_its_next_life_enters_again() -> None:
     guest, warden = entered()
-    warden._shut["rover", 77] = [90, 91]
-    lives = [77, warden._lives["rover"][0]]
+    warden._orders.fenced["rover", 77] = {"rover-00": [(90, 1, 1), (91, 1, 1)]}
+    lives = [77, warden._orders.hosts["rover"][0]]
     removal = Removal(PLOTS, "rover")
     for agent in PLOTS.agents:
         known = Known(agent=agent, disk=0, life=lives[1], plots=[0], agents=list(PLOTS.agents), lives=lives)
@@ -171,20 +172,21 @@ def test_an_operator_frees_what_all_lives_of_a_guest_hold_and_its_next_life_ente
             guest.hear_granted(granted, now_ns)
     assert removal.done
     assert not table.grants
-    assert not [each for each in table.shut if each.cells]
+    assert not table.fences
     assert guest.replaced
     assert guest.cells == ()
 
     back = Guest(PLOTS, "rover", [lives[1]])
     for agent in PLOTS.agents:
-        back.hear_known(Known(agent=agent, disk=0, life=warden._lives["rover"][0], plots=[], agents=[], lives=[]))
+        life, _ = warden._orders.hosts["rover"]
+        back.hear_known(Known(agent=agent, disk=0, life=life, plots=[], agents=[], lives=[]))
     back.enter(90)
     back.begin(9)
     talk(back, warden, 2_000_000_000)
     assert back.cells == (90,)
     table = warden.tick(3_000_000_000)
     assert table is not None
-    assert table.shut == []  # no vehicle drove by the operator's incarnation
+    assert table.fences == []  # no vehicle drove by the operator's incarnation
 
 
 def test_a_replaced_guest_says_nothing_and_takes_nothing() -> None:
@@ -197,17 +199,17 @@ def test_a_replaced_guest_says_nothing_and_takes_nothing() -> None:
 
 
 def test_what_was_shut_for_a_guest_is_opened_only_by_a_life_that_counts_and_is_its_own_first() -> None:
-    shut = [Shut("rover", 5, [70, 71])]
-    warden = warden_of(hosts={"rover": (1 << 40, 9)}, shut=shut)
+    held = {"rover-00": [(70, 1, 1), (71, 1, 1)]}
+    warden = warden_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, held)])
     older = entering("rover", 70, life=1 << 33)
     warden.take_standing(Standing(**{**fields_of(older), "dead": [5]}), 0)
-    assert warden._shut == {("rover", 5): [70, 71]}
+    assert warden._orders.fenced == {("rover", 5): held}
     warden.take_standing(entering("a1", 71), 0)
     younger = entering("rover", 70, life=(1 << 40) + 1)
     warden.take_standing(Standing(**{**fields_of(younger), "dead": [5]}), 0)
     table = warden.tick(0)
     assert table is not None
-    assert table.grants["rover-00"].cells == [70]
+    assert table.grants["rover-00"] == [(70, 1, 1)]
 
 
 def fields_of(standing: Standing) -> dict[str, object]:

@@ -17,6 +17,7 @@ from support.plot_tables import (
 
 from swarm.right_of_way.holdings import Wish
 from swarm.right_of_way.incarnations import BEAT_NS
+from swarm.wire.messages.traffic import Entry, Left
 from swarm.wire.topics import STANDING
 
 
@@ -39,7 +40,7 @@ def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
 def test_a_life_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
     holdings = holdings_of()
     younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), life=2)
-    holdings.hear_granted(younger, lambda vehicle, cells: cells[0], S)
+    holdings.hear_granted(younger, S)
     assert holdings.replaced
     hear(holdings, table_of(1, 2, a0=[9]), S)
     assert list(holdings.path("a0-00")) == []
@@ -53,21 +54,51 @@ def test_a_host_takes_what_follows_its_path() -> None:
     assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
 
 
-def test_a_cell_given_back_is_not_asked_for_before_the_table_shows_that_it_is_free() -> None:
+def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
     hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
     holdings.give_back("a0-00")
-    wishes = {"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}
-    (told,) = holdings.standings(wishes, S)
+    (told,) = holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S)
     said = told.standing
-    assert holdings.standings(wishes, S + BEAT_NS - 1) == []  # nothing new
-    assert len(holdings.standings(wishes, S + BEAT_NS)) == 1
-    assert (said.vehicles[0].holds, said.vehicles[0].ahead, said.vehicles[0].wants) == ([9], [], [17, 1])
-    hear(holdings, table_of(1, 3, a0=[9]))
-    (told,) = holdings.standings(wishes, S + BEAT_NS)
-    said = told.standing
-    assert (said.vehicles[0].ahead, said.vehicles[0].wants) == ([10, 11], [10, 17, 1])
+    assert holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + BEAT_NS - 1) == []
+    assert (said.vehicles[0].holds, said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
+    hear(holdings, table_of(1, 3, a0=[9, 10, 11]))  # it has not heard that yet
+    assert list(holdings.path("a0-00")) == [9]
+    hear(holdings, table_of(1, 4, a0=[9, (10, 1, 4)]))
+    assert list(holdings.path("a0-00")) == [9, 10]
+
+
+def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9]))
+    waits = Entry((10, 1, 2), [(1, 1, "a1-00")])
+    held = {"a0-00": [Entry((9, 1, 1)), waits]}
+    granted = msgspec.structs.replace(granted_of(table_of(1, 2, a0=[9])), grants=held)
+    holdings.hear_granted(granted, S)
+    assert (holdings.path("a0-00"), holdings.open("a0-00")) == ([9, 10], [9])
+    with pytest.raises(ValueError, match="must not enter cell 10"):
+        holdings.moved("a0-00", 10)
+    for host, number in (("a2", (10, 1, 1)), ("a1", (10, 1, 3)), ("a1", (11, 1, 1))):
+        holdings.hear_left(Left(agent=host, host="a0", entries=[number]))
+        assert not holdings.may_enter("a0-00", 10)
+    holdings.hear_left(Left(agent="a1", host="a0", entries=[(10, 1, 1)]))
+    assert holdings.open("a0-00") == [9, 10]
+    holdings.moved("a0-00", 10)
+    assert holdings.path("a0-00") == [10]
+
+
+def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it_no_more() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9, 10]))
+    followed = msgspec.structs.replace(granted_of(table_of(1, 2, a0=[9, 10])), followed={"a3": [(9, 1, 1)]})
+    holdings.hear_granted(followed, S)
+    assert holdings.lefts(S) == []
+    holdings.moved("a0-00", 10)
+    word = Left(agent="a0", host="a3", entries=[(9, 1, 1)])
+    assert [holdings.lefts(now_ns) for now_ns in (S, S + 1, S + BEAT_NS)] == [[word], [], [word]]
+    hear(holdings, table_of(1, 3, a0=[10]))
+    assert holdings.lefts(9 * S) == []
 
 
 def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:

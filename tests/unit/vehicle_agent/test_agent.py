@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.plot_tables import grants_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -59,9 +60,9 @@ def agent_of(scenario: Scenario, index: int = 0) -> Agent:
 def grant(agent: Agent, seq: int, **cells: list[int]) -> None:
     """The warden of a plot grants cells to a0-00 and a0-01, named by their last digit."""
     warden = Plots(GRID, ["a0", "a1"]).warden(0, 1)
-    grants = {f"a0-0{name[1:]}": each for name, each in cells.items()}
+    grants = grants_of(agent.holdings, seq, {f"a0-0{name[1:]}": each for name, each in cells.items()})
     granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
-    agent.place(agent.holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
+    agent.place(agent.holdings.hear_granted(granted, seq))
 
 
 @pytest.fixture

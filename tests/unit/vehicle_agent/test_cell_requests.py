@@ -11,9 +11,7 @@ import pytest
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.right_of_way.holdings import Holdings, Wish
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted
+from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
@@ -170,26 +168,3 @@ def test_one_that_stands_or_leaves_leaves_nothing_behind():
         wishes.forget(vehicle.id)
     assert not any((wishes.of, wishes._made_of, wishes._beside, wishes._since_ns))
     assert others
-
-
-def test_what_is_said_is_not_kept_after_a_grant_that_nobody_can_obey() -> None:
-    grid = GridSpec(4, 8, 10.0)
-    plots = Plots(grid, ["a0"], side=4)
-    holdings = Holdings(plots, "a0", ["v"])
-    holdings.begin(1, [])
-    holdings.enter("v", 0)
-
-    def hear(seq: int, cells: list[int]) -> None:
-        grants = {"v": cells}
-        granted = Granted(plot=0, host="a0", agent="a0", epoch=1, seq=seq, life=1, heard=0, grants=grants)
-        holdings.hear_granted(granted, lambda vehicle, found: None, 1)
-
-    def asked() -> list[list[int]]:
-        return [stand.ahead for tell in holdings.standings(wishes, 1) for stand in tell.standing.vehicles]
-
-    wishes = {"v": Wish(ahead=[1, 2], age_ms=1)}
-    hear(1, [0, 1])
-    assert holdings.path("v") == [0]
-    assert asked() == [[]]  # cell 1 is granted, but not held: it is about to be freed
-    hear(2, [6])  # of another plot
-    assert asked() == [[1, 2]]

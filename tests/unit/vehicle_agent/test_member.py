@@ -53,11 +53,11 @@ def test_the_second_member_says_what_the_first_has_not_said_and_something_in_eac
 def warden_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
     """A member that has just become warden, and the table that it sent, which no member has stored yet."""
     member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
-    member.hear_standing(standing("a0", [9], seq=1), 2 * S)
+    member.hear_standing(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    member.hear_standing(standing("a0", [9], seq=2), 2 * S)
+    member.hear_standing(standing("a0", [(9, 0, 1)], seq=2), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
     return member, table
@@ -74,13 +74,13 @@ def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_i
         ((None, table.seq), number),
     ):
         now_ns += BEAT_NS
-        member.hear_standing(standing("a0", [9], seq=now_ns), now_ns)
+        member.hear_standing(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
         for other, seq in zip(MEMBERS[1:], stored, strict=True):
             if seq is not None:
                 member.hear_stored(Stored(plot=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
         assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
     now_ns += 2 * BEAT_NS
-    member.hear_standing(standing("a0", [9], seq=now_ns), now_ns)
+    member.hear_standing(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
     assert member.tick(now_ns) == [table]  # no member has answered the number
 
 
@@ -113,7 +113,7 @@ def test_a_number_of_a_later_epoch_ends_a_warden_and_one_of_an_earlier_epoch_is_
 
 def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
     member = member_of()
-    member.hear_standing(standing("a1", [9], seq=1), 2 * S)
+    member.hear_standing(standing("a1", [(9, 0, 1)], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
     assert isinstance(save, Save)
     member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
@@ -121,7 +121,7 @@ def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
     first = member.warden
     assert first is not None
-    member.hear_standing(standing("a1", [9], seq=3), 3 * S)
+    member.hear_standing(standing("a1", [(9, 0, 1)], seq=3), 3 * S)
     member.tick(3 * S)  # no member has acknowledged anything: it resigns
     assert member.warden is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 3 * S)
@@ -139,12 +139,12 @@ def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
     member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
-    member.hear_standing(standing("a0", [9], seq=1), 2 * S)
+    member.hear_standing(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    wants = [Stand("a0-00", 9, 9, [9], [], [18, 10], 2, 0)]
-    member.hear_standing(standing("a0", [9], seq=2, vehicles=wants), 2 * S)
+    wants = [Stand("a0-00", 9, 9, [(9, 0, 1)], [], [18, 10], 2, 0)]
+    member.hear_standing(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
     stored = Stored(plot=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
@@ -153,6 +153,7 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
     assert isinstance(granted, Granted)
     assert (granted.host, granted.stamp, granted.heard) == ("a0", table.stamp, 2)
-    assert (granted.grants, granted.occupied) == ({"a0-00": [9, 10]}, [18])
+    assert [entry.cell for entry in granted.grants["a0-00"]] == [9, 10]
+    assert granted.occupied == [18]
     assert member.hear_stored(stored, 2 * S) == []  # told just now
     assert [type(each) for each in member.hear_stored(stored, 2 * S + BEAT_NS)] == [Granted]

@@ -32,7 +32,7 @@ class Sized(Process):
         world, disk = self.world, self.disk
         side = world.other_side if self.agent in world.others else world.plots.side
         self.plots = Plots(world.grid, list(world.spawns), side)
-        return RightOfWay(self.agent, self.plots, world.spawns, disk.own, disk.saved, self.find_body)
+        return RightOfWay(self.agent, self.plots, world.spawns, disk.own, disk.saved)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:

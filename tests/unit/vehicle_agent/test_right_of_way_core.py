@@ -8,7 +8,7 @@ from support.plot_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Known, KnownRequest, Shut, Table
+from swarm.wire.messages.traffic import Fence, Known, KnownRequest, Table
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
@@ -65,7 +65,7 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
 
 def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
     """No other process can: the later incarnation has another file. It had left that plot long ago."""
-    table = msgspec.structs.replace(table_of(1, 1), shut=[Shut("a4", 1 << 32, [9])])
+    table = msgspec.structs.replace(table_of(1, 1), fences=[Fence("a4", 1 << 32, {"a4-00": [(9, 1, 1)]})])
     member = rights_of(MEMBERS[0], {0: (1, table)})
     (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
     assert isinstance(known, Known)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from support.plot_tables import (
     PLOTS,
     S,
+    cells_of,
+    entries,
     standing,
     table_of,
 )
@@ -16,27 +18,40 @@ from vehicle_agent.traffic.warden import Warden
 
 
 def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
-    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10, 11]), {"a1": ["a1-00"]})
-    assert warden.tick(0).grants["a1-00"].cells == [9, 10, 11]  # type: ignore[union-attr]
-    warden.take_standing(standing("a1", [10, 11], seq=2), 0)
-    assert warden.tick(S).grants["a1-00"].cells == [10, 11]  # type: ignore[union-attr]
-    warden.take_standing(standing("a1", [9, 10, 11], seq=1), 0)  # late
-    warden.take_standing(standing("a1", [10], seq=3, knows=(1, 0)), 0)  # of before the last grant
-    assert warden.tick(2 * S).grants["a1-00"].cells == [10, 11]  # type: ignore[union-attr]
-    warden.take_standing(standing("a1", [10], seq=4, knows=(1, 1)), 0)
-    assert warden.tick(3 * S).grants["a1-00"].cells == [10]  # type: ignore[union-attr]
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10, (11, 1, 2)]), {"a1": ["a1-00"]})
+    assert cells_of(warden.tick(0), "a1-00") == [9, 10, 11]
+    warden.take_standing(standing("a1", entries(1, 1, 10), seq=2, knows=(1, 1)), 0)
+    assert cells_of(warden.tick(S), "a1-00") == [10, 11]
+    warden.take_standing(standing("a1", entries(1, 1, 9, 10), seq=1), 0)  # late
+    warden.take_standing(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), 0)  # of before the last grant
+    assert cells_of(warden.tick(2 * S), "a1-00") == [10, 11]
+    warden.take_standing(standing("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
+    assert cells_of(warden.tick(3 * S), "a1-00") == [10]
 
 
-def test_what_an_older_life_may_stand_on_stays_shut_until_it_has_stopped_or_is_proved_dead() -> None:
-    for end in (standing("a1", [9], seq=9, ended=True), standing("a1", [9], seq=9, life=1 << 33, dead=[1])):
+def test_entries_of_an_older_life_stay_until_it_has_stopped_or_is_proved_dead() -> None:
+    nine = entries(1, 1, 9)
+    for end in (standing("a1", nine, seq=9, ended=True), standing("a1", nine, seq=9, life=1 << 33, dead=[1])):
         warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
-        warden.take_standing(standing("a1", [9], seq=1, life=1 << 32, vehicles=[]), 0)
+        warden.take_standing(standing("a1", nine, seq=1, life=1 << 32, vehicles=[]), 0)
         table = warden.tick(0)
         assert table is not None
-        assert [(shut.agent, shut.life, shut.cells) for shut in table.shut] == [("a1", 1, [9, 10])]
-        assert table.grants["a1-00"].cells == [9, 10]
+        assert [(each.agent, each.life, each.entries) for each in table.fences] == [
+            ("a1", 1, {"a1-00": entries(1, 1, 9, 10)})
+        ]
+        assert table.grants["a1-00"] == [(9, 3, 2)]  # a new one, behind that of the older life
         warden.take_standing(end, 0)
-        assert all(shut.life != 1 for shut in warden.tick(S).shut)  # type: ignore[union-attr]
+        assert all(each.life != 1 for each in warden.tick(S).fences)  # type: ignore[union-attr]
+
+
+def test_the_entry_of_a_body_passes_to_the_life_that_proves_the_older_one_ended() -> None:
+    for dead, cells in (([1], [(10, 1, 1)]), ([], [])):
+        warden = Warden(PLOTS, "a0", 3, table_of(1, 1, rover=[9, 10]), {"a1": ["a1-00"]})
+        stands = Stand("rover-00", 10, 10, [], [10], [], 0, 0)
+        warden.take_standing(standing("rover", [(10, 0, 0)], 1, life=1 << 32, dead=dead, vehicles=[stands]), 0)
+        table = warden.tick(0)
+        assert table is not None
+        assert table.grants.get("rover-00", []) == cells
 
 
 def test_an_older_life_is_told_that_it_is_replaced_by_a_warden_that_never_heard_the_younger() -> None:
@@ -44,7 +59,7 @@ def test_an_older_life_is_told_that_it_is_replaced_by_a_warden_that_never_heard_
     table = table_of(1, 1, a1=[9])
     table.hosts["a1"] = (2 << 32, 7)
     warden = Warden(PLOTS, "a0", 3, table, {"a1": ["a1-00"]})
-    for late in (standing("a1", [9], seq=50), standing("a1", [9], seq=51, ended=True)):
+    for late in (standing("a1", [(9, 1, 1)], seq=50), standing("a1", [(9, 1, 1)], seq=51, ended=True)):
         warden.take_standing(late, S)
         told = warden.tick(S)
         (granted,) = warden.granted(table if told is None else told, S)
@@ -53,13 +68,13 @@ def test_an_older_life_is_told_that_it_is_replaced_by_a_warden_that_never_heard_
     older = Holdings(PLOTS, "a1", ["a1-00"])
     older.begin(1, [])
     older.watch([0])
-    older.hear_granted(granted, lambda vehicle, cells: cells[0], S)
+    older.hear_granted(granted, S)
     assert older.replaced
 
 
 def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9]), {"a1": ["a1-00"]})
-    warden.take_standing(standing("a1", [9], seq=1, life=1 << 61), 0)
+    warden.take_standing(standing("a1", [(9, 1, 1)], seq=1, life=1 << 61), 0)
     assert "a1 names a life" in warden.refused[0]
     assert warden.tick(0).hosts["a1"] == (1, 1)  # type: ignore[union-attr]
     assert first_life(5 << 32 | 7, 1) > 5 << 32 | 0xFFFF_FFFF
@@ -74,40 +89,62 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
         held = table_of(1, 1, **{host: [cell] for host, cell in places.items()})
         warden = Warden(PLOTS, "a0", 3, held, {host: [f"{host}-00"] for host in places})
         for host, cell in places.items():
-            stand = Stand(f"{host}-00", cell, cell, [cell], [27], [27], 1, step << 12)
-            warden.take_standing(standing(host, [cell], seq=2, vehicles=[stand]), 0)
+            stand = Stand(f"{host}-00", cell, cell, [(cell, 1, 1)], [27], [27], 1, step << 12)
+            warden.take_standing(standing(host, [(cell, 1, 1)], seq=2, vehicles=[stand]), 0)
         table = warden.tick(0)
         assert table is not None
-        first.update(vehicle for vehicle, grant in table.grants.items() if 27 in grant.cells)
+        first.update(vehicle for vehicle in table.grants if 27 in cells_of(table, vehicle))
     assert first == set(held.grants)
 
 
-def test_a_cell_that_one_under_way_holds_last_is_closed_though_the_same_plan_grants_it_more() -> None:
-    held = table_of(1, 1, a1=[9, 10], a2=[18])
-    warden = Warden(PLOTS, "a0", 3, held, {host: [f"{host}-00"] for host in ("a1", "a2")})
-    drives = Stand("a1-00", 9, 10, [9, 10], [11], [], 0, 9 << 12)
-    waits = Stand("a2-00", 18, 18, [18], [], [10, 26], 2, 0)
-    warden.take_standing(standing("a1", [9, 10], seq=2, vehicles=[drives]), 0)
-    warden.take_standing(standing("a2", [18], seq=2, vehicles=[waits]), 0)
+def plan(stands: dict[str, Stand]) -> dict[str, list[int]]:
+    """The cells of each vehicle in a warden's first table; vehicles hold what their stands say."""
+    held = table_of(1, 1, **{host: list(stand.holds) for host, stand in stands.items()})
+    warden = Warden(PLOTS, "a0", 3, held, {host: [f"{host}-00"] for host in stands})
+    for host, stand in stands.items():
+        warden.take_standing(standing(host, list(stand.holds), seq=2, vehicles=[stand]), 0)
     table = warden.tick(0)
     assert table is not None
-    assert {vehicle: grant.cells for vehicle, grant in table.grants.items()} == {
-        "a1-00": [9, 10, 11],
-        "a2-00": [18, 26],
-    }
+    return {vehicle: cells_of(table, vehicle) for vehicle in table.grants}
+
+
+def stand_of(host: str, cells: list[int], ahead: list[int] = [], wants: list[int] = [], age: int = 0) -> Stand:  # noqa: B006
+    return Stand(f"{host}-00", cells[0], cells[-1], entries(1, 1, *cells), ahead, wants, len(wants), age << 12)
+
+
+def test_a_vehicle_follows_one_that_goes_on_and_none_that_stays() -> None:
+    drives = {"a1": stand_of("a1", [9, 10], ahead=[11]), "a2": stand_of("a2", [8], wants=[9, 16])}
+    assert plan(drives) == {"a1-00": [9, 10, 11], "a2-00": [8, 9]}
+    stays = {"a1": stand_of("a1", [9]), "a2": stand_of("a2", [8], wants=[9, 16])}
+    assert plan(stays)["a2-00"] == [8, 16]
+
+
+def test_who_is_pushed_and_who_pushes_are_granted_their_cells_by_one_table() -> None:
+    pushed = {"a1": stand_of("a1", [9], wants=[10]), "a2": stand_of("a2", [8], wants=[9], age=9)}
+    assert plan(pushed) == {"a1-00": [9, 10], "a2-00": [8, 9]}
+
+
+def test_no_two_exchange_places_and_none_go_around_in_a_ring() -> None:
+    swap = {"a1": stand_of("a1", [9], wants=[8]), "a2": stand_of("a2", [8], wants=[9], age=9)}
+    assert plan(swap) == {"a1-00": [9], "a2-00": [8]}
+    cells = {"a1": (9, 10), "a2": (10, 18), "a3": (18, 17), "a4": (17, 9)}
+    ring = {host: stand_of(host, [here], wants=[there]) for host, (here, there) in cells.items()}
+    assert plan(ring) == {f"{host}-00": [here] for host, (here, _) in cells.items()}
 
 
 def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_beat() -> None:
     warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
     first = warden.tick(0)
     assert first is not None
-    warden.take_standing(standing("a1", [9, 10], seq=2), 0)
+    warden.take_standing(standing("a1", entries(1, 1, 9, 10), seq=2), 0)
     assert warden.tick(BEAT_NS // 2) is None
     assert warden.tick(BEAT_NS) is first
-    warden.take_standing(standing("a1", [10], seq=3), BEAT_NS)
+    warden.take_standing(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), BEAT_NS)
     assert warden.tick(BEAT_NS + 1) is None  # a mere release can wait
     freed = warden.tick(2 * BEAT_NS)
     assert freed is not None
-    assert (freed.seq, freed.hosts["a1"], freed.grants["a1-00"].cells) == (2, (1, 3), [10])
-    warden.take_standing(standing("a1", [10], seq=4, vehicles=[]), 2 * BEAT_NS)  # it wants nothing here any more
+    assert (freed.seq, freed.hosts["a1"], cells_of(freed, "a1-00")) == (2, (1, 3), [10])
+    warden.take_standing(
+        standing("a1", entries(1, 1, 10), seq=4, vehicles=[]), 2 * BEAT_NS
+    )  # it wants nothing here any more
     assert warden.tick(3 * BEAT_NS).hosts["a1"] == (1, 4)  # type: ignore[union-attr]

@@ -1,0 +1,171 @@
+"""Entries: a vehicle's place in the order of vehicles for each cell, as its host acts on them. Pure.
+
+A warden keeps one order of entries for each cell, and appends at its end only
+(`vehicle_agent.traffic.cell_orders`). The vehicle of an entry enters the cell once every entry before it is over.
+An entry is over by the word `Left` of the host that had it, or by a usable table that lists it no more. Both are
+facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
+cell while another leaves it, and stops at the border of its own cell until the word is there.
+
+Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
+
+1. The number of an entry is used once: (cell, epoch, sequence). A table adds one entry to a cell at most.
+2. Who enters has seen that *all* entries before its own are over, not only the last: that one may have been given
+   back while the first is still used. Entries of the same vehicle, of an earlier life, do not count.
+3. A host says that it has left a cell once its vehicle has, not when it sets out.
+4. An entry that was left, given back or passed over is never used again by this host.
+5. A host acts on tables for its own life only, and in their order.
+6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
+   have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
+   the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, at the end of the
+   order of a cell which the earlier life held; the others are over once it has a place there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from swarm.config.agents import agent_of
+from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
+
+_MOST_HEARD = 1 << 13
+"""Entries of others that are remembered as over; each is told again until a table lists it no more."""
+BEFORE_ALL: Stamp = (0, 0)
+
+
+@dataclass(slots=True)
+class HostEntries:
+    """The entries of the vehicles of one life of a host.
+
+    plot_of   plot of a cell
+    adjacent  whether one step leads from one cell to another
+    bodies    vehicle -> the cell of its body, or where it would enter, while it has no place and that is known
+    away      vehicles that have left in this life: they take no entry
+    paths     vehicle -> its entries in driving order, its own cell first
+    placed    vehicles that are on the first cell of their paths; the others are nowhere
+    over      plot -> numbers that this life has left, given back or passed over, and its table still lists
+    heard     (number, host) of which that host has said that it is over; entries of paths know it
+    knows     plot -> the newest table acted on
+    """
+
+    life: int
+    plot_of: Callable[[int], int]
+    adjacent: Callable[[int, int], bool]
+    bodies: dict[str, int] = field(default_factory=dict)
+    away: set[str] = field(default_factory=set)
+    paths: dict[str, list[Entry]] = field(default_factory=dict)
+    placed: set[str] = field(default_factory=set)
+    over: dict[int, set[Number]] = field(default_factory=dict)
+    heard: dict[tuple[Number, str], None] = field(default_factory=dict)
+    knows: dict[int, Stamp] = field(default_factory=dict)
+
+    def hear_left(self, host: str, numbers: Iterable[Number]) -> None:
+        """Another host has left these, or given them back: facts for good."""
+        self.heard.update(dict.fromkeys((number, host) for number in numbers))
+        for path in self.paths.values():
+            for index, entry in enumerate(path):
+                if entry.after:
+                    path[index] = self._waiting(entry, entry.after)
+        while len(self.heard) > _MOST_HEARD:
+            del self.heard[next(iter(self.heard))]
+
+    def _waiting(self, entry: Entry, after: Sequence[Before]) -> Entry:
+        """Returns an entry with those of `after` which are before it and not known to be over."""
+        if not entry.after:
+            return entry
+        before = [
+            each
+            for each in entry.after
+            if each in after and ((entry.cell, each[0], each[1]), agent_of(each[2])) not in self.heard
+        ]
+        return Entry(entry.number, before)
+
+    def hear_granted(self, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]) -> set[str]:
+        """A usable table of a plot names these entries of our vehicles. Returns the vehicles of which the path has
+        other entries now."""
+        if life != self.life or stamp <= self.knows.get(plot, BEFORE_ALL):
+            return set()
+        self.knows[plot] = stamp
+        over = self.over.setdefault(plot, set())
+        over.intersection_update(entry.number for entries in grants.values() for entry in entries)
+        longer = set()
+        for vehicle, entries in grants.items():
+            path = self.paths.get(vehicle, [])
+            at = {entry.number: index for index, entry in enumerate(path)}
+            for entry in entries:
+                if entry.number in at:
+                    index = at[entry.number]
+                    path[index] = self._waiting(entry, path[index].after)
+                elif entry.number not in over and self._follows(vehicle, path, entry):
+                    path.append(self._waiting(entry, entry.after))
+                    longer.add(vehicle)
+                else:
+                    over.add(entry.number)
+            if path:
+                self.paths[vehicle] = path
+                if path[0].cell == self.bodies.get(vehicle) and not path[0].after:
+                    self.placed.add(vehicle)
+        return longer
+
+    def _follows(self, vehicle: str, path: Sequence[Entry], entry: Entry) -> bool:
+        """Returns True if an entry continues a path. The first is that of the vehicle's body, if that is known; any
+        other one may wait for others, too: the vehicle is nowhere until it may enter."""
+        if path:
+            return self.adjacent(path[-1].cell, entry.cell)
+        return vehicle not in self.away and self.bodies.get(vehicle, entry.cell) == entry.cell
+
+    def may_enter(self, entry: Entry) -> bool:
+        """Returns True if all entries before one are over."""
+        ours = self.over.get(self.plot_of(entry.cell), ())
+        return all((entry.cell, epoch, seq) in ours for epoch, seq, _ in entry.after)
+
+    def place(self, vehicle: str) -> bool:
+        """Puts a vehicle that is nowhere on the first cell of its path, if it may."""
+        if vehicle in self.placed or not self.may_enter(self.paths[vehicle][0]):
+            return False
+        self.placed.add(vehicle)
+        return True
+
+    def enter_next(self, vehicle: str) -> bool:
+        """Drives a vehicle over the border into the next cell of its path, if it may. Its own cell is left then."""
+        path = self.paths[vehicle]
+        if vehicle not in self.placed or len(path) < 2 or not self.may_enter(path[1]):
+            return False
+        self._end([path.pop(0)])
+        return True
+
+    def give_back(self, vehicle: str, keep: int = 1) -> None:
+        """Keeps only the first cells of a path."""
+        path = self.paths[vehicle]
+        self._end(path[keep:])
+        del path[keep:]
+
+    def enter(self, vehicle: str, cell: int) -> None:
+        """The body of a vehicle that has no place is on a cell, or it would enter there and nowhere else."""
+        if vehicle in self.paths and self.paths[vehicle][0].cell != cell:
+            self._end(self.paths.pop(vehicle))
+        self.bodies[vehicle] = cell
+        self.away.discard(vehicle)
+
+    def leave(self, vehicle: str) -> None:
+        """The vehicle goes nowhere more: it gives back all that it holds."""
+        self._end(self.paths.pop(vehicle, ()))
+        self.placed.discard(vehicle)
+        self.bodies.pop(vehicle, None)
+        self.away.add(vehicle)
+
+    def _end(self, entries: Iterable[Entry]) -> None:
+        for entry in entries:
+            self.over.setdefault(self.plot_of(entry.cell), set()).add(entry.number)
+
+    def of(self, vehicle: str) -> dict[int, list[Number]]:
+        """Returns plot -> the entries of a vehicle there."""
+        found: dict[int, list[Number]] = {}
+        for entry in self.paths[vehicle]:
+            found.setdefault(self.plot_of(entry.cell), []).append(entry.number)
+        return found
+
+    def holds(self, plot: int) -> dict[str, list[Number]]:
+        """Returns vehicle -> its entries in a plot: all others that its newest table lists are over."""
+        held = {vehicle: self.of(vehicle).get(plot, []) for vehicle in self.paths}
+        return {vehicle: numbers for vehicle, numbers in held.items() if numbers}

@@ -1,0 +1,264 @@
+"""Orders: which vehicles may use each cell of a plot, one after the other, as its warden keeps them. Pure.
+
+`swarm.right_of_way.entries` has the rules. Entries are appended at the end of an order, and removed by the word of
+their own host, or by proof that its life has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
+
+from swarm.config.agents import agent_of
+from swarm.wire.messages.traffic import Before, Entry, Fence, Number, Stamp, Table
+
+_NO_ENTRIES: Sequence[Number] = []
+_NO_ORDER: Mapping[Number, str] = {}
+_MOST_BESIDE = 1 << 14
+"""Cells of which it is kept what lies beside them, of those that were asked for lately: about 16 MB."""
+
+
+@lru_cache(maxsize=_MOST_BESIDE)
+def cells_beside(cell: int, cols: int) -> frozenset[int]:
+    """Returns the cells beside a cell in a grid with `columns` columns; at a border of the grid also some that are
+    far away."""
+    north, south = cell - cols, cell + cols
+    return frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))
+
+
+class Orders:
+    """The entries of one plot. A warden looks at them several times a tick, and few of them change.
+
+    hosts    host -> (life, sequence) of its newest statement
+    of       vehicle -> its entries in driving order, of its host's newest life; another list when they change
+    by_host  host -> its vehicles that have entries
+    fenced   (host, life) -> entries of a life that may still drive
+    orders   cell -> number -> vehicle, the first first
+    """
+
+    def __init__(self, table: Table) -> None:
+        self.hosts: dict[str, tuple[int, int]] = dict(table.hosts)
+        self.of: dict[str, list[Number]] = {}
+        self.by_host: dict[str, dict[str, None]] = {}
+        self.fenced: dict[tuple[str, int], dict[str, list[Number]]] = {}
+        self.orders: dict[int, dict[Number, str]] = {}
+        self._fences: set[Number] = set()
+        for vehicle, entries in table.grants.items():
+            self._set(vehicle, list(entries))
+        for fence in table.fences:
+            self.fenced[fence.agent, fence.life] = {vehicle: list(of) for vehicle, of in fence.entries.items()}
+        lives = [(self.of, False), *((of, True) for of in self.fenced.values())]
+        each = [(number, vehicle, shut) for of, shut in lives for vehicle, all in of.items() for number in all]
+        for number, vehicle, shut in sorted(each, key=lambda one: one[0][1:]):
+            self.orders.setdefault(number[0], {})[number] = vehicle
+            if shut:
+                self._fences.add(number)
+
+    def table(self, plot: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
+        """Returns the same as a message."""
+        fences = [Fence(host, life, dict(of)) for (host, life), of in self.fenced.items()]
+        epoch, seq = stamp
+        return Table(
+            plot=plot,
+            agent=agent,
+            epoch=epoch,
+            seq=seq,
+            hosts=dict(self.hosts),
+            grants=dict(self.of),
+            fences=fences,
+            pushed=dict(pushed),
+        )
+
+    # --- what is so -----------------------------------------------------------------------------------------
+
+    def entries(self, vehicle: str) -> Sequence[Number]:
+        """The entries of a vehicle."""
+        return self.of.get(vehicle, _NO_ENTRIES)
+
+    def order(self, cell: int) -> Mapping[Number, str]:
+        """The order of a cell."""
+        return self.orders.get(cell, _NO_ORDER)
+
+    def by_host_count(self, host: str) -> int:
+        """The number of entries of a host."""
+        return sum(len(self.of[vehicle]) for vehicle in self.by_host.get(host, ()))
+
+    def is_fenced(self, cell: int) -> bool:
+        """Returns True if an earlier life of a host may be on a cell, or enter it."""
+        return bool(self._fences) and not self._fences.isdisjoint(self.order(cell))
+
+    def before(self, number: Number, vehicle: str) -> Iterator[tuple[Number, str]]:
+        """The entries for which one waits. Those of the same vehicle are of an earlier life."""
+        for other, of in self.order(number[0]).items():
+            if other == number:
+                return
+            if of != vehicle:
+                yield other, of
+
+    def waits(self, vehicle: str) -> bool:
+        """Returns True if the last entry of a vehicle waits for another."""
+        return any(True for number in self.entries(vehicle)[-1:] for _ in self.before(number, vehicle))
+
+    def would_circle(self, vehicle: str, cell: int) -> bool:
+        """Returns True if one of those in a cell's order waits, by way of others, for a vehicle."""
+        left, seen = list(self.order(cell).values()), set[str]()
+        while left:
+            other = left.pop()
+            if other == vehicle:
+                return True
+            if other not in seen:
+                seen.add(other)
+                left += [of for number in self.entries(other) for _, of in self.before(number, other)]
+        return False
+
+    def onward(self, cell: int) -> Iterator[int]:
+        """The cells for which those in a cell's order wait."""
+        for vehicle in self.order(cell).values():
+            for number in self.entries(vehicle):
+                if number[0] != cell and len(self.orders[number[0]]) > 1 and any(self.before(number, vehicle)):
+                    yield number[0]
+
+    def granted(self, host: str) -> dict[str, list[Entry]]:
+        """Returns the entries of a host's vehicles, each with those before it."""
+        vehicles = self.by_host.get(host, ())
+        return {vehicle: [self._entry(number, vehicle) for number in self.of[vehicle]] for vehicle in vehicles}
+
+    def _entry(self, number: Number, vehicle: str) -> Entry:
+        if len(self.orders[number[0]]) == 1:
+            return Entry(number)
+        before: list[Before] = [(other[1], other[2], of) for other, of in self.before(number, vehicle)]
+        return Entry(number, before)
+
+    def followed(self) -> dict[str, dict[str, list[Number]]]:
+        """Returns host -> other host -> entries of the first behind which vehicles of the other wait."""
+        found: dict[str, dict[str, list[Number]]] = {}
+        for order in self.orders.values():
+            if len(order) > 1:
+                hosts = [(number, agent_of(vehicle)) for number, vehicle in order.items()]
+                for index, (number, host) in enumerate(hosts):
+                    for other in {other for _, other in hosts[index + 1 :]} - {host}:
+                        found.setdefault(host, {}).setdefault(other, []).append(number)
+        return found
+
+    # --- what hosts say -------------------------------------------------------------------------------------
+
+    def take_standing(
+        self,
+        host: str,
+        life: int,
+        seq: int,
+        holds: Mapping[str, Sequence[Number]],
+        knows: Stamp,
+        dead: Sequence[int],
+        bodies: Mapping[str, int],
+        placed: Collection[str],
+        fresh: Stamp,
+    ) -> bool:
+        """A host states what its vehicles hold; what it omits of tables that it knows is over. Returns True if a
+        host may wait for what this changes.
+
+        dead    earlier lives of the host that have certainly ended
+        bodies  vehicle without a place -> the cell on which its body is, or where it would enter
+        placed  vehicles which have a place
+        fresh   stamp of entries that are added
+        """
+        known, heard = self.hosts.get(host, (0, 0))
+        if (life, seq) <= (known, heard):
+            return False
+        begins = life > known
+        self.hosts[host] = life, seq
+        if begins and known:
+            self._fence(host, known)
+        self.remove(host, holds, knows)
+        earlier = [of for (of_host, _), of in reversed(self.fenced.items()) if of_host == host]
+        for vehicle in {vehicle: None for of in earlier for vehicle in of} if begins and life not in dead else ():
+            if vehicle not in self.of and vehicle not in bodies:
+                self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
+        for each in dead:
+            begun = self.of.keys() - bodies.keys() - set(placed)
+            self._open(host, each, bodies, but=begun)
+        return begins or any(earlier)
+
+    def _fence(self, host: str, life: int) -> None:
+        """A life of a host was replaced, and may still drive."""
+        mine = {vehicle: self.of.pop(vehicle) for vehicle in self.by_host.pop(host, ())}
+        if mine:
+            fence = self.fenced.setdefault((host, life), {})
+            for vehicle, entries in mine.items():
+                fence[vehicle] = [*fence.get(vehicle, ()), *entries]
+                self._fences.update(entries)
+
+    def _open(self, host: str, life: int, bodies: Mapping[str, int], but: Collection[str] = ()) -> None:
+        """A life has ended: its entries are over, except those on which bodies are, and those of vehicles which
+        are to begin from there and have no place yet."""
+        fence = self.fenced.pop((host, life), {})
+        kept = {vehicle: entries for vehicle, entries in fence.items() if vehicle in but}
+        if kept:
+            self.fenced[host, life] = kept
+        for vehicle, entries in fence.items():
+            if vehicle in kept:
+                continue
+            here = [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
+            self._fences.difference_update(entries)
+            for entry in entries:
+                if entry not in here:
+                    self._drop(entry)
+            if here:
+                self._set(vehicle, [*here, *self.entries(vehicle)])
+
+    def _begin(self, vehicle: str, entries: Sequence[Number], fresh: Stamp) -> None:
+        """A new life of a vehicle whose body is made up enters where an earlier one was, if it can on a cell which
+        no other vehicle is to enter."""
+        cells = [number[0] for number in entries]
+        alone = (cell for cell in cells if set(self.order(cell).values()) <= {vehicle})
+        self._append(vehicle, next(alone, cells[-1]), fresh)
+
+    def end(self, host: str, life: int) -> bool:
+        """A life that was replaced states that it drives no more. Returns whether that opens cells."""
+        opens = (host, life) in self.fenced
+        self._open(host, life, {})
+        return opens
+
+    def remove(self, host: str, holds: Mapping[str, Sequence[Number]], knows: Stamp) -> None:
+        """Drops the entries that a host which knows a table does not hold any more."""
+        for vehicle in list(self.by_host.get(host, ())):
+            held, entries = holds.get(vehicle, ()), self.of[vehicle]
+            kept = [entry for entry in entries if entry in held or entry[1:] > knows]
+            if len(kept) < len(entries):
+                for entry in entries:
+                    if entry not in kept:
+                        self._drop(entry)
+                self._set(vehicle, kept)
+
+    # --- what is granted ------------------------------------------------------------------------------------
+
+    def append(self, vehicle: str, cell: int, fresh: Stamp) -> bool:
+        """Puts a vehicle at the end of a cell's order, in the next table; False if that has added another already,
+        or the vehicle is in it."""
+        if vehicle in self.order(cell).values():
+            return False
+        return self._append(vehicle, cell, fresh)
+
+    def _append(self, vehicle: str, cell: int, fresh: Stamp) -> bool:
+        number = (cell, *fresh)
+        order = self.orders.setdefault(cell, {})
+        if number in order:
+            return False
+        order[number] = vehicle
+        self._set(vehicle, [*self.entries(vehicle), number])
+        return True
+
+    def _set(self, vehicle: str, entries: list[Number]) -> None:
+        vehicles = self.by_host.setdefault(agent_of(vehicle), {})
+        if entries:
+            self.of[vehicle] = entries
+            vehicles[vehicle] = None
+        else:
+            self.of.pop(vehicle, None)
+            vehicles.pop(vehicle, None)
+
+    def _drop(self, number: Number) -> None:
+        order = self.orders.get(number[0], {})
+        order.pop(number, None)
+        if not order:
+            self.orders.pop(number[0], None)
