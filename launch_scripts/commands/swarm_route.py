@@ -34,7 +34,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
 )
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
-from swarm.wire.topics import COST, NAMELESS, PLACE_ROUTE, ROUTE, asker_of
+from swarm.wire.topics import COST, PLACE_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -111,8 +111,6 @@ def ask_planner(
     asker = asker_of(OPERATOR, "command")
     topic = COST if cost else ROUTE
     replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target, asker=asker)
-    if not replies and failure is None:  # no planner, or an earlier version
-        replies, failure = replies_to(bus, NAMELESS[topic.name], request, _TIMEOUT_S, target=target)
     took_ms = (time.monotonic() - began_s) * 1e3
     return _answered(replies, failure, frame, cell, took_ms, f"no planner of target {target!r} answers {where}")
 

@@ -93,11 +93,6 @@ class KeptOrders:
             case _:
                 return False
 
-    @property
-    def authenticated(self) -> bool:
-        """True if codes authenticate orders: without certificates."""
-        return self._fresh is not None
-
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
         match asked.request:

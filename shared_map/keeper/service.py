@@ -13,7 +13,7 @@ from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.goal_service import KeptGoals
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
-from shared_map.keeper.zone_orders import SHORT_S, fault_of_short, free_name, rows_of, zone_sets, zones_of
+from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
@@ -33,7 +33,7 @@ from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import Order, VehicleGoals, ZoneOrder, Zones
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.topics import SHORT_ZONES, SIGHTED, STATS, ZONES
+from swarm.wire.topics import SIGHTED, STATS, ZONES
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +137,6 @@ class KeeperService:
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.serve(ZONES, self._post, keeper=self._id)
-        self._bus.serve(SHORT_ZONES, self._post, keeper=self._id)
         self._orders.start(now_ns)
         self._goals.start(now_ns)
         self._bus.subscribe(STATS, self._post)
@@ -264,12 +263,7 @@ class KeeperService:
         if order.action != "list":
             if not order.name:
                 order = msgspec.structs.replace(order, name=free_name(self.replica))
-            found: list[MarkSet] | str | None = None
-            if asked.topic is SHORT_ZONES and self._orders.authenticated:
-                found = fault_of_short(order, self.replica, now_ns)
-                order = msgspec.structs.replace(order, lasts_s=min(order.lasts_s or SHORT_S, SHORT_S))
-            if found is None:
-                found = zone_sets(order, self.replica, self._terrain, self._store.set_aside, now_ns, self._numbers)
+            found = zone_sets(order, self.replica, self._terrain, self._store.set_aside, now_ns, self._numbers)
             try:
                 if isinstance(found, list):
                     sets = found

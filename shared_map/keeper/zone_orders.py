@@ -43,8 +43,6 @@ MOST_CELLS = 1 << 17
 MOST_IN_ALL = MAX_MARKS // 8
 """Cells of all zones: half of what a replica holds of one author."""
 
-SHORT_S = 10.0
-"""Longest zone without a code, as the longest lease of an obstacle: nothing remains of who orders it and leaves."""
 _LIMIT = 1 << 62
 """Numbers of sets are below this."""
 
@@ -93,16 +91,6 @@ def zone_sets(
         stated = by_tile.get(tile, NO_STATEMENTS)
         sets.append(mark_set(author, author.partition(".")[0], tile, *number, stated))
     return sets
-
-
-def fault_of_short(order: ZoneOrder, replica: MapReplica, now_ns: int) -> str | None:
-    """Reason why a stranger's zone is refused; None if it is not.
-
-    It closes an area as an obstacle does, for a while, and no zone of an operator gives way to it.
-    """
-    if order.action == "remove" or order.name in cells_of_zones(replica, now_ns):
-        return f"zone {order.name!r}: changing it needs the code of the run (docs/operate/orders.md)"
-    return None
 
 
 def free_name(replica: MapReplica) -> str:

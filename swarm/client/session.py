@@ -23,7 +23,7 @@ from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.planning import PlaceRouteRequest, RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import NAMED_SINCE, NAMELESS_ROUTE, PLACE_ROUTE, ROUTE, RUN, Topic, asker_of
+from swarm.wire.topics import NAMELESS_ROUTE, PLACE_ROUTE, ROUTE, RUN, Topic, asker_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -215,7 +215,7 @@ class Session:
         self, request: RouteRequest, timeout_s: float, target: str, vehicle: str | None
     ) -> Future[list[Any]]:
         """All answers of a planner, asked under the name of a vehicle."""
-        if vehicle is None or self.run.wire_version < NAMED_SINCE:
+        if vehicle is None:
             return self.ask(NAMELESS_ROUTE, request, timeout_s, target=target)
         return self.ask(ROUTE, request, timeout_s, target=target, asker=asker_of("rover", vehicle))
 

@@ -16,7 +16,7 @@ from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carri
 from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
-from swarm.wire.topics import NAMED_SINCE, NAMELESS, NOTE, RUN, STATS, Topic, asker_of
+from swarm.wire.topics import NOTE, RUN, STATS, Topic, asker_of
 from swarm.wire.versions import are_neighbours
 
 _MOST_STANDING, _MOST_OVER = 40, 20
@@ -133,8 +133,6 @@ class Member:
         """True if a router's token has risen since others were asked for their run. All are asked once a second at
         most: a token costs its sender nothing."""
         self._ask_due_ns = 0
-        self._older = False
-        """True if a process of the run was heard which does not know the names of askers."""
         # The first differing reply of the current round, in words.
         self._differs: RunMismatchError | None = None
         # Processes which were named already, and sentences that the next tick publishes.
@@ -261,11 +259,8 @@ class Member:
 
         of  fields of the key, beside the asker
         """
-        if self._older:
-            topic = NAMELESS[topic.name]
-        else:
-            of["asker"] = asker_of(self.info.role, self.info.id)
-        self._bus.ask(topic, request, self._post, tag=tag, timeout_s=timeout_s, **of)
+        asker = asker_of(self.info.role, self.info.id)
+        self._bus.ask(topic, request, self._post, tag=tag, timeout_s=timeout_s, asker=asker, **of)
 
     @property
     def _name(self) -> str:
@@ -309,7 +304,6 @@ class Member:
                     self._to_name.append(str(error))
         else:
             self._confirmed = True
-            self._older |= other.role == "planner" and other.wire_version < NAMED_SINCE
 
     def _ask(self) -> None:
         self._bus.ask(RUN, Nothing(), self._post, tag=_TAG, timeout_s=2.0)

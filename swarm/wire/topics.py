@@ -344,7 +344,7 @@ COST = Topic(
     request=planning.CostRequest, published=False, costly=True,
     ask_bytes=_LONG, answer_bytes=2 * _LONG,
 )  # fmt: skip
-_NAMELESS = "the same for askers that are not named: people, and earlier versions; they share one turn"
+_NAMELESS = "the same for askers that are not named, such as people; they share one turn"
 NAMELESS_ROUTE = replace(
     ROUTE, name="nameless-route", key="target/{target}/route", what=_NAMELESS,
     access=access(serve="planner:target", ask="agent rover"),
@@ -378,10 +378,6 @@ ZONES = Topic(
     "asked by people", access(serve="keeper:keeper"),
     request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
     answer_bytes=_FILE,
-)  # fmt: skip
-SHORT_ZONES = replace(
-    ZONES, name="short-zones", key="order/{keeper}/zones", trusted=False,
-    what="the same without a code: on loopback such a zone ends after 10 s, and changes no other",
 )  # fmt: skip
 GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders,
@@ -438,7 +434,7 @@ NOTE = Topic(
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, LEFT, STORED,
     KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
-    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES, SHORT_ZONES,
+    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip
 
@@ -447,10 +443,6 @@ ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
 _TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64})/([0-9]{1,19})")
 
 
-NAMELESS = {ROUTE.name: NAMELESS_ROUTE, COST.name: NAMELESS_COST}
-"""Topic -> the one of the same questions without the name of an asker."""
-NAMED_SINCE = 9
-"""Wire version from which on planners answer questions with the name of an asker."""
 NO_ASKER = "-"
 """In the key of an answer, the asker of a question under many names."""
 

@@ -23,7 +23,7 @@ from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
-from swarm.wire.topics import SHORT_ZONES, ZONES, Topic
+from swarm.wire.topics import ZONES, Topic
 
 ROWS, COLS = 40, 70
 SQUARE = [(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)]
@@ -75,24 +75,6 @@ class ZoneWorld(SwarmModel):
         sync = self.finder.sync
         sync.publish(sync.replica.write(list(cells), kind, pace, self.now_ns))
         self.run(0.3)
-
-
-def test_a_zone_without_a_code_ends_soon_and_changes_no_other() -> None:
-    world = ZoneWorld()
-    world.add("bridge", [(0, 0), (0, 3), (3, 3), (3, 0)])
-    theirs = world.lethal()
-    for lasts_s in (None, 1e9):
-        zones = world.order(SHORT_ZONES, action="add", polygon=SQUARE, lasts_s=lasts_s)
-        assert isinstance(zones, Zones)
-        assert all((zone.until_ns is None) == (zone.name == "bridge") for zone in zones.zones)
-    for order in ({"action": "add", "polygon": SQUARE}, {"action": "remove"}):
-        assert "needs the code of the run" in str(world.order(SHORT_ZONES, name="bridge", **order))
-    assert world.lethal() > theirs
-    world.run(12.0)
-    assert world.lethal() == theirs
-    listed = world.order(SHORT_ZONES)
-    assert isinstance(listed, Zones)
-    assert [zone.name for zone in listed.zones] == ["bridge"]
 
 
 def test_a_zone_is_in_every_map_and_gone_once_it_is_removed() -> None:
