@@ -50,7 +50,9 @@ def route(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find the cheapest route to a target of a running swarm, or on a terrain file.
+    """Find the cheapest route to a target or a place of a running swarm, or on a terrain file.
+
+    swarm route --from cell:40,200 --to 36.41,-84.29
 
     swarm route --target t3 --from cell:40,200
 
@@ -65,7 +67,7 @@ def route(
     cost           Print only the cost, or that no path exists.
     terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
     start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
-    end            With --terrain: the destination, in the same forms as --from.
+    end            Instead of a target: the destination, in the same forms as --from.
     vehicle_class  Class of the vehicle.
     out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
     """
@@ -83,15 +85,20 @@ def route(
     if preset is not None:
         raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
     by_cell = row is not None and col is not None
-    if target is None or (start is None) == (not by_cell) or end is not None or (cost and out is not None):
-        raise ConfigError("give --target and --from to ask a swarm, or --terrain, --from and --to without one")
+    to_place = end is not None and not cost
+    if (target is None) != to_place or (start is None) == (not by_cell) or (cost and out is not None):
+        raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands import swarm_route
 
+    goal = None if end is None else read_place(end, "--to")
     with where.bus() as bus:
-        answer = swarm_route.ask_planner(
-            bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
-        )
+        if goal is not None:
+            answer = swarm_route.ask_place(bus, where, place, goal, steps=steps, vehicle_class=vehicle_class)
+        elif target is not None:
+            answer = swarm_route.ask_planner(
+                bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
+            )
     if out is not None:
         swarm_route.write(answer, out)
     if as_json:

@@ -24,9 +24,16 @@ from swarm.runtime.operator import replies_to
 from swarm.wire.access import OPERATOR
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlaceRouteReply,
+    PlaceRouteRequest,
+    RouteReply,
+    RouteRequest,
+)
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
-from swarm.wire.topics import COST, NAMELESS, ROUTE, asker_of
+from swarm.wire.topics import COST, NAMELESS, PLACE_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -34,6 +41,15 @@ if TYPE_CHECKING:
 _TIMEOUT_S = 5.0
 """A planner answers within 1 s, or says that it has no tree; five times that is for a busy machine, as for plans of
 ROS (docs/design/ros2-gateway.md)."""
+
+
+_PLACE = "place"
+"""Target of a route to a place."""
+_NO_PLACE = {
+    "growing": "its tree is still growing; ask again",
+    "lethal_goal": "it is lethal",
+    "outside_goal": "it is outside the map",
+}
 
 
 @dataclass(frozen=True)
@@ -112,6 +128,33 @@ def ask_planner(
     if failure is not None and failure != "timeout":
         raise ConfigError(failure)
     raise BusError(f"no planner of target {target!r} answers {where}")
+
+
+def ask_place(bus: Bus, where: object, start: Place, end: Place, *, steps: int, vehicle_class: str) -> Answer:
+    """Asks for the route between two places, until it is known. Raises BusError or ConfigError in one sentence."""
+    frame = frame_of_run(bus, where)
+    cell, goal = cell_of(start, frame, "--from"), cell_of(end, frame, "--to")
+    request = PlaceRouteRequest(to=goal, cells=[cell], max_cells=steps, vehicle_class=vehicle_class)
+    began_s = time.monotonic()
+    while True:
+        asker = asker_of(OPERATOR, "command")
+        replies, failure = replies_to(bus, PLACE_ROUTE, request, _TIMEOUT_S, asker=asker)
+        spent_s = time.monotonic() - began_s
+        found = next((reply for reply in replies if isinstance(reply, PlaceRouteReply)), None)
+        if found is None and failure not in (None, "timeout"):
+            raise ConfigError(failure)
+        if found is None:
+            raise BusError(f"no process plans routes to places {where}: its scenario needs planner.places = true")
+        if found.status != "growing" or spent_s > _TIMEOUT_S:
+            break
+    if found.status != "ok":
+        raise TerrainError(f"there is no route to {written(frame, goal)}: {_NO_PLACE[found.status]}")
+    reply = RouteReply(
+        target=_PLACE, incarnation=found.incarnation, target_cell=goal, map_version=found.map_version,
+        tree_age_ms=0.0, rows=frame.grid.rows, cols=frame.grid.cols, routes=found.routes,
+        vehicle_class=vehicle_class,
+    )  # fmt: skip
+    return Answer(reply, frame, cell, spent_s * 1e3)
 
 
 def as_json(answer: Answer) -> str:
@@ -215,10 +258,9 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
         typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight{rest}")
     else:
         typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
-    grown = (
-        f"tree grown whole {reply.tree_age_ms / 1e3:.1f} s ago and kept up since, map version {reply.map_version}"
-    )
-    typer.echo(f"{grown}, answered in {answer.took_ms:.1f} ms")
+    age_s = reply.tree_age_ms / 1e3
+    grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
+    typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
     _show_pose(reply)
 
 
