@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -21,6 +20,7 @@ from swarm.bus.bus import Asked, Bus, Event, Post
 from swarm.config.explain import choice
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, class_numbers
+from swarm.runtime.fair_queue import FairQueue
 from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
@@ -88,7 +88,8 @@ class PlacesService:
         self._sync = MapSync(self.replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._classes: dict[str, _ClassTrees] = {}
         self._obedience = OrderClient(setup, bus, post, self._obeys)
-        self._held: deque[Asked] = deque()
+        self._held: FairQueue[Asked] = FairQueue(_MOST_HELD, _MOST_HELD // 4)
+        """Questions that wait, agents' first, of others each in its turn."""
         self._now_ns = self._left = 0
         for name in ("place_routes", "place_cells_grown"):
             self.counters.count(name, 0)
@@ -105,12 +106,12 @@ class PlacesService:
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, Asked) and isinstance(event.request, PlaceRouteRequest):
-            if len(self._held) >= _MOST_HELD:
-                event.refuse(f"{_MOST_HELD} questions wait here already: ask again in a second")
-                event.end()
-            else:
-                self._held.append(event)
-                self._answer()
+            price = 1 + len(event.request.cells)
+            dropped = self._held.put(event.asker, event, price=price, rank=int(not is_own(event.asker)))
+            if dropped is not None:
+                dropped.refuse("too many questions wait here already: ask again in a second")
+                dropped.end()
+            self._answer()
         elif not self._member.on_member_event(event):
             any(handle(event, now_ns) for handle in (self._sync.on_map_event, self._obedience.on_order_event))
 
@@ -127,14 +128,14 @@ class PlacesService:
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        while (asked := self._held.take()) is not None:
+            asked.refuse("the process that plans to places ends")
+            asked.end()
         self._member.publish_stats(now_ns)
 
     def _answer(self) -> None:
         """Answers waiting questions as far as a tick has time to grow trees; agents come first."""
-        while self._held and self._left > 0:
-            at = next((n for n, asked in enumerate(self._held) if is_own(asked.asker)), 0)
-            asked = self._held[at]
-            del self._held[at]
+        while self._left > 0 and (asked := self._held.take()) is not None:
             if not asked.expired:
                 assert isinstance(asked.request, PlaceRouteRequest)
                 reply = self._reply(asked.request)
