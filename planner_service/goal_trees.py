@@ -80,7 +80,7 @@ class GoalTrees:
     """
 
     def __init__(self, costs: CostGrid, budget_bytes: int) -> None:
-        self._costs = costs
+        self.costs = costs
         self._budget = budget_bytes
         self._growth = PartialGrowth(costs)
         self._in_hand: _Kept | None = None
@@ -116,7 +116,7 @@ class GoalTrees:
         self._in_hand = None
         self._kept.clear()
         self.bytes = 0
-        self._growth = PartialGrowth(self._costs)
+        self._growth = PartialGrowth(self.costs)
         self._forgotten += len(self._log)
         self._log, self._logged = [], 0
 
@@ -125,15 +125,15 @@ class GoalTrees:
     def ask(self, goal: int, start: int, most_cells: int) -> GoalAnswer:
         """The cheapest route between two cells of the grid. Grows about `most_cells` at most; where growths cannot
         stop (see `PartialGrowth`), a whole tree."""
-        grid = self._costs.grid
+        grid = self.costs.grid
         alone = np.array((start,), np.int64)
         if not (0 <= goal < grid.cells and 0 <= start < grid.cells):
             return GoalAnswer("outside", alone, math.inf, math.inf)
-        root, at = self._costs.pad(goal), self._costs.pad(start)
-        if not self._costs.cell_cost[root] < np.inf:
+        root, at = self.costs.pad(goal), self.costs.pad(start)
+        if not self.costs.cell_cost[root] < np.inf:
             self._drop(goal)
             return GoalAnswer("lethal_goal", alone, math.inf, math.inf)
-        if not self._costs.cell_cost[at] < np.inf:
+        if not self.costs.cell_cost[at] < np.inf:
             return GoalAnswer("lethal_start", alone, math.inf, math.inf)
         kept = self._kept.get(goal)
         if kept is not None and not self._look(kept):
@@ -153,7 +153,7 @@ class GoalTrees:
         fresh = self._log[kept.seen - self._forgotten :]
         kept.seen = self._forgotten + len(self._log)
         if kept.tree is not None and fresh:
-            near = [_near(each, kept.tree.box, self._costs.stride) for each in fresh]
+            near = [_near(each, kept.tree.box, self.costs.stride) for each in fresh]
             kept.changes = joined([kept.changes, *near])
         return kept.changes.cells.size <= MOST_CHANGES
 
@@ -162,32 +162,32 @@ class GoalTrees:
         tree = kept.tree
         if tree is None:
             tree = self._held
-        cost = tree.at(start, self._costs.stride)
+        cost = tree.at(start, self.costs.stride)
         if not kept.changes.cells.size:
             if cost < math.inf:
-                return self._ok(tree, start, route_of(self._costs, tree, start), 0)
+                return self._ok(tree, start, route_of(self.costs, tree, start), 0)
             return self._none(start, 0) if tree.bound == math.inf else None
         if cost == math.inf:
             return None
         route = self._as_it_was(kept.changes, tree, start)
-        cells = self._padded(start, route, self._costs.stride)
+        cells = self._padded(start, route, self.costs.stride)
         level, stands = self._growth.stays(tree, kept.changes, cells)
         return self._ok(tree, start, route, 0) if stands or cost < level * (1.0 - 1e-6) else None
 
     @property
     def _held(self) -> CutTree:
         """The tree in hand, as a view of it."""
-        growth, stride = self._growth, self._costs.stride
+        growth, stride = self._growth, self.costs.stride
         whole = growth.cost.reshape(-1, stride)
         return CutTree(growth.root, (0, 0, *whole.shape), whole, growth.bound, 0.0)
 
     def _as_it_was(self, changes: Changes, tree: CutTree, start: int) -> NDArray[np.uint8]:
         """The directions of a route on the map on which the tree was grown."""
-        costs, cells = self._costs.cell_cost, changes.cells
+        costs, cells = self.costs.cell_cost, changes.cells
         now = costs[cells]
         costs[cells[::-1]] = changes.before[::-1]  # of a cell that changed twice, its first cost stays
         try:
-            return route_of(self._costs, tree, start)
+            return route_of(self.costs, tree, start)
         finally:
             costs[cells] = now
 
@@ -215,22 +215,22 @@ class GoalTrees:
             return self._grown_whole(goal, root, start)
         if growth.cost[start] < np.inf:
             tree = self._held
-            return self._ok(tree, start, route_of(self._costs, tree, start), cells)
+            return self._ok(tree, start, route_of(self.costs, tree, start), cells)
         return self._none(start, cells) if growth.bound == math.inf else self._none(start, cells, growth.bound)
 
     def _grown_whole(self, goal: int, root: int, start: int) -> GoalAnswer:
         self._drop(goal)
-        tree = whole_tree(self._costs, root)
+        tree = whole_tree(self.costs, root)
         self._kept[goal] = _Kept(tree, self._forgotten + len(self._log))
         self.bytes += _bytes(tree)
         self._evict()
-        cells = self._costs.grid.cells
-        if tree.at(start, self._costs.stride) == math.inf:
+        cells = self.costs.grid.cells
+        if tree.at(start, self.costs.stride) == math.inf:
             return self._none(start, cells)
-        return self._ok(tree, start, route_of(self._costs, tree, start), cells)
+        return self._ok(tree, start, route_of(self.costs, tree, start), cells)
 
     def _ok(self, tree: CutTree, start: int, route: NDArray[np.uint8], grown: int) -> GoalAnswer:
-        grid = self._costs
+        grid = self.costs
         cells = self._padded(start, route, grid.stride)
         cost = tree.at(start, grid.stride)
         bound = cost * (1.0 - 2.0 * float(grid.rounding.at(np.float64(cost)))) * grid.time_share
@@ -247,11 +247,11 @@ class GoalTrees:
         alone = np.array((self._unpad(start),))
         if bound == math.inf:
             return GoalAnswer("unreachable", alone, math.inf, math.inf, grown, grown == 0)
-        return GoalAnswer("growing", alone, math.inf, bound * (1.0 - 1e-6) * self._costs.time_share, grown)
+        return GoalAnswer("growing", alone, math.inf, bound * (1.0 - 1e-6) * self.costs.time_share, grown)
 
     def _unpad(self, cell: int) -> int:
-        row, col = divmod(cell, self._costs.stride)
-        return (row - 1) * self._costs.grid.cols + col - 1
+        row, col = divmod(cell, self.costs.stride)
+        return (row - 1) * self.costs.grid.cols + col - 1
 
     @staticmethod
     def _padded(start: int, route: NDArray[np.uint8], stride: int) -> Cells:
@@ -271,8 +271,7 @@ class GoalTrees:
         if kept is not None and self._growth.root >= 0:
             kept.tree = self._growth.cut()
             self.bytes += _bytes(kept.tree)
-        self._growth.forget()
-        self._evict()
+            self._evict()
 
     def _drop(self, goal: int) -> None:
         kept = self._kept.pop(goal, None)

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.goal_trees import GoalTrees
 from planner_service.pulled_routes import Puller
 from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.step_climb import Climb
 from swarm.config.explain import choice
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
+
+_KEPT_BYTES = 1 << 28
+"""Memory of the trees that `RouteFinder.between` keeps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,8 +76,9 @@ class RouteFinder:
     ----------
     pace : array_like (rows, cols), s/m
         Seconds that a metre takes in each cell; inf is lethal. It is copied.
-    target : (row, col)
-        Where all routes lead. On a lethal cell there is no route; outside the grid raises OutsideGridError.
+    target : (row, col), optional
+        Where all routes of `route` lead. On a lethal cell, or without one, there is no route; outside the grid
+        raises OutsideGridError. `between` needs none.
     resolution_m : float
         Side of a cell.
     climb : Climb, optional
@@ -91,7 +97,7 @@ class RouteFinder:
     def __init__(
         self,
         pace: Any,
-        target: tuple[int, int],
+        target: tuple[int, int] | None = None,
         *,
         resolution_m: float = 1.0,
         climb: Climb | None = None,
@@ -109,8 +115,9 @@ class RouteFinder:
         self._config = PlannerConfig(**settings)
         self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
+        self._goals: GoalTrees | None = None
         self._version = 0
-        self._target = self._cell(*target)
+        self._target = None if target is None else self._cell(*target)
         self._update([])
 
     def move(self, target: tuple[int, int]) -> None:
@@ -132,6 +139,8 @@ class RouteFinder:
             raise ValueError("a pace is NaN, zero or negative; lethal is inf")
         self._pace[row : window.row1, col : window.col1] = block
         self._version += 1
+        if self._goals is not None:
+            self._goals.changed(self._goals.costs.apply(self._pace, [window]))
         self._update([window])
 
     def route(self, row: int, col: int) -> FoundRoute:
@@ -145,6 +154,36 @@ class RouteFinder:
         lethal = found.status is RouteStatus.NO_TARGET and self._tree.lethal_target is not None
         status = TargetStatus.LETHAL if lethal else found.status
         return FoundRoute(status, cells, found.cost_s, found.lower_bound_s, found.length_m)
+
+    def between(self, start: tuple[int, int], goal: tuple[int, int]) -> FoundRoute:
+        """The cheapest route between any two cells, whatever the target is.
+
+        Parameters
+        ----------
+        start, goal : (row, col)
+            Whole numbers. Outside the grid is a status.
+
+        The search grows from the goal as far as the start is, and its tree is kept for the next start. Where uphill
+        is not downhill, or where the costliest cell costs some 2,900 times the cheapest, it grows over all of the
+        map. Costs are in s, lengths in m, with the same meaning as of `route`.
+        """
+        start_row, start_col = _whole(*start)
+        goal_row, goal_col = _whole(*goal)
+        if self._goals is None:
+            costs = CostGrid(self.grid, self._config, self._climb)
+            costs.load(self._pace)
+            self._goals = GoalTrees(costs, _KEPT_BYTES)
+        grid = self.grid
+        if not (grid.inside(start_row, start_col) and grid.inside(goal_row, goal_col)):
+            alone = np.array([(start_row, start_col)], np.int64)
+            return FoundRoute(RouteStatus.OUTSIDE, alone, np.inf, 0.0, 0.0)
+        found = self._goals.ask(grid.cell(goal_row, goal_col), grid.cell(start_row, start_col), grid.cells)
+        cells = np.stack(np.divmod(found.cells, grid.cols), axis=1)
+        diagonal = 1.0 if self._config.edge == "paper" else np.sqrt(2.0)
+        lengths = np.where(np.abs(np.diff(cells, axis=0)).sum(axis=1) > 1, diagonal, 1.0)
+        bound = found.lower_bound_s if found.status == "ok" else 0.0
+        status = TargetStatus.LETHAL if found.status == "lethal_goal" else RouteStatus(found.status)
+        return FoundRoute(status, cells, found.cost_s, bound, float(lengths.sum()) * grid.resolution_m)
 
     def _cell(self, row: int, col: int) -> int:
         """The index of a cell. Raises OutsideGridError outside."""
@@ -186,6 +225,8 @@ class RouteFinder:
 
     def _update(self, dirty: list[Window]) -> None:
         tree, pace = self._tree, self._pace
+        if self._target is None:
+            return
         update = tree.update(pace, self._target, dirty, self._version)
         if update.wants_full:
             grown = tree.full_job(self._target)()

@@ -178,23 +178,25 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
         With one sentence, also if there is no way.
     """
     scenario, terrain, first, last = between(source, start, end, preset)
-    grid, finder = terrain.grid, finder_for(scenario, terrain, last)
-    found = finder.route(*grid.row_col(first))
+    grid, finder = terrain.grid, finder_for(scenario, terrain)
+    found = finder.between(grid.row_col(first), grid.row_col(last))
     _check_open(scenario, terrain, first, "--from", last)
     _check_open(scenario, terrain, last, "--to", first)
     if found.status is not RouteStatus.OK:
         raise TerrainError(f"no route ({found.status}): lethal ground lies between the two places all around")
     cells = found.cells[:, 0] * grid.cols + found.cells[:, 1]
-    # The remaining cost gives the cost driven, by any rule of the planner.
-    left_s = finder.cost_to_go_s().reshape(-1)[cells].astype(np.float64)
+    at_m = metres_along(grid, cells, np.sqrt(2.0) if scenario.planner.edge == "octile" else 1.0)
+    steps_s = np.diff(at_m) * terrain.pace_s_per_m.reshape(-1)[cells[1:]]
+    if terrain.climb is not None:
+        steps_s *= terrain.climb.along(cells[:-1], cells[1:])
     return DescribedRoute(
         name=scenario.name,
         grid=grid,
         cells=cells,
         cost_s=found.cost_s,
         lower_bound_s=found.lower_bound_s,
-        at_m=metres_along(grid, cells, np.sqrt(2.0) if scenario.planner.edge == "octile" else 1.0),
-        at_s=left_s[0] - left_s,
+        at_m=at_m,
+        at_s=np.concatenate(([0.0], np.cumsum(steps_s))),
         height_m=terrain.elevation_m.reshape(-1)[cells].astype(np.float64),
         terrain=terrain,
     )
@@ -240,12 +242,12 @@ def between(source: str, start: str, end: str, preset: str | None = None) -> End
     return Ends(scenario, terrain, cell_of(places[0], frame, "--from"), cell_of(places[1], frame, "--to"))
 
 
-def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder:
-    """Routes to a cell by the scenario's rules."""
+def finder_for(scenario: Scenario, terrain: Terrain, target: int | None = None) -> RouteFinder:
+    """Routes by the scenario's rules, to a cell or between any."""
     names = ("neighbours", "edge", "corner_cutting", "length_weight")
     rules = {name: getattr(scenario.planner, name) for name in names}
     resolution_m, climb = terrain.grid.resolution_m, terrain.climb
-    target_cell = terrain.grid.row_col(target)
+    target_cell = None if target is None else terrain.grid.row_col(target)
     return RouteFinder(terrain.pace_s_per_m, target_cell, resolution_m=resolution_m, climb=climb, **rules)
 
 

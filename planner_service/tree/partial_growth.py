@@ -132,12 +132,12 @@ class PartialGrowth:
         self.bound = (int(self._state[0]) + 1) * self._width if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
-        """Returns the tree in hand, as arrays of its own."""
-        assert self._scratch is not None
+        """Returns the tree in hand, as an array of its own; then there is none in hand."""
         box = self.box()
-        row0, col0, row1, col1 = box
-        inner = self.cost.reshape(-1, self._grid.stride)[row0:row1, col0:col1]
-        return CutTree(self.root, box, inner.copy(), self.bound, self._width)
+        inner = self._inside(box)
+        tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
+        self._empty(inner)
+        return tree
 
     def box(self) -> tuple[int, int, int, int]:
         """Returns the padded rows and columns in which all cells with a cost lie."""
@@ -153,9 +153,17 @@ class PartialGrowth:
         )
 
     def forget(self) -> None:
-        """There is no tree in hand any more. Costs what it had."""
-        if self.root >= 0 and self._scratch is not None:
-            self.cost[self._scratch[0][: self.touched]] = np.inf
+        """There is no tree in hand any more. The work follows the size of the tree."""
+        if self.root >= 0:
+            self._empty(self._inside(self.box()))
+
+    def _inside(self, box: tuple[int, int, int, int]) -> Floats:
+        row0, col0, row1, col1 = box
+        inner: Floats = self.cost.reshape(-1, self._grid.stride)[row0:row1, col0:col1]
+        return inner
+
+    def _empty(self, inner: Floats) -> None:
+        np.copyto(inner, np.inf, where=inner >= 0)
         self.root = -1
 
     def learn(self, changes: Changes) -> None:

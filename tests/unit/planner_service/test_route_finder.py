@@ -117,3 +117,21 @@ def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
             call(2.9, 1)
     with pytest.raises(TypeError, match="strateg is no setting; did you mean 'strategy'"):
         RouteFinder(np.ones((6, 6)), (5, 5), strateg="full")
+
+
+def test_a_route_between_any_cells_is_the_one_to_a_target_there() -> None:
+    pace = random_pace(np.random.default_rng(8), 60, 70, 6.0, 0.15)
+    pace[0, 0] = pace[30, 40] = pace[33, 42] = 1.0
+    finder = RouteFinder(pace, resolution_m=5.0)
+    for change in ([[1.0]], [[np.inf]], [[2.5, 3.0]]):
+        finder.change(change, row=31, col=41)
+        pace[31, 41 : 41 + len(change[0])] = change[0]
+        known = RouteFinder(pace, target=(30, 40), resolution_m=5.0)
+        for start in ((0, 0), (33, 42), (30, 40), (31, 41), (-1, 3)):
+            found, expected = finder.between(start, (30, 40)), known.route(*start)
+            assert found.status == expected.status
+            assert found.cost_s == pytest.approx(expected.cost_s, rel=1e-5)
+            assert found.lower_bound_s <= expected.cost_s
+            assert found.length_m >= 0
+    assert finder.between((0, 0), (0, 0)).cost_s == 0
+    assert RouteFinder(pace).route(0, 0).status is RouteStatus.NO_TARGET
