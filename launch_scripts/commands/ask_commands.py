@@ -50,11 +50,13 @@ def route(
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find the cheapest route to a target or a place in a running swarm, or on a terrain file.
+    """Find the cheapest route to a target or a place of a running swarm, or on a terrain file.
+
+    swarm route --from cell:40,200 --to 36.41,-84.29
 
     swarm route --target t3 --from cell:40,200
 
-    swarm route --from cell:40,200 --to cell:12,30
+    swarm route --target t3 --from 36.41,-84.29 --steps 1
 
     swarm route --target t3 --from cell:40,200 --json | jq .routes[0].cost_s
 
@@ -65,7 +67,7 @@ def route(
     cost           Print only the cost, or that no path exists.
     terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
     start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
-    end            The destination, in the same forms as --from, instead of a target.
+    end            Instead of a target: the destination, in the same forms as --from.
     vehicle_class  Class of the vehicle.
     out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
     """
@@ -83,18 +85,17 @@ def route(
     if preset is not None:
         raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
     by_cell = row is not None and col is not None
-    if (target is None) == (end is None) or (start is None) == (not by_cell) or (cost and (out or end)):
-        raise ConfigError(
-            "give --from, and --target or --to, to ask a swarm; without one --terrain, --from and --to"
-        )
+    to_place = end is not None and not cost
+    if (target is None) != to_place or (start is None) == (not by_cell) or (cost and out is not None):
+        raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands import swarm_route
 
+    goal = None if end is None else read_place(end, "--to")
     with where.bus() as bus:
-        if target is None:
-            goal = read_place(end or "", "--to")
-            answer = swarm_route.ask_places(bus, where, place, goal, steps=steps, vehicle_class=vehicle_class)
-        else:
+        if goal is not None:
+            answer = swarm_route.ask_place(bus, where, place, goal, steps=steps, vehicle_class=vehicle_class)
+        elif target is not None:
             answer = swarm_route.ask_planner(
                 bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
             )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -42,6 +41,15 @@ if TYPE_CHECKING:
 _TIMEOUT_S = 5.0
 """A planner answers within 1 s, or says that it has no tree; five times that is for a busy machine, as for plans of
 ROS (docs/design/ros2-gateway.md)."""
+
+
+_PLACE = "place"
+"""Target of a route to a place."""
+_NO_PLACE = {
+    "growing": "its tree is still growing; ask again",
+    "lethal_goal": "it is lethal",
+    "outside_goal": "it is outside the map",
+}
 
 
 @dataclass(frozen=True)
@@ -112,37 +120,39 @@ def ask_planner(
     topic = COST if cost else ROUTE
     replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target, asker=asker)
     took_ms = (time.monotonic() - began_s) * 1e3
-    return _answered(replies, failure, frame, cell, took_ms, f"no planner of target {target!r} answers {where}")
-
-
-def ask_places(
-    bus: Bus, where: object, start: Place, goal: Place, *, steps: int, vehicle_class: str = GROUND
-) -> Answer:
-    """Asks for the route between two places. Raises BusError or ConfigError in one sentence."""
-    frame = frame_of_run(bus, where)
-    cell, to = cell_of(start, frame, "--from"), cell_of(goal, frame, "--to")
-    request = PlaceRouteRequest(to=to, cells=[cell], max_cells=steps, vehicle_class=vehicle_class)
-    began_s = time.monotonic()
-    while True:
-        replies, failure = replies_to(bus, PLACE_ROUTE, request, _TIMEOUT_S, asker=asker_of(OPERATOR, "command"))
-        took_s = time.monotonic() - began_s
-        found = [reply for reply in replies if isinstance(reply, PlaceRouteReply)]
-        if took_s > _TIMEOUT_S or not any(reply.status == "growing" for reply in found):
-            break
-    told = [reply.to_target("place", frame.grid.rows, frame.grid.cols) for reply in found]
-    missing = f"no process plans between places for {where}: set planner.places = true in its scenario"
-    return _answered(told, failure, frame, cell, took_s * 1e3, missing)
-
-
-def _answered(
-    replies: Sequence[object], failure: str | None, frame: MapFrame, cell: int, took_ms: float, missing: str
-) -> Answer:
     for reply in replies:
         if isinstance(reply, RouteReply | CostReply):
             return Answer(reply, frame, cell, took_ms)
     if failure is not None and failure != "timeout":
         raise ConfigError(failure)
-    raise BusError(missing)
+    raise BusError(f"no planner of target {target!r} answers {where}")
+
+
+def ask_place(bus: Bus, where: object, start: Place, end: Place, *, steps: int, vehicle_class: str) -> Answer:
+    """Asks for the route between two places, until it is known. Raises BusError or ConfigError in one sentence."""
+    frame = frame_of_run(bus, where)
+    cell, goal = cell_of(start, frame, "--from"), cell_of(end, frame, "--to")
+    request = PlaceRouteRequest(to=goal, cells=[cell], max_cells=steps, vehicle_class=vehicle_class)
+    began_s = time.monotonic()
+    while True:
+        asker = asker_of(OPERATOR, "command")
+        replies, failure = replies_to(bus, PLACE_ROUTE, request, _TIMEOUT_S, asker=asker)
+        spent_s = time.monotonic() - began_s
+        found = next((reply for reply in replies if isinstance(reply, PlaceRouteReply)), None)
+        if found is None and failure not in (None, "timeout"):
+            raise ConfigError(failure)
+        if found is None:
+            raise BusError(f"no process plans routes to places {where}: its scenario needs planner.places = true")
+        if found.status != "growing" or spent_s > _TIMEOUT_S:
+            break
+    if found.status != "ok":
+        raise TerrainError(f"there is no route to {written(frame, goal)}: {_NO_PLACE[found.status]}")
+    reply = RouteReply(
+        target=_PLACE, incarnation=found.incarnation, target_cell=goal, map_version=found.map_version,
+        tree_age_ms=0.0, rows=frame.grid.rows, cols=frame.grid.cols, routes=found.routes,
+        vehicle_class=vehicle_class,
+    )  # fmt: skip
+    return Answer(reply, frame, cell, spent_s * 1e3)
 
 
 def as_json(answer: Answer) -> str:
@@ -246,10 +256,9 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
         typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight{rest}")
     else:
         typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
-    grown = (
-        f"tree grown whole {reply.tree_age_ms / 1e3:.1f} s ago and kept up since, map version {reply.map_version}"
-    )
-    typer.echo(f"{grown}, answered in {answer.took_ms:.1f} ms")
+    age_s = reply.tree_age_ms / 1e3
+    grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
+    typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
     _show_pose(reply)
 
 

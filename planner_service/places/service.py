@@ -48,7 +48,7 @@ from swarm.wire.topics import PLACE_ROUTE, asker_of, is_own
 log = logging.getLogger(__name__)
 
 TREES_BYTES = 256 << 20
-"""What the trees of a class that are kept may take."""
+"""What the trees of all classes that are kept may take, besides one in hand of each class."""
 SLICE_CELLS = 1 << 16
 """Cells that are grown before others have their turn: 1 to 4 ms."""
 _MOST_WAITING, _MOST_EACH = 4096, 256
@@ -82,13 +82,13 @@ class _Question:
 class _ClassTrees:
     """The map of one class of vehicles, and the trees on it."""
 
-    def __init__(self, cost_map: CostMap, costs: CostGrid) -> None:
+    def __init__(self, cost_map: CostMap, costs: CostGrid, budget_bytes: int) -> None:
         self.cost_map = cost_map
         self._costs = costs
         cost_map.take_dirty()
         costs.load(cost_map.pace_s_per_m)
         self.map_version = cost_map.version
-        self.trees = GoalTrees(costs, TREES_BYTES)
+        self.trees = GoalTrees(costs, budget_bytes)
 
     def keep_up(self) -> None:
         """Takes the changes of the map. Not beside a growth."""
@@ -280,7 +280,7 @@ class PlacesService:
         asker = question.event.asker
         dropped = self._waiting.put(asker, question, price=price, rank=0 if is_own(asker) else 1)
         if dropped is not None:
-            self._refuse(dropped.event, "too many questions wait: ask again later")
+            self._refuse(dropped.event, "too many questions wait here already: ask again in a second")
 
     def _price(self, request: PlaceRouteRequest) -> int:
         """Cells that a slice of an answer will grow at most: three times the square of the way there."""
@@ -302,7 +302,7 @@ class PlacesService:
         if trees is None:
             cost_map = self._cost_map if name == GROUND else self._maps.of[name]
             costs = CostGrid(cost_map.grid, self._scenario.planner, cost_map.terrain.climb)
-            trees = self._classes[name] = _ClassTrees(cost_map, costs)
+            trees = self._classes[name] = _ClassTrees(cost_map, costs, TREES_BYTES // (1 + len(self._maps.of)))
             log.info("places of %s: trees for the class %s", self._job, name)
         return trees
 

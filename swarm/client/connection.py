@@ -14,14 +14,15 @@ from swarm.client.order_calls import Orders
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
-from swarm.client.terrain_frame import Frame
+from swarm.client.terrain_frame import Frame, Point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
-from swarm.places import Given
+from swarm.wire.access import OPERATOR
 from swarm.wire.messages import WIRE_VERSION
-from swarm.wire.messages.planning import GROUND, POSE_LEASE_S
+from swarm.wire.messages.planning import GROUND, POSE_LEASE_S, PlaceRouteReply, PlaceRouteRequest
 from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import PLACE_ROUTE, asker_of
 from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
@@ -171,28 +172,19 @@ class Swarm:
         """
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
-    def route(
-        self,
-        start: Given,
-        goal: Given,
-        *,
-        vehicle_class: str = GROUND,
-        vehicle: str = "client",
-        timeout_s: float = 5.0,
-    ) -> Route:
-        """The best route between any two places, if the scenario has `planner.places`.
+    def route(self, start_m: Point, goal_m: Point, *, vehicle_class: str = GROUND, timeout_s: float = 5.0) -> Route:
+        """The best route between two places, (x_m, y_m) each. Waits until it is known.
 
-        start, goal  (lat, lon) in degrees, or texts such as "cell:40,200"
-        vehicle      the vehicle that asks; with certificates, the name in the certificate
-
-        Raises BusError if no process answers, ConfigError on a place outside the terrain.
+        Raises ConfigError on a place outside the terrain, BusError where no process plans to places.
         """
-        from_cell, to_cell = self.frame.cell_named(start), self.frame.cell_named(goal)
-        asked = self._session.ask_place(to_cell, from_cell, vehicle_class, timeout_s, vehicle)
-        reply = self._session.answers(asked, timeout_s)[0]
-        grid = self.frame.grid
-        told = reply.to_target("place", grid.rows, grid.cols)
-        return Route.of(self.frame, told.routes[0], told)
+        until_s = time.monotonic() + timeout_s
+        start, goal = self.frame.cell(*start_m), self.frame.cell(*goal_m)
+        request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)
+        while True:
+            waiting = self._session.ask(PLACE_ROUTE, request, timeout_s, asker=asker_of(OPERATOR, "client"))
+            reply: PlaceRouteReply = self._session.answers(waiting, timeout_s)[0]
+            if reply.status != "growing" or time.monotonic() >= until_s:
+                return Route.of(self.frame, reply.routes[0], reply)
 
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... For the user of the swarm, or with certificates

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 from swarm.client.terrain_frame import Frame, Point
 from swarm.grid import walk
-from swarm.wire.messages.planning import PushedRoute, RouteReply
+from swarm.wire.messages.planning import PlaceRouteReply, PushedRoute, RouteReply
 from swarm.wire.route_columns import Route as WireRoute
 from swarm.wire.route_columns import RouteStatus, TargetStatus
 
@@ -21,9 +21,9 @@ class Route:
 
     While the target is unseen the status is "searching", and the route leads to a cell where it may be.
 
-    target         id of the target
+    target         id of the target; empty of a route between places
     status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target, lethal_target;
-                   searching
+                   searching. Between places also growing (not known yet), lethal_goal, outside_goal
     cells          from the vehicle's cell to the target's, or as far as the planner tells
     turns          of a pulled route the indices of the cells in which it turns, its first and last included: it
                    goes straight from one to the next, along the cells between. Empty: from cell to cell
@@ -50,7 +50,7 @@ class Route:
     nearest_cell: int | None = None
 
     @classmethod
-    def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
+    def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PlaceRouteReply | PushedRoute) -> Route:
         """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain, or one of its
         segments leads nowhere."""
         searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
@@ -64,6 +64,12 @@ class Route:
             age_s, lost, nearest = reply.pose_age_s, reply.tracker_lost, reply.nearest_cell
             if reply.lethal_target is not None and route.status is RouteStatus.NO_TARGET:
                 status = str(TargetStatus.LETHAL)
+        if isinstance(reply, PlaceRouteReply):
+            status = status if reply.status == "ok" else reply.status
+            return cls(
+                frame, "", status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
+                target_cell=reply.to_cell,
+            )  # fmt: skip
         return cls(
             frame, reply.target, status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
             age_s, lost, turns, reply.target_cell, nearest,

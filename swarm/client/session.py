@@ -21,9 +21,9 @@ from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError,
 from swarm.wire.codec import M, decode, encode
 from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
-from swarm.wire.messages.planning import PlaceRouteRequest, RouteReply, RouteRequest
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import NAMELESS_ROUTE, PLACE_ROUTE, ROUTE, RUN, Topic, asker_of
+from swarm.wire.topics import NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -203,13 +203,6 @@ class Session:
 
         self.ask_planner(request, timeout_s, target, vehicle).add_done_callback(finish)
         return found
-
-    def ask_place(
-        self, goal: int, cell: int, vehicle_class: str, timeout_s: float, vehicle: str
-    ) -> Future[list[Any]]:
-        """All answers about the way from a cell to another, asked under the name of a vehicle."""
-        request = PlaceRouteRequest(to=goal, cells=[cell], vehicle_class=vehicle_class)
-        return self.ask(PLACE_ROUTE, request, timeout_s, asker=asker_of("rover", vehicle))
 
     def ask_planner(
         self, request: RouteRequest, timeout_s: float, target: str, vehicle: str | None

@@ -78,20 +78,31 @@ def test_twenty_vehicles_get_to_twenty_places_though_their_agent_and_the_planner
         def cells() -> dict[str, int]:
             return {id: frame.cell(each.x_m, each.y_m) for id, each in seen.vehicles.items()}
 
+        def cell(index: int) -> str:
+            return "cell:{},{}".format(*frame.grid.row_col(index))
+
         assert orders.pause().silent == []
         eventually(lambda: cells() == (time.sleep(1.0) or cells()), 30, "a halt")  # type: ignore[func-returns-value]
         began = cells()
         ids = sorted(began)
+        ends = ("--from", cell(began[ids[0]]), "--to", cell(began[ids[7]]))
+        routed = command("route", *ends, "--connect", fleet.endpoint, "--json")
+        assert routed.returncode == 0, routed.stderr
+        found = json.loads(routed.stdout)
+        assert found["routes"][0]["status"] == "ok"
+        assert found["target_cell"] == began[ids[7]]
+        same = swarm.route(*(frame.centre_m(began[id]) for id in (ids[0], ids[7])))
+        assert (same.ok, same.cells[0], same.cells[-1]) == (True, began[ids[0]], began[ids[7]])
+        assert same.cost_s >= same.lower_bound_s > 0.999 * same.cost_s
         # Each goes to where another one has been, so that there is a way.
         goals = {id: began[ids[(n + 7) % 20]] for n, id in enumerate(ids)}
         done = command(
-            "order", "vehicle", "send", ids[0], "cell:{},{}".format(*frame.grid.row_col(goals[ids[0]])),
-            "--connect", fleet.endpoint,
+            "order", "vehicle", "send", ids[0], cell(goals[ids[0]]), "--connect", fleet.endpoint,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert "1 processes obey" in done.stdout
         for id in ids[1:]:
-            assert orders.send(id, ["cell:{},{}".format(*frame.grid.row_col(goals[id]))]).silent == []
+            assert orders.send(id, [cell(goals[id])]).silent == []
         for name in ("agent-a0", "places-all"):
             os.kill(fleet.pid_of(name), signal.SIGKILL)
             eventually(lambda name=name: fleet.said(f"{name}: killed"), 20, "its end")  # type: ignore[misc]

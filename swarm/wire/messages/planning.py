@@ -121,15 +121,6 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
     status: Literal["ok", "growing", "lethal_goal", "outside_goal"] = "ok"
     vehicle_class: Id = GROUND
 
-    def to_target(self, name: str, rows: int, cols: int) -> RouteReply:
-        """The same as the answer of a planner whose target stays there."""
-        lethal = self.to_cell if self.status == "lethal_goal" else None
-        return RouteReply(
-            target=name, incarnation=self.incarnation, target_cell=None if lethal else self.to_cell,
-            map_version=self.map_version, tree_age_ms=0.0, rows=rows, cols=cols, routes=self.routes,
-            vehicle_class=self.vehicle_class, lethal_target=lethal,
-        )  # fmt: skip
-
     def check(self) -> None:
         self.routes.check_bounds()
 

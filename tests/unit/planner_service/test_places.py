@@ -1,0 +1,149 @@
+"""Routes to any place: as an oracle has them on the map of the moment, within bounds, and fair to agents."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, rough
+from support.swarm_model import SwarmModel
+
+import planner_service.places.service as places
+from planner_service.places.service import PlacesService
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.bus.scheduler import InlineWorker
+from swarm.config.agents import place_job, places_of
+from swarm.config.load import parse_scenario
+from swarm.grid import walk
+from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest
+from swarm.wire.route_columns import RouteStatus
+from swarm.wire.topics import PLACE_ROUTE
+
+GROUPS = {"red": ["*"], "blue": [], "green": ["*"]}
+Pace = np.ndarray[Any, np.dtype[np.float32]]
+
+
+class PlacesWorld(SwarmModel):
+    """The process, and askers."""
+
+    def __init__(self, pace: Pace, groups: str = "[[groups]]", job: str = "all") -> None:
+        super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario(f"[[targets]]\n{groups}"))
+        setup, self._job = self.setup("places", job), job
+        self.service = self.start(
+            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+        )
+        self.client = self.bus("client")
+        self.run(1.0)
+
+    def ask(self, to: int, *cells: int, asker: str = "rover.r1", **fields: Any) -> list[Event]:
+        """The list to which the events of a question are added."""
+        heard: list[Event] = []
+        request = PlaceRouteRequest(to=to, cells=list(cells), **fields)
+        self.client.ask(PLACE_ROUTE, request, heard.append, tag="p", places=self._job, asker=asker)
+        return heard
+
+    def settled(self, to: int, cell: int, asker: str) -> list[Event]:
+        """The events of a question, once it is answered or refused."""
+        heard = self.ask(to, cell, asker=asker)
+        self.until(lambda: heard, within_s=2.0)
+        return heard
+
+    def answer(self, to: int, *cells: int, **fields: Any) -> PlaceRouteReply:
+        """The answer, once nothing grows any more."""
+        while True:
+            heard = self.ask(to, *cells, **fields)
+            self.until(lambda heard=heard: heard, within_s=2.0)  # type: ignore[misc]
+            assert isinstance(heard[0], Replied), heard
+            reply = heard[0].message
+            assert isinstance(reply, PlaceRouteReply)
+            if reply.status != "growing":
+                return reply
+
+
+@pytest.mark.seeds(5)
+def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) -> None:
+    pace, chance = rough(seed), random.Random(seed)
+    world = PlacesWorld(pace)
+    writer = world.writer("all.a0.1")
+    now = np.array(pace)
+    for _ in range(6):
+        for _ in range(4):
+            to, *cells = (chance.randrange(GRID.cells) for _ in range(4))
+            reply, best = world.answer(to, *cells), optimum_s(now, to)
+            if math.isinf(now.flat[to]):
+                assert reply.status == "lethal_goal" or all(math.isinf(now.flat[cell]) for cell in cells)
+                continue
+            for cell, route in zip(cells, reply.routes, strict=True):
+                if math.isinf(now.flat[cell]):
+                    assert route.status is RouteStatus.LETHAL_START
+                elif math.isinf(best[cell]):
+                    assert route.status is RouteStatus.UNREACHABLE
+                else:
+                    assert driven_s(now, route) == pytest.approx(best[cell], rel=1e-5)
+                    assert route.cost_s == pytest.approx(best[cell], rel=1e-5)
+                    assert best[cell] * (1 - 1e-5) <= route.lower_bound_s * (1 + 2e-5) <= route.cost_s * (1 + 3e-5)
+        marked = np.array(sorted({chance.randrange(GRID.cells) for _ in range(30)}), np.uint32)
+        lethal = np.array([chance.random() < 0.5 for _ in marked])
+        paces = np.where(lethal, np.inf, 0.4).astype(np.float32)
+        marked, lethal, paces = (each[np.isfinite(pace.reshape(-1)[marked])] for each in (marked, lethal, paces))
+        kinds = np.where(lethal, np.uint8(MarkKind.LETHAL), np.uint8(MarkKind.PACE)).astype(np.uint8)
+        stated = np.where(lethal, np.float32(0), paces).astype(np.float32)
+        writer.sync.publish(writer.replica.write(marked, kinds, stated, world.now_ns))
+        now.reshape(-1)[marked] = paces
+        world.run(1.0)
+
+
+def test_a_part_of_a_route_says_what_the_rest_costs() -> None:
+    pace = rough(3)
+    world = PlacesWorld(pace)
+    to = GRID.cell(20, 2)
+    start = GRID.cell(20, 45)
+    (whole,) = world.answer(to, start).routes
+    (part,) = world.answer(to, start, max_cells=5).routes
+    assert part.directions == whole.directions[:5]
+    end = walk(GRID, start, part.directions)[-1]
+    assert part.remaining_s == pytest.approx(optimum_s(pace, to)[end], rel=1e-5)
+    assert part.cost_s == whole.cost_s
+
+
+def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(places, "TREES_BYTES", 100_000)
+    world = PlacesWorld(flat())
+    chance = random.Random(1)
+    asked = [
+        world.ask(chance.randrange(GRID.cells), chance.randrange(GRID.cells), asker="rover.stranger")
+        for _ in range(10_000)
+    ]
+    agent = world.ask(GRID.cell(1, 1), GRID.cell(30, COLS - 2), asker="agent.a0")
+    world.run(0.25)
+    assert isinstance(agent[0], Replied), "an agent does not wait behind the stranger's"
+    answered = sum(isinstance(heard[0], Replied) for heard in asked if heard)
+    assert answered < 1000
+    refused = [heard[0].failure for heard in asked if heard and isinstance(heard[0], AskEnded)]
+    assert any("too many questions wait here" in str(failure) for failure in refused)
+    trees = world.service._classes["ground"].trees
+    assert trees.bytes <= 100_000
+    assert len(world.service._waiting) <= 4096
+
+
+def test_each_group_asks_a_process_that_knows_what_the_group_may_know() -> None:
+    groups = [f'[[groups]]\nname = "{name}"\nreads = {reads}' for name, reads in GROUPS.items()]
+    scenario = parse_scenario("\n".join(["[[targets]]", "[planner]", "places = true", *groups]))
+    assert {name: place_job(scenario, name) for name in GROUPS} == {"red": "red", "blue": "blue", "green": "red"}
+    assert places_of(scenario) == ["red", "blue"]
+
+
+def test_an_agent_of_another_group_is_refused() -> None:
+    groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
+    world = PlacesWorld(flat(), groups, "red")
+    assert isinstance(world.settled(1, 2, "agent.a0")[0], Replied)
+    ended = world.settled(1, 2, "agent.a1")[0]
+    assert isinstance(ended, AskEnded)
+    assert ended.failure == "agent.a1 is of group blue: ask its own places"
