@@ -33,6 +33,7 @@ from swarm.wire.messages.planning import (
     Sighted,
     TargetPose,
 )
+from swarm.wire.messages.traffic import Granted, Left, Standing
 from swarm.wire.messages.vehicles import Body, Followed, Removed, RemoveVehicles, SharedCosts, VehicleState
 from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
@@ -109,7 +110,7 @@ class AgentService:
         self._roster = Roster()
         self._planners_changed = False
         """True if a planner has come or gone, or a target, since the agent was told of them."""
-        self._now_ns = 0
+        self._now_ns = self._acted_ns = 0
         self._answer_s = _ANSWER_S
         self._shut_in: set[str] = set()
         """Vehicles of which it has been said that bodies shut them in."""
@@ -163,6 +164,10 @@ class AgentService:
             self.agent.bodies.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
+        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | Standing):
+            self._place(self._right_of_way.hear(event.message, now_ns))
+            self._act(now_ns)
+            return
         if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
             return
         match event:
@@ -188,8 +193,18 @@ class AgentService:
             case _:
                 pass
 
+    def _act(self, now_ns: int) -> None:
+        """Goes on between two ticks by what others have said, a few times in the time of a cell."""
+        acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns
+        if acts and not self.agent.holdings.replaced:
+            self._acted_ns = now_ns
+            self.agent.bodies_moved()
+            self._drive(now_ns)
+            self._perform(self.agent.decide(now_ns))
+            self._right_of_way.tick(self.agent.wishes, now_ns)
+
     def tick(self, now_ns: int) -> None:
-        self._now_ns = now_ns
+        self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
         agent.bodies.tick(now_ns)
         for pose in self._collected(POSE, TargetPose):
