@@ -83,6 +83,7 @@ class AgentService:
     """Drives the vehicles of one agent, marks what they find, and publishes where they are.
 
     agent      the core
+    driven     how often it has driven its vehicles
     when_over  called once all vehicles of an added agent have left
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
@@ -110,7 +111,7 @@ class AgentService:
         self._roster = Roster()
         self._planners_changed = False
         """True if a planner has come or gone, or a target, since the agent was told of them."""
-        self._now_ns = self._acted_ns = 0
+        self._now_ns = self._acted_ns = self.driven = 0
         self._answer_s = _ANSWER_S
         self._shut_in: set[str] = set()
         """Vehicles of which it has been said that bodies shut them in."""
@@ -386,6 +387,7 @@ class AgentService:
     def _drive(self, now_ns: int) -> None:
         """Drives cell by cell, and writes findings on each into the map before driving on."""
         agent, learning = self.agent, self._maps.learning
+        self.driven += 1
         agent.begin_drive(now_ns)
         while (found := agent.drive()) is not None:
             if len(findings := found.where(self._parts.zones.free(found.cells))):
