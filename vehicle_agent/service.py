@@ -202,7 +202,14 @@ class AgentService:
             self.agent.bodies_moved()
             self._drive(now_ns)
             self._perform(self.agent.decide(now_ns))
+            self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)
             self._right_of_way.tick(self.agent.wishes, now_ns)
+
+    def _report(self, places: Places, now_ns: int) -> None:
+        """Publishes where the vehicles are, each time that they have driven: between two reports they are where the
+        first says."""
+        for region, fleet in self._parts.fleet.reports(places, now_ns):
+            self._bus.publish(FLEET, fleet, region=region, author=self._author)
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = self._acted_ns = now_ns
@@ -241,8 +248,7 @@ class AgentService:
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
-        for region, fleet in parts.fleet.reports(columns, now_ns):
-            self._bus.publish(FLEET, fleet, region=region, author=self._author)
+        self._report(columns, now_ns)
         paths = agent.holdings.paths
         chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
         for chasers in parts.chasers.reports(chasing, now_ns):
