@@ -36,6 +36,9 @@ from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
+_PATIENCE, _PATIENCE_S = 8.0, 1.0
+"""A vehicle waits behind others that do not go on for the time of so many cells, or so many seconds if that is
+more."""
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -207,6 +210,7 @@ class Agent:
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
         """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
         self._time_scale = time_scale
+        self._driver.patience_ns = int(max(_PATIENCE_S, _PATIENCE * self._map.cell_s(0.5) / time_scale) * NS_PER_S)
         self.assignment.set_period(reassign_s)
 
     # --- where vehicles start -------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ class. Hazards found in a zone are no news, and a vehicle in one drives out.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkKind
 
+_SAMPLE = 1 << 16
+"""Cells whose times are looked at, to know about how long one takes."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
@@ -47,6 +51,12 @@ class LocalMap:
     physics: NDArray[np.float32]
     climb: Climb | None = None
     own_prior: NDArray[np.float32] | None = None
+
+    def cell_s(self, share: float) -> float:
+        """Returns the time of a cell (s) than which this share of cells takes less, by a sample of them."""
+        paces = self.physics.reshape(-1)[:: max(self.physics.size // _SAMPLE, 1)]
+        paces = paces[np.isfinite(paces)]
+        return self.grid.resolution_m * float(np.quantile(paces, share)) if len(paces) else math.inf
 
     def lethal(self, cells: NDArray[np.int64], paces: NDArray[np.float32]) -> NDArray[np.int64]:
         """Returns which of these cells are lethal to the vehicles' class, if these are their paces for "ground"."""

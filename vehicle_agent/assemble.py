@@ -40,6 +40,8 @@ from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTarge
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 
+_ACTS = 5
+"""Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least, so that they are there before a vehicle is."""
 
@@ -104,7 +106,8 @@ class AgentParts:
         core = RightOfWay(
             setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns
         )
-        self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn)
+        self.act_ns = int(self.maps.local.cell_s(0.0) / scenario.time_scale / _ACTS * NS_PER_S)
+        self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn, acts=self.act_ns < tick_ns)
 
         # The vehicles.
         seen = SensorWorld(grid, truth, range_m, setup.id, scenario.seed)

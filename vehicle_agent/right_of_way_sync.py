@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from hashlib import blake2s
 
 from msgspec.structs import replace
@@ -14,6 +15,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages import Message
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Left, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
@@ -74,6 +76,7 @@ _WAITING_AGAIN_NS = 10 * NS_PER_S
 class RightOfWaySync:
     """Carries an agent's right of way.
 
+    acts    whether messages are posted as they come, not kept for the next tick
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
             "slow_link", for agents that answer late; "promises", for the file of promises
     """
@@ -86,6 +89,8 @@ class RightOfWaySync:
         bus: Bus,
         post: Post,
         warn: Callable[[str, str], None],
+        *,
+        acts: bool = False,
     ) -> None:
         self.core = core
         self._id = setup.id
@@ -93,6 +98,7 @@ class RightOfWaySync:
         self._bus = bus
         self._post = post
         self._warn = warn
+        self._acts = acts
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
         self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
@@ -116,11 +122,12 @@ class RightOfWaySync:
         self._bus.serve(TABLE, self._post, agent=self._id)
         # Not one by one for each seat: every subscription has a thread of its own, and of a large map's plots few
         # agents have hundreds of seats.
-        self._bus.collect(STANDING, member=self._id)
+        keep = partial(self._bus.subscribe, post=self._post) if self._acts else self._bus.collect
+        keep(STANDING, member=self._id)
         self._bus.subscribe(TABLE, self._post, member=self._id)
         self._bus.subscribe(STORED, self._post, member=self._id)
-        self._bus.collect(GRANTED, host=self._id)
-        self._bus.collect(LEFT, host=self._id)
+        keep(GRANTED, host=self._id)
+        keep(LEFT, host=self._id)
         self._ask_known(now_ns)
 
     def on_cells_event(self, event: Event, now_ns: int) -> bool:
@@ -161,12 +168,19 @@ class RightOfWaySync:
         """Takes in what wardens have granted, and other hosts have left, since the last time, before vehicles
         drive. Yields the vehicles that have found their places by each message; they are to be placed before the
         next."""
-        for heard in self._bus.collected(LEFT):
-            assert isinstance(heard.message, Left)
-            yield self.core.host.hear_left(heard.message)
-        for heard in self._bus.collected(GRANTED):
-            assert isinstance(heard.message, Granted)
-            yield self.core.host.hear_granted(heard.message, self._own_time.at(now_ns))
+        for heard in (*self._bus.collected(LEFT), *self._bus.collected(GRANTED)):
+            yield self.hear(heard.message, now_ns)
+
+    def hear(self, message: Message, now_ns: int) -> list[str]:
+        """Takes up what a host or a warden says. Returns the vehicles that have found their places by it."""
+        match message:
+            case Left():
+                return self.core.host.hear_left(message)
+            case Granted():
+                return self.core.host.hear_granted(message, self._own_time.at(now_ns))
+            case Standing():
+                self.core.hear_standing(message, self._own_time.at(now_ns))
+        return []
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)
@@ -178,8 +192,7 @@ class RightOfWaySync:
         if waited and asked_ns is not None:
             self._begin()
         for heard in self._bus.collected(STANDING):
-            assert isinstance(heard.message, Standing)
-            self.core.hear_standing(heard.message, own_ns)
+            self.hear(heard.message, now_ns)
         self._perform(self.core.tick(wishes, own_ns))
         self._tell_slow(now_ns)
         unled = self.core.host.unled(own_ns)

@@ -36,6 +36,7 @@ from swarm.wire.messages.planning import (
     Sighted,
     TargetPose,
 )
+from swarm.wire.messages.traffic import Granted, Left, Standing
 from swarm.wire.messages.vehicles import Body, Followed, Removed, RemoveVehicles, SharedCosts, VehicleState
 from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
@@ -91,6 +92,7 @@ class AgentService:
     """Drives the vehicles of one agent, marks what they find, and publishes where they are.
 
     agent      the core
+    driven     how often it has driven its vehicles
     when_over  called once all vehicles of an added agent have left
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
@@ -120,7 +122,7 @@ class AgentService:
         self._roster = Roster()
         self._planners_changed = False
         """True if a planner has come or gone, or a target, since the agent was told of them."""
-        self._now_ns = 0
+        self._now_ns = self._acted_ns = self.driven = 0
         self._answer_s = _ANSWER_S
         self._shut_in: set[str] = set()
         """Vehicles of which it has been said that bodies shut them in."""
@@ -175,6 +177,10 @@ class AgentService:
             self.agent.bodies.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
+        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | Standing):
+            self._place(self._right_of_way.hear(event.message, now_ns))
+            self._act(now_ns)
+            return
         if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
             return
         match event:
@@ -200,8 +206,25 @@ class AgentService:
             case _:
                 pass
 
+    def _act(self, now_ns: int) -> None:
+        """Goes on between two ticks by what others have said, a few times in the time of a cell."""
+        acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns
+        if acts and not self.agent.holdings.replaced:
+            self._acted_ns = now_ns
+            self.agent.bodies_moved()
+            self._drive(now_ns)
+            self._perform(self.agent.decide(now_ns))
+            self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)
+            self._right_of_way.tick(self.agent.wishes, now_ns)
+
+    def _report(self, places: Places, now_ns: int) -> None:
+        """Publishes where the vehicles are, each time that they have driven: between two reports they are where the
+        first says."""
+        for region, fleet in self._parts.fleet.reports(places, now_ns):
+            self._bus.publish(FLEET, fleet, region=region, author=self._author)
+
     def tick(self, now_ns: int) -> None:
-        self._now_ns = now_ns
+        self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
         agent.bodies.tick(now_ns)
         for pose in self._collected(POSE, TargetPose):
@@ -237,8 +260,7 @@ class AgentService:
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
-        for region, fleet in parts.fleet.reports(columns, now_ns):
-            self._bus.publish(FLEET, fleet, region=region, author=self._author)
+        self._report(columns, now_ns)
         paths = agent.holdings.paths
         self._tell_goals(now_ns)
         chasing = [
@@ -406,6 +428,7 @@ class AgentService:
     def _drive(self, now_ns: int) -> None:
         """Drives cell by cell, and writes findings on each into the map before driving on."""
         agent, learning = self.agent, self._maps.learning
+        self.driven += 1
         agent.begin_drive(now_ns)
         while (found := agent.drive()) is not None:
             if len(findings := found.where(self._parts.zones.free(found.cells))):

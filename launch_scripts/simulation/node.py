@@ -222,10 +222,16 @@ class Node:
         return None
 
     def _work(self, work: Callable[[int], None], now_ns: int, looks: bool) -> None:
+        driven = self._driven
         with in_loop(None):
             work(now_ns)
-        for look in self._simulation.after_tick if looks else ():
+        for look in self._simulation.after_tick if looks or driven != self._driven else ():
             look(self)
+
+    @property
+    def _driven(self) -> int:
+        """How often the service has driven its vehicles, which agents do between ticks, too."""
+        return getattr(self.service, "driven", 0)
 
     def crash(self) -> None:
         """Ends the process as kill -9 does: nothing is published or saved."""

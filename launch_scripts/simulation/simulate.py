@@ -103,7 +103,7 @@ class Simulation:
     """A run that tests advance, inspect and disturb. `simulate` runs one to its end.
 
     record_to   folder in which the inputs of every process are recorded; None: they are not
-    after_tick  called with a node after each of its ticks
+    after_tick  called with a node after each of its ticks, and each time that its vehicles have driven
     after_boot  called with a node after each of its starts
     """
 

@@ -23,14 +23,14 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
    not even after the vehicles have left it.
 4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
    table lists it no more. Never use such an entry again.
-5. Give back what waits for others that do not go on: circles over several plots end by it.
+5. Give back entries that wait for others which do not go on.
 6. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
 7. Speak to the warden, and to all members where no warden was heard for half a second.
 
 Duties of a warden:
 
-1. Add an entry at the end of a cell's order only, one to a cell and table, and remove it by the word of its host
-   only: a statement that knows the table which added it and omits it, or proof that its life has ended.
+1. Add an entry at the end of a cell's order only, and one to a cell and table. Remove it only by a statement of its
+   host that knows the table which added it and omits it, or by proof that its life has ended.
 2. Put a vehicle only behind one that goes on, and never so that it would wait for itself.
 3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
 

@@ -9,7 +9,7 @@ cell while another leaves it, and stops at the border of its own cell until the 
 Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 
 1. The number of an entry is used once: (cell, epoch, sequence). A table adds one entry to a cell at most.
-2. Who enters has seen that *all* entries before its own are over, not only the last: that one may have been given
+2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
    back while the first is still used. Entries of the same vehicle, of an earlier life, do not count.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
 4. An entry that was left, given back or passed over is never used again by this host.

@@ -16,7 +16,7 @@ DELAYS_MS = (0.2, 5.0, 20.0, 100.0)
 def met(seed: int, delay_ms: float) -> tuple[int, int]:
     """Collisions in truth and by the referee's judgement, in a crowd whose processes are stopped."""
     scenario, terrain = crowd("open", seed, vehicles=24, per_agent=6, side=12)
-    simulation = Simulation(scenario, faults=FaultPlan(delay_ms=delay_ms, stutter=0.02), terrain=terrain)
+    simulation = Simulation(scenario, faults=FaultPlan(delay_ms=delay_ms, stutter=0.005), terrain=terrain)
     book = LawBook(simulation)
     simulation.run_until(SECONDS)
     report = simulation.report(SECONDS)
