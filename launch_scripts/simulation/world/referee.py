@@ -21,6 +21,7 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body, Fleet
+from swarm.wire.topics import BODY, FLEET
 from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
 
 _SKEW_NS = NS_PER_S // 200
@@ -35,10 +36,7 @@ several reports state one encounter."""
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """Two vehicles on one cell at one time; reported once per encounter.
-
-    evidence  the two stays that overlap: the reports on which they rest are in the recordings of the run
-    """
+    """Two vehicles on one cell at one time; reported once per encounter. `evidence` are the stays that overlap."""
 
     first: str
     second: str
@@ -48,13 +46,7 @@ class Collision:
 
     def sentence(self, began_ns: int) -> str:
         """Returns what was found, and the reports which prove it; times are since the run began."""
-
-        def said(stay: Stay) -> str:
-            begin_s, end_s = ((each_ns - began_ns) / NS_PER_S for each_ns in (stay.begin_ns, stay.end_ns))
-            reports = f"reports {stay.first_seq} to {stay.seq} of {stay.author}"
-            return f"{stay.vehicle} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
-
-        return f"{self.first} and {self.second} on one cell: {' and '.join(map(said, self.evidence))}"
+        return f"{self.first} and {self.second} on one cell{_proven(self.evidence, began_ns)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +56,11 @@ class LethalEntry:
     vehicle: str
     cell: int
     stamp_ns: int
+    evidence: tuple[Stay] = field(compare=False)
+
+    def sentence(self, began_ns: int) -> str:
+        """Returns what was found, and the report which proves it."""
+        return f"{self.vehicle} entered a lethal cell{_proven(self.evidence, began_ns)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +77,17 @@ class BodyHit:
     stamp_ns: int
     by_vehicle: bool
     said_s: float
+    evidence: tuple[Stay, Cover] = field(compare=False)
 
-    @property
-    def sentence(self) -> str:
+    def sentence(self, began_ns: int) -> str:
+        """Returns what was found, and the reports which prove it."""
         if self.by_vehicle:
-            return f"{self.vehicle} drove into body {self.body}, which had closed the cell for {self.said_s:.1f} s"
-        if self.said_s < 0.0:
-            return f"body {self.body} drove into {self.vehicle}, which was there first"
-        return f"body {self.body} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
+            found = f"{self.vehicle} drove into body {self.body}, which had closed the cell for {self.said_s:.1f} s"
+        elif self.said_s < 0.0:
+            found = f"body {self.body} drove into {self.vehicle}, which was there first"
+        else:
+            found = f"body {self.body} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
+        return found + _proven(self.evidence, began_ns)
 
 
 Broken = Collision | LethalEntry | BodyHit
@@ -98,6 +98,7 @@ class Stay:
     """A vehicle on a cell, from the first to the last time at which it is known to be there.
 
     since_ns  the earliest time at which it may have come there
+    region    of the cell: with the author it names the key of the reports
     author    of the last report of it, which has the number `seq`; the first has `first_seq`
     """
 
@@ -106,9 +107,31 @@ class Stay:
     begin_ns: int
     end_ns: int
     since_ns: int
+    region: int
     author: str
     seq: int
     first_seq: int
+
+    @property
+    def name(self) -> str:
+        return self.vehicle
+
+    @property
+    def key(self) -> str:
+        """The key of the reports, below the namespace."""
+        return FLEET.below({"region": str(self.region), "author": self.author})
+
+
+def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
+    """Returns when each was on the cell, in seconds since the run began, and the reports that say so: their numbers
+    and their key. A recording of the run has them."""
+
+    def said(each: Stay | Cover) -> str:
+        begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
+        reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
+        return f"{each.name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
+
+    return f": {' and '.join(map(said, evidence))}"
 
 
 Encounters = dict[tuple[str, str], int]
@@ -160,7 +183,7 @@ class Referee:
         if self._air is not None and fleet.vehicle_class in self._aloft:
             return self._air.on_fleet(fleet)
         broken: list[Broken] = []
-        author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
+        author, seq, stamp_ns, region = fleet.author, fleet.seq, fleet.stamp_ns, fleet.region
         vehicles, stays, covered = self._vehicles, self._stays, self._bodies.covered
         # In one loop: each vehicle reports in every tick, and all that most of them have to say is that they are
         # still where they were.
@@ -169,7 +192,7 @@ class Referee:
                 continue
             stay = vehicles.get(id)
             if stay is None:
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, author, seq, seq), fleet, broken)
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, region, author, seq, seq), fleet, broken)
                 continue
             before_ns = stay.end_ns
             if stamp_ns <= before_ns:
@@ -183,7 +206,7 @@ class Referee:
                     broken.extend(self._meetings(stay))
             if not stands:
                 since_ns = stamp_ns if gapless else before_ns
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, author, seq, seq), fleet, broken)
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, region, author, seq, seq), fleet, broken)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)
         return broken
@@ -196,7 +219,7 @@ class Referee:
         self._vehicles[entered.vehicle] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
         if not truth.item(entered.cell) < math.inf:
-            broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns))
+            broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns, (replace(entered),)))
 
     def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:
         yield from self._bodies.check(stay)
@@ -229,24 +252,36 @@ _LATE_NS = 3 * NS_PER_S // 20
 
 
 @dataclass(slots=True, eq=False)
-class _Cover:
+class Cover:
     """A body on a cell.
 
     closed_ns  since when it has closed the cell
     end_ns     while it is there the end of its lease
+    seq        of the last report of it there; the first has `first_seq`
     """
 
     body: str
     begin_ns: int
     closed_ns: int
     end_ns: int
+    seq: int
+    first_seq: int
+
+    @property
+    def name(self) -> str:
+        return f"body {self.body}"
+
+    @property
+    def key(self) -> str:
+        """The key of the reports, below the namespace."""
+        return BODY.below({"id": self.body})
 
 
 @dataclass(slots=True, eq=False)
 class _Record:
     seq: int = -1
     until_ns: int = 0
-    covers: dict[int, _Cover] = field(default_factory=dict)
+    covers: dict[int, Cover] = field(default_factory=dict)
     closed_ns: dict[int, int] = field(default_factory=dict)
     """Cell -> since when it has been closed, of those that the newest report closes."""
 
@@ -257,7 +292,7 @@ class BodyReferee:
     def __init__(self, grid: GridSpec) -> None:
         self._grid = grid
         self._records: dict[tuple[str, int], _Record] = {}
-        self._covers: dict[int, list[_Cover]] = {}
+        self._covers: dict[int, list[Cover]] = {}
         self._met: Encounters = {}
         self._swept_ns = 0
 
@@ -284,9 +319,9 @@ class BodyReferee:
             for cell in capsule_of(body, self._grid, 0.0).cells(self._grid):
                 cover = left.pop(cell, None) if goes_on else None
                 if cover is None:
-                    cover = _Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0)
+                    cover = Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0, body.seq, body.seq)
                     self._covers.setdefault(cell, []).append(cover)
-                cover.end_ns = record.until_ns
+                cover.end_ns, cover.seq = record.until_ns, body.seq
                 record.covers[cell] = cover
         for cover in left.values():
             cover.end_ns = left_ns
@@ -306,9 +341,8 @@ class BodyReferee:
                 continue
             if _is_new(self._met, (stay.vehicle, cover.body), end_ns):
                 said_ns = stay.since_ns - cover.closed_ns
-                yield BodyHit(
-                    stay.vehicle, cover.body, stay.cell, end_ns, said_ns >= IN_TIME_NS, said_ns / NS_PER_S
-                )
+                by_vehicle, evidence = said_ns >= IN_TIME_NS, (replace(stay), replace(cover))
+                yield BodyHit(stay.vehicle, cover.body, stay.cell, end_ns, by_vehicle, said_ns / NS_PER_S, evidence)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""

@@ -199,10 +199,10 @@ class TargetsService:
                     self._bus.publish(BODY, action, id=action.id)
                 case BodyHit(cell=cell, by_vehicle=by_vehicle):
                     self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
-                    self._alarm("body-collision", action.vehicle, action.sentence, cell, now_ns)
+                    self._alarm("body-collision", action.vehicle, action.sentence(self._began_ns), cell, now_ns)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
-                    self._alarm("lethal-entry", vehicle, f"{vehicle} entered a lethal cell", cell, now_ns)
+                    self._alarm("lethal-entry", vehicle, action.sentence(self._began_ns), cell, now_ns)
 
     def _alarm(self, kind: str, about: str, text: str, cell: int, now_ns: int) -> None:
         """Something happened that must not: to the log of who watches now, and to those who come late."""

@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 from support.target_reports import fleet
 
 from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry, Referee
+from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Body, Fleet
 
+GRID = GridSpec(10, 10, 10.0)
+MS = 1_000_000
 
-def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry]:
-    referee = Referee({"ground": np.ones(100, np.float32) if truth is None else truth}, GridSpec(10, 10, 10.0))
+
+def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry | BodyHit]:
+    referee = Referee({"ground": np.ones(100, np.float32) if truth is None else truth}, GRID)
     return [broken for report in reports for broken in referee.on_fleet(report)]
 
 
@@ -36,10 +40,37 @@ def test_two_vehicles_on_one_cell_at_one_time_collide() -> None:
     (collision,) = judged(a(100, 5), b(150, 5), a(200, 6), b(250, 5))
     assert isinstance(collision, Collision)
     assert (collision.cell, collision.stamp_ns) == (5, 200_000_000)
-    by_a, by_b = ("a from 0.100 to 0.200 s", "b from 0.150 to 0.250 s")
-    assert re.sub(r" \(reports \d+ to \d+ of a\d\.1\)", "", collision.sentence(0)) == (
-        f"a and b on one cell: {by_a} and {by_b}"
+    assert collision.sentence(0) == (
+        "a and b on one cell: a from 0.100 to 0.200 s (reports 1 to 2 on fleet/0/a0.1) "
+        "and b from 0.150 to 0.250 s (reports 1 to 2 on fleet/0/a1.1)"
     )
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from("abr"), st.integers(0, 3)), max_size=40))
+def test_whatever_is_found_names_the_reports_which_prove_it(
+    moves: list[tuple[str, int]],
+) -> None:
+    truth = np.ones(100, np.float32)
+    truth[3] = np.inf
+    referee, sent, found = Referee({"ground": truth}, GRID), dict[tuple[str, int], tuple[int, int]](), list[Any]()
+    for n, (id, cell) in enumerate(moves, start=1):
+        at_ms, stamp_ns = 100 * n, 100 * n * MS
+        if id == "r":
+            _, report = body(at_ms, cell + 0.5, 0.5)
+            sent["body/r1", report.seq] = stamp_ns, cell
+            referee.hear_body(report, stamp_ns)
+        else:
+            said = (a if id == "a" else b)(at_ms, cell)
+            sent[f"fleet/0/{said.author}", said.seq] = stamp_ns, cell
+            found += referee.on_fleet(said)
+    for broken in found:
+        stated = re.findall(r"from (\S+) to (\S+) s \(reports (\d+) to (\d+) on (\S+)\)", broken.sentence(0))
+        assert len(stated) == (1 if isinstance(broken, LethalEntry) else 2)
+        for begin_s, end_s, first, last, key in stated:
+            assert sent[key, int(first)] == (round(float(begin_s) * 1e9), broken.cell)
+            until_ns = sent[key, int(last)][0] + (NS_PER_S if key == "body/r1" else 0)  # its lease
+            assert float(end_s) * 1e9 <= until_ns + 1
 
 
 def test_an_encounter_counts_once_and_the_next_one_again() -> None:
@@ -87,7 +118,7 @@ def test_coming_onto_lethal_ground_counts_once_per_entry() -> None:
     truth[7] = np.inf
     reports = [a(100 * n, cell) for n, cell in enumerate([6, 7, 7, 7, 6, 7], start=1)]
     entries = judged(*reports, truth=truth)
-    assert entries == [LethalEntry("a", 7, 200_000_000), LethalEntry("a", 7, 600_000_000)]
+    assert [(entry.cell, entry.stamp_ns) for entry in entries] == [(7, 200_000_000), (7, 600_000_000)]
 
 
 def test_a_cell_outside_the_grid_is_nobodys_business() -> None:
@@ -123,9 +154,6 @@ def test_the_cells_of_all_vehicles_are_those_they_reported_last() -> None:
 
 # --- blame for a hit between a body and a vehicle -----------------------------------------------------------------
 
-GRID = GridSpec(10, 10, 10.0)
-MS = 1_000_000
-
 
 def body(at_ms: int, col: float, row: float = 5.5, **said: object) -> tuple[int, Body]:
     fields = {"id": "r1", "incarnation": 1, "seq": at_ms, "x_m": col * 10.0, "y_m": -row * 10.0, "radius_m": 1.0}
@@ -158,19 +186,19 @@ def on(from_ms: int, until_ms: int, col: int) -> list[tuple[int, Fleet]]:
 def test_a_vehicle_that_enters_a_cell_which_a_body_has_closed_for_two_ticks_is_at_fault() -> None:
     (hit,) = judged_hits(*standing(0, 2000, 5.5), *on(50, 1000, 4), *on(1050, 2000, 5))
     assert hit.by_vehicle
-    assert hit.sentence == "a drove into body r1, which had closed the cell for 1.1 s"
+    assert hit.sentence(0).startswith("a drove into body r1, which had closed the cell for 1.1 s")
 
 
 def test_a_body_that_drives_into_a_vehicle_is_at_fault() -> None:
     (hit,) = judged_hits(*on(50, 2000, 5), *standing(0, 1000, 3.5), *standing(1000, 2000, 5.5))
     assert not hit.by_vehicle
-    assert hit.sentence == "body r1 drove into a, which was there first"
+    assert hit.sentence(0).startswith("body r1 drove into a, which was there first")
 
 
 def test_a_vehicle_that_enters_where_a_body_has_just_come_had_no_time() -> None:
     (hit,) = judged_hits(*on(50, 1000, 4), *on(1050, 2000, 5), *standing(900, 2000, 5.5))
     assert not hit.by_vehicle
-    assert hit.sentence == "body r1 met a, 0.15 s after its first report of the cell"
+    assert hit.sentence(0).startswith("body r1 met a, 0.15 s after its first report of the cell")
 
 
 def test_a_vehicle_that_crosses_the_way_on_which_a_body_comes_is_at_fault() -> None:
