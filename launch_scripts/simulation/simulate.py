@@ -16,8 +16,6 @@ from hashlib import blake2s
 from pathlib import Path
 from typing import Any, TextIO
 
-import msgspec
-
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
 from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, ProcessSpec, processes_of
@@ -229,27 +227,6 @@ class Simulation:
 
     def _note(self, what: str, *nodes: str) -> None:
         self.log.event(self.scheduler.clock.now_ns(), what, ",".join(nodes))
-
-
-def simulate(
-    scenario: Scenario,
-    seed: int | None = None,
-    seconds: float | None = None,
-    faults: FaultPlan | None = None,
-    trace: TextIO | None = None,
-    record_to: Path | None = None,
-) -> SimulationResult:
-    """Runs a scenario to its end.
-
-    seed      instead of the scenario's own
-    trace     where the event log is written
-    record_to as of `Simulation`
-    """
-    if seed is not None:
-        scenario = msgspec.structs.replace(scenario, seed=seed)
-    seconds = scenario.seconds if seconds is None else seconds
-    scenario = msgspec.structs.replace(scenario, seconds=seconds)
-    return run_to_end(Simulation(scenario, faults=faults, trace=trace, record_to=record_to))
 
 
 def run_to_end(

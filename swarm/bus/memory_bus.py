@@ -285,19 +285,6 @@ class LinkModel(Protocol):
         ...
 
 
-class PerfectLinks:
-    """Every message arrives once, after the same short time."""
-
-    def __init__(self, delay_ns: int = 200_000) -> None:
-        self._delays = (delay_ns,)
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
-        return self._delays
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        return True
-
-
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
 _AT_ONCE = (0,)

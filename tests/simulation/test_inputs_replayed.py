@@ -15,12 +15,12 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.simulated import simulate
 from typer.testing import CliRunner
 
 from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import keep, recordings_of, replay_run
-from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_all_examples, write_example
+from support.simulated import simulate
 
 from launch_scripts.simulation.many_seeds import try_seed
-from launch_scripts.simulation.simulate import Simulation, simulate
+from launch_scripts.simulation.simulate import Simulation
 from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.wire.messages.processes import Note

@@ -8,16 +8,16 @@ import subprocess
 import sys
 
 import pytest
+from support.simulated import simulate
 
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.worlds import SMALL, seeded
 
 RUN = """
 import json, sys
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.worlds import SMALL
-from launch_scripts.simulation.simulate import simulate
+from support.simulated import simulate
 with open(sys.argv[1], "w") as trace:
     seed = int(sys.argv[2])
     result = simulate(SMALL, seed, 12, random_plan(SMALL, seed, 12), trace)

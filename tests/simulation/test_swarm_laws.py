@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from support.simulated import agents, cells
+from support.simulated import agents, cells, simulate
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.simulate import Simulation, simulate
+from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL, seeded
 
 SECONDS = 24.0

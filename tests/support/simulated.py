@@ -5,14 +5,15 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, TextIO
 
 from msgspec.structs import replace
 
 from launch_scripts.process_table import planner_spec, spec_of
-from launch_scripts.simulation.faults import OBSERVER
+from launch_scripts.simulation.faults import OBSERVER, FaultPlan
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulate import Simulation, SimulationResult, run_to_end
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
@@ -25,6 +26,27 @@ from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, Zo
 from swarm.wire.topics import GIVE_ORDER, SEND_VEHICLE, ZONES
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
+
+
+def simulate(
+    scenario: Scenario,
+    seed: int | None = None,
+    seconds: float | None = None,
+    faults: FaultPlan | None = None,
+    trace: TextIO | None = None,
+    record_to: Path | None = None,
+) -> SimulationResult:
+    """Runs a scenario to its end.
+
+    seed      instead of the scenario's own
+    trace     where the event log is written
+    record_to as of `Simulation`
+    """
+    if seed is not None:
+        scenario = replace(scenario, seed=seed)
+    seconds = scenario.seconds if seconds is None else seconds
+    scenario = replace(scenario, seconds=seconds)
+    return run_to_end(Simulation(scenario, faults=faults, trace=trace, record_to=record_to))
 
 
 def agents(simulation: Simulation) -> dict[str, AgentService]:

@@ -15,7 +15,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Event, Post
-from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks
+from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
@@ -27,6 +27,20 @@ from swarm.wire.topics import Topic
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = NS_PER_S // 10
+
+
+class PerfectLinks:
+    """Every message arrives once, after the same short time."""
+
+    def __init__(self, delay_ns: int = 200_000) -> None:
+        self._delays = (delay_ns,)
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        return self._delays
+
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        return True
+
 
 S = TypeVar("S", bound=Service)
 

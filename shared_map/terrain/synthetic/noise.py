@@ -57,7 +57,7 @@ class Noise:
         return field
 
 
-def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
+def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float) -> Noise:
     """Smooth noise of many scales.
 
     Parameters
@@ -68,19 +68,19 @@ def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: floa
         Cells; at least 1 each.
     coarsest : float
         Cells across the broadest hills. Below 2 there is no noise: all is 0.
-    ridged : bool
-        Whether crests are sharp and valleys broad.
 
     Returns
     -------
     Noise, within -1..1
     """
-    return _octaves(_ValueLattice, 0.5, rng, rows, cols, coarsest, ridged)
+    return _octaves(_ValueLattice, 0.5, rng, rows, cols, coarsest, ridged=False)
 
 
 def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
     """Like `fractal_noise`, from gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the
     work.
+
+    ridged  crests are sharp and valleys broad
 
     Values are roughly within -1..1.
     """

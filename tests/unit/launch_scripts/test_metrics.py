@@ -16,12 +16,13 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
 from support.makers import planner_status, run_info, stats
+from support.swarm_model import PerfectLinks
 
 from launch_scripts import web
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
-from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.errors import BusError

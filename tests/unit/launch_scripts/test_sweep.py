@@ -14,11 +14,12 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.simulated import simulate
 from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
 from launch_scripts.simulation.laws import BrokenLaw
-from launch_scripts.simulation.simulate import Simulation, simulate
+from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.study import summary as statistics
 from launch_scripts.simulation.study.study import (
     combinations,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -81,9 +82,9 @@ def test_a_hidden_zone_is_painted_on_the_truth_only(terrain: Terrain) -> None:
     assert np.isfinite(terrain.pace_s_per_m[10:20, 10:20]).any()
 
 
-@pytest.mark.parametrize("noise", [fractal_noise, mountain_noise])
+@pytest.mark.parametrize("noise", [fractal_noise, partial(mountain_noise, ridged=True)])
 def test_a_part_of_noise_is_that_part_of_the_whole(noise: Callable[..., Noise]) -> None:
-    made = noise(np.random.default_rng(3), 300, 211, 70.0, ridged=True)
+    made = noise(np.random.default_rng(3), 300, 211, 70.0)
     whole = made.whole()
     for row0, row1, col0, col1 in ((0, 300, 0, 211), (17, 18, 3, 200), (128, 300, 210, 211)):
         np.testing.assert_array_equal(made.part(row0, row1, col0, col1), whole[row0:row1, col0:col1])

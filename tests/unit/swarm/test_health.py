@@ -15,9 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.makers import run_info
+from support.swarm_model import PerfectLinks
 
 from swarm.bus.bus import AskEnded, Event, LinkChanged
-from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import ManualClock, MonotonicClock
 from swarm.runtime import health as health_module

@@ -9,12 +9,11 @@ from support.bus_behaviour import *  # noqa: F403
 from support.bus_world import Box, answering, asked, note, pose
 from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
-from support.swarm_model import START_NS, SwarmModel
+from support.swarm_model import START_NS, PerfectLinks, SwarmModel
 from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
-from swarm.bus.memory_bus import PerfectLinks
 from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.liveness import Peer
