@@ -19,6 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
@@ -167,13 +168,11 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
     expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
     with path.open("rb") as file:
         lines, void = _skip_header(file, dataset.driver, what)
-        count, rest, last = 0, b"", False
-        while not last:
-            piece = file.read(_TEXT_PIECE_BYTES)
-            last = not piece
-            end = len(piece) if last else max(piece.rfind(space) for space in (b"\n", b" ", b"\t", b"\r")) + 1
-            text, rest = (rest + piece[:end], piece[end:]) if end or last else (b"", rest + piece)
+        count, rest = 0, b""
+        for piece in itertools.chain(iter(partial(file.read, _TEXT_PIECE_BYTES), b""), (b"\n",)):
+            text = rest + piece
             words = text.replace(b",", b".").split()
+            rest = words.pop() if words and not text[-1:].isspace() else b""
             fits = words[: numbers.size - count]
             try:
                 numbers[count : count + len(fits)] = np.array(
@@ -188,21 +187,17 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
                 line = lines + text.count(b"\n", 0, at)
                 raise TerrainError(f"{what}, line {line}: found {shown!r}; {expected}")
             count += len(fits)
-            lines += text.count(b"\n")
+            lines += piece.count(b"\n")
     if count < numbers.size:
         raise TerrainError(f"{what} has {count} numbers; {expected}")
     whole = bool((np.abs(numbers) < 2**24).all() and (numbers == np.rint(numbers)).all())
     nodata = math.nan if void is not None and not _is_number(void) else dataset.nodata
     grid = numbers.reshape(dataset.height, dataset.width)
     grid = grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
-    is_beyond = whole and not abs(nodata or 0.0) < 2**24
-    return (grid.astype(np.int32) if whole else grid), None if is_beyond else _as_stored(nodata)
-
-
-def _as_stored(nodata: float | None) -> float | None:
-    """A value of no height as float32 has it: one beyond its range is read as infinite."""
-    with np.errstate(over="ignore"):
-        return None if nodata is None else float(np.float32(nodata))
+    stated = None if nodata is None or (whole and not abs(nodata) < 2**24) else nodata
+    with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
+        stored = None if stated is None else float(np.float32(stated))
+    return (grid.astype(np.int32) if whole else grid), stored
 
 
 def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:

@@ -154,7 +154,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
             unclosed = np.flatnonzero(shapely.is_missing(geometries))
             geometries[unclosed] = shapely.from_wkb(stored[unclosed], on_invalid="fix")
         columns_read = dict(zip(map(str, meta["fields"]), fields, strict=True))
-        shapes, of = _parts(geometries)
+        shapes, of = parts_of(geometries)
         bad: dict[int, str] = {int(n): "it has no shape" for n in np.flatnonzero(shapely.is_missing(geometries))}
         bad |= {int(n): "it, or a part of it, has no corners" for n in of[shapely.is_empty(shapes)]}
         corners, at = shapely.get_coordinates(shapes, return_index=True)
@@ -176,7 +176,7 @@ def unusable(what: str, id: str, why: str) -> TerrainError:
     return TerrainError(f"{what}: feature {id} cannot be used: {why}; repair or remove it")
 
 
-def _parts(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, empty ones too, and of which each is a part."""
     import shapely
 

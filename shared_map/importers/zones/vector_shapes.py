@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
-from shared_map.importers.zones.vector_files import Features, Layer, unusable
+from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -277,16 +277,12 @@ def _jumps(geometry: Any) -> bool:
 
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Points, lines and polygons that geometries consist of, and of which each is a part."""
+    """Points, lines and polygons that geometries consist of, without empty ones, and of which each is a part."""
     import shapely
 
-    of = np.arange(len(geometries))
-    parts = geometries
-    while len(parts) and (shapely.get_type_id(parts) > _POLYGONS).any():
-        parts, index = shapely.get_parts(parts, return_index=True)
-        of = of[index]
-    kept = ~(shapely.is_missing(parts) | shapely.is_empty(parts)) if len(parts) else np.zeros(0, np.bool_)
-    return np.asarray(parts, object)[kept], of[kept]
+    parts, of = parts_of(geometries)
+    kept = ~shapely.is_empty(parts)
+    return parts[kept], of[kept]
 
 
 def _mended(
