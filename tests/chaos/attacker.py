@@ -13,7 +13,9 @@ import zenoh
 
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
-from swarm.wire.topics import FLEET
+from swarm.errors import ProtocolError
+from swarm.wire.codec import decode
+from swarm.wire.topics import FLEET, POSE
 
 _WAITING = 10_000
 """Most reports that wait to be looked at; the oldest are dropped."""
@@ -31,7 +33,12 @@ class Attacker:
         self._last: dict[str, Any] = {}
         """Key -> the last sample under it."""
         self._namespace = network.namespace
-        self._fleets = self._subscribe(FLEET.expression(network.namespace), self._hear_fleet)
+        self._captures: dict[str, int] = {}
+        """Target -> how often it was captured, by its last pose."""
+        self._heard = (
+            self._subscribe(FLEET.expression(network.namespace), self._hear_fleet),
+            self._subscribe(POSE.expression(network.namespace), self._hear_pose),
+        )
 
     def _subscribe(self, key: str, hear: Callable[[Any], None]) -> Any:
         return self._bus.session.declare_subscriber(key, hear, allowed_origin=zenoh.Locality.REMOTE)
@@ -39,6 +46,15 @@ class Attacker:
     def _hear_fleet(self, sample: Any) -> None:
         self._waiting.append(sample.payload.to_bytes())
         self._there.set()
+
+    def _hear_pose(self, sample: Any) -> None:
+        with contextlib.suppress(ProtocolError):
+            pose = decode(sample.payload.to_bytes(), POSE.message)
+            self._captures[pose.target] = pose.captures  # type: ignore[attr-defined]
+
+    def captures(self) -> int:
+        """Captures of all targets until now."""
+        return sum(self._captures.values())
 
     def _hear(self, sample: Any) -> None:
         key = str(sample.key_expr)
@@ -69,5 +85,6 @@ class Attacker:
         self._bus.session.put(key, payload, congestion_control=dropping, attachment=code)
 
     def close(self) -> None:
-        self._fleets.undeclare()
+        for ear in self._heard:
+            ear.undeclare()
         self._bus.close()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import msgspec
@@ -13,6 +14,7 @@ from chaos.fault_schedule import CALM
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
+LAUNCHER = "launcher"
 GROWTH_LIMIT = 0.05
 """Memory, threads and files may grow by this share once a run has settled."""
 SETTLED_S = 600.0
@@ -55,12 +57,19 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """Resource use of all processes at one time, when none was missing."""
+    """Resource use at one time, when no process was missing.
+
+    rss_mb    memory by process; threads and open files of all together
+    disk_mb   size of the run's folder
+    captures  of all targets until then
+    """
 
     at_s: float
-    rss_mb: float
+    rss_mb: dict[str, float]
     threads: int
     files: int
+    disk_mb: float = 0.0
+    captures: int = 0
 
 
 class Results(msgspec.Struct, kw_only=True):
@@ -69,6 +78,7 @@ class Results(msgspec.Struct, kw_only=True):
     scenario: str
     seed: int
     within_s: float
+    spared: tuple[str, ...] = (LAUNCHER,)
     seconds: float = 0.0
     outcomes: list[Outcome] = []
     ended: list[Ended] = []
@@ -100,20 +110,39 @@ class Results(msgspec.Struct, kw_only=True):
         return found
 
     def growth(self) -> dict[str, float | None]:
-        """By which share memory, threads and files grew: the last fifth of the run over the fifth after it had
-        settled. None without samples of both."""
+        """By which share memory of the launcher and of each spared process, threads and files grew: the last fifth
+        of the run over the fifth after it had settled. None without samples of both."""
         settled_s = SETTLED_S if self.seconds >= LONG_S else self.seconds / 3
         fifth_s = (self.seconds - settled_s) / 5
         first = [each for each in self.samples if settled_s <= each.at_s < settled_s + fifth_s]
         last = [each for each in self.samples if each.at_s >= self.seconds - fifth_s]
-        growth: dict[str, float | None] = {}
-        for what in ("rss_mb", "threads", "files"):
+
+        def grew(value: Callable[[Sample], float]) -> float | None:
             if not first or not last:
-                growth[what] = None
-                continue
-            before = statistics.median(getattr(each, what) for each in first)
-            growth[what] = statistics.median(getattr(each, what) for each in last) / before - 1
-        return growth
+                return None
+            return statistics.median(map(value, last)) / statistics.median(map(value, first)) - 1
+
+        memory = {f"rss_mb of {name}": grew(lambda each, name=name: each.rss_mb[name]) for name in self.spared}  # type: ignore[misc]
+        return {**memory, "threads": grew(lambda each: each.threads), "files": grew(lambda each: each.files)}
+
+    def minutes(self) -> list[dict[str, Any]]:
+        """A row per minute: memory by role, and the rest of its last sample."""
+        rows = []
+        for minute, some in groupby(self.samples, lambda each: int(each.at_s / 60)):
+            *_, last = some
+            roles = {name: name.partition("-")[0] for name in last.rss_mb}
+            memory = {f"{role}_mb": 0.0 for role in sorted({*roles.values()})}
+            for name, rss_mb in last.rss_mb.items():
+                memory[f"{roles[name]}_mb"] += rss_mb
+            struck = sum(each.kind != CALM and each.at_s < last.at_s for each in self.outcomes)
+            rest = {
+                "threads": last.threads,
+                "files": last.files,
+                "disk_mb": last.disk_mb,
+                "captures": last.captures,
+            }
+            rows.append({"minute": minute, **memory, **rest, "faults": struck})
+        return rows
 
     def rows(self) -> list[dict[str, Any]]:
         """Per kind of fault: how many, and seconds until all had recovered."""
@@ -139,7 +168,13 @@ class Results(msgspec.Struct, kw_only=True):
     def report(self) -> dict[str, Any]:
         """All of it, for chaos.json."""
         fields = msgspec.to_builtins(self)
-        return {**fields, "rows": self.rows(), "growth": self.growth(), "broken": self.broken()}
+        return {
+            **fields,
+            "rows": self.rows(),
+            "minutes": self.minutes(),
+            "growth": self.growth(),
+            "broken": self.broken(),
+        }
 
 
 def name_of(outcome: Outcome) -> str:

@@ -21,7 +21,7 @@ from support.up_process import UpProcess
 from chaos.attacker import Attacker
 from chaos.fault_schedule import FAULTS, Fault, faults
 from chaos.hostile import Hostile
-from chaos.results import Ended, Outcome, Recovery, Results, Sample, name_of
+from chaos.results import LAUNCHER, Ended, Outcome, Recovery, Results, Sample, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
@@ -41,7 +41,7 @@ _SETTLE_S = 5.0
 _WATCH_S = 30.0
 """A fault that has not recovered by then never does."""
 _SCAN_S = 0.2
-_SAMPLE_S = 1.0
+_SAMPLE_S = 5.0
 _AT_ONCE = 100
 """Hostile messages between two checks of the received messages."""
 _MATERIAL_S = 1.0
@@ -61,6 +61,7 @@ class Options:
     every_s   from one fault to the next, at least
     kinds     which faults
     within_s  a fault from which the swarm recovers later breaks a law
+    spared    processes that nothing falls on: what they keep over the whole run shows
     """
 
     scenario: str
@@ -70,6 +71,7 @@ class Options:
     every_s: float
     kinds: tuple[str, ...]
     within_s: float
+    spared: tuple[str, ...]
     runs: Path
 
 
@@ -89,6 +91,9 @@ def chaos(
     within: Annotated[
         float, typer.Option(min=0.1, help="Recovering later than so many seconds breaks a law.")
     ] = 10.0,
+    spare: Annotated[
+        list[str] | None, typer.Option(help="Not this process, such as monitor-0: shows whether it grows.")
+    ] = None,
     seed: Seed = 1,
     runs: Annotated[Path, typer.Option(help="Folder of the folder for logs and chaos.json.")] = Path("runs"),
 ) -> dict[str, Any]:
@@ -96,7 +101,7 @@ def chaos(
 
     \b
     ./launch_scripts/bench chaos --seconds 60
-    ./launch_scripts/bench chaos --blow kill --every 10 --seconds 3600
+    ./launch_scripts/bench chaos --blow kill --every 45 --spare monitor-0 --seconds 3600
     ./launch_scripts/bench chaos --blow messages --messages 1000000
 
     Processes are killed (kill -9 of one or two) or stopped for a while, and messages are said with flipped bits,
@@ -115,6 +120,7 @@ def chaos(
         every_s=every,
         kinds=tuple(blow or FAULTS),
         within_s=within,
+        spared=tuple(spare or ()),
         runs=runs,
     )
     run = ChaosRun(options)
@@ -131,7 +137,7 @@ def chaos(
     except OSError as error:
         raise StoreError(f"cannot write {run.run_dir / 'chaos.json'}: {error.strerror or error}") from error
     del report["samples"]
-    shown = {name: report[name] for name in ("rows", "seconds", "messages", "growth")}
+    shown = {name: report[name] for name in ("rows", "minutes", "seconds", "messages", "growth")}
     notes = [f"broken: {sentence}" for sentence in report["broken"]]
     return {**report, "interrupted": interrupted, "shown": shown, "notes": notes}
 
@@ -150,14 +156,23 @@ class ChaosRun:
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]
+        if unknown := set(options.spared) - set(self._names):
+            raise ConfigError(f"--spare: no {min(unknown)!r}; there are {', '.join(self._names)}")
+        self._struck = [name for name in self._names if name not in options.spared]
         names = (*NAMES, *scenario.target_ids, *(plan.id for plan in plan_agents(scenario)), *vehicles)
         classes = [each.name for each in scenario.classes]
         fuzzer = MessageFuzzer(terrain.grid, options.seed, tuple(dict.fromkeys(names)), classes)
         namespace = scenario.network.namespace
         self._hostile = Hostile(namespace, fuzzer, options.seed)
         self.run_dir = make_run_dir(options.runs, f"chaos-{time.strftime('%Y%m%d-%H%M%S')}-{options.seed}")
-        self.results = Results(scenario=options.scenario, seed=options.seed, within_s=options.within_s)
+        self.results = Results(
+            scenario=options.scenario,
+            seed=options.seed,
+            within_s=options.within_s,
+            spared=(LAUNCHER, *options.spared),
+        )
         self._began_s = time.monotonic()
+        self._launcher_pid = 0
         self._pids: dict[str, int] = {}
         self._killed: set[int] = set()
         self._stopped: set[int] = set()
@@ -189,7 +204,8 @@ class ChaosRun:
         """`swarm up`; ends it, and all that it started."""
         port = self._scenario.network.connect[0].rpartition(":")[2]
         limit_s = (self._options.seconds or _LONGEST_S) + _MARGIN_S
-        launcher = UpProcess(self._options.scenario, self.run_dir, limit_s, "--port", port, "--no-live")
+        launcher = UpProcess(self._options.scenario, self.run_dir, limit_s, "--port", port)
+        self._launcher_pid = launcher.process.pid
         try:
             yield launcher
         finally:
@@ -223,7 +239,7 @@ class ChaosRun:
 
     def _strike_all(self, launcher: UpProcess, attacker: Attacker) -> None:
         options = self._options
-        for number, fault in enumerate(faults(options.seed, self._names, options.kinds, options.every_s / 2)):
+        for number, fault in enumerate(faults(options.seed, self._struck, options.kinds, options.every_s / 2)):
             if self._finished():
                 return
             if (code := launcher.process.poll()) is not None:
@@ -328,7 +344,7 @@ class ChaosRun:
                 self._scan()
             if now_s >= self._sample_due_s:
                 self._sample_due_s = now_s + _SAMPLE_S
-                self._sample()
+                self._sample(attacker)
             if now_s >= until_s:
                 return
 
@@ -364,15 +380,18 @@ class ChaosRun:
             return next((line[:300] for line in reversed(lines) if line.startswith(f"{name}: ")), "without a word")
         return "without a word"
 
-    def _sample(self) -> None:
-        some = [used for pid in self._pids.values() if (used := usage(pid)) is not None]
-        if len(some) == len(self._names):
+    def _sample(self, attacker: Attacker) -> None:
+        pids = {LAUNCHER: self._launcher_pid, **self._pids}
+        used = {name: each for name, pid in pids.items() if (each := usage(pid)) is not None}
+        if len(used) > len(self._names):
             self.results.samples.append(
                 Sample(
                     at_s=self._now_s,
-                    rss_mb=sum(each.rss_bytes for each in some) / 1e6,
-                    threads=sum(each.threads for each in some),
-                    files=sum(each.files for each in some),
+                    rss_mb={name: each.rss_bytes / 1e6 for name, each in used.items()},
+                    threads=sum(each.threads for each in used.values()),
+                    files=sum(each.files for each in used.values()),
+                    disk_mb=sum(each.stat().st_size for each in self.run_dir.rglob("*") if each.is_file()) / 1e6,
+                    captures=attacker.captures(),
                 )
             )
 

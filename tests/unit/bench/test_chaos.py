@@ -85,7 +85,8 @@ def outcome(kind: str = "kill", routed_s: float | None = 1.0, moving_s: float | 
 
 def samples(seconds: float, grows: float) -> list[Sample]:
     times = range(int(seconds))
-    return [Sample(at_s=float(t), rss_mb=100 * (1 + grows * t / seconds), threads=50, files=90) for t in times]
+    memory = [{"launcher": 100 * (1 + grows * t / seconds), "agent-a0": 20.0, "agent-a1": 30.0} for t in times]
+    return [Sample(at_s=float(t), rss_mb=memory[t], threads=50, files=90) for t in times]
 
 
 def test_a_run_in_which_all_recovers_breaks_no_law() -> None:
@@ -111,7 +112,13 @@ def test_each_law_of_a_run_can_break(fields: dict[str, object], says: str) -> No
 
 def test_growth_is_held_against_long_runs_only() -> None:
     grown = results(3600.0, samples=samples(3600, 0.5))
-    assert [sentence.split()[0] for sentence in grown.broken()] == ["rss_mb"]
+    assert [sentence.partition(" grew")[0] for sentence in grown.broken()] == ["rss_mb of launcher"]
     assert results(3600.0, samples=samples(3600, 0.02)).broken() == []
     assert results(100.0, samples=samples(100, 0.5)).broken() == []
-    assert results().growth() == {"rss_mb": None, "threads": None, "files": None}
+    assert results().growth() == {"rss_mb of launcher": None, "threads": None, "files": None}
+
+
+def test_a_minute_shows_the_memory_of_each_role_and_the_faults_until_then() -> None:
+    first, second = results(120.0, samples=samples(120, 0.0), outcomes=[outcome(CALM), outcome()]).minutes()
+    assert (first["minute"], first["launcher_mb"], first["agent_mb"], first["faults"]) == (0, 100.0, 50.0, 1)
+    assert second["minute"] == 1
