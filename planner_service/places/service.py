@@ -1,6 +1,6 @@
 """The shell of `places`: routes between any two cells of the map, for groups that share their marks.
 
-A place is a goal without a process of its own: its tree is grown as far as somebody asks and is kept for the next
+A place is a goal without a process of its own: its tree is grown as far as its askers are and is kept for the next
 (`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
 changes, and the asker that has paid least is next. Nothing here must outlive the process: the one that takes over
 grows again when asked.
@@ -48,7 +48,7 @@ from swarm.wire.topics import PLACE_ROUTE, asker_of, is_own
 log = logging.getLogger(__name__)
 
 TREES_BYTES = 256 << 20
-"""What the trees of all classes that are kept may take, besides one in hand of each class."""
+"""Room for the trees that are kept, of all classes together, besides one in hand of each class."""
 SLICE_CELLS = 1 << 16
 """Cells that are grown before others have their turn: 1 to 4 ms."""
 _MOST_WAITING, _MOST_EACH = 4096, 256
