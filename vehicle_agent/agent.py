@@ -37,8 +37,7 @@ from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
-"""A vehicle waits behind others that do not go on for the time of so many cells, or so many seconds if that is
-more."""
+"""Longest wait behind vehicles that do not go on: in times of a cell, and in seconds; the longer counts."""
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
