@@ -39,6 +39,11 @@ TIMEOUT_PARAMETER = "timeout_s"
 """Parameter of a query on the wire: how many seconds its asker waits."""
 USUAL_TIMEOUT_S = 10.0
 """Timeout (s) of a query without that parameter: the default of Zenoh's own `get`."""
+QUESTION_BYTES = 8 << 20
+"""Bytes of all queries that wait in a process: more than it decodes in half a second. Those that come then are
+refused, or end without an answer."""
+QUESTION_COST_BYTES = 1 << 10
+"""Cost of a query beside its request, in memory and work, as bytes of a request."""
 LONGEST_TIMEOUT_S = 60.0
 """A query is taken to wait no longer, whatever it says."""
 
@@ -71,8 +76,11 @@ class Question:
     answerer: Answerer
     asker: str
     """Name of the asker, as its key says; "" if the key names none."""
-    size: int
-    """Bytes of the request, if it is not decoded yet."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request, as it came."""
+        return self.answerer.size
 
     @property
     def timeout_s(self) -> float:
@@ -110,7 +118,6 @@ class Asked(Question):
     fields: Mapping[str, str]
     request: Message
     answerer: Answerer
-    size = 0
 
     @property
     def asker(self) -> str:  # type: ignore[override]
@@ -134,7 +141,6 @@ class Undecoded(Question):
     answerer: Answerer
     decoded: Callable[[], Asked | None]
     asker: str = ""
-    size: int = 0
 
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,129}")
@@ -217,6 +223,9 @@ class Answerer(Protocol):
 
     @property
     def timeout_s(self) -> float: ...
+
+    @property
+    def size(self) -> int: ...
 
     def waited_s(self) -> float: ...
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None: ...

@@ -108,6 +108,10 @@ class MemoryAnswerer:
     def timeout_s(self) -> float:
         return self.asking.timeout_s
 
+    @property
+    def size(self) -> int:
+        return len(self.asking.asked)
+
     def waited_s(self) -> float:
         return (self.queryable.bus.network.scheduler.clock.now_ns() - self.arrived_ns) / NS_PER_S
 

@@ -22,6 +22,8 @@ import zenoh
 
 from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
+    QUESTION_BYTES,
+    QUESTION_COST_BYTES,
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
     Appeared,
@@ -142,8 +144,6 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_QUERY_BUFFER = 4096
-"""Queries that wait to be read, per queryable. One that comes then ends without an answer."""
 _TOKEN_BUFFER = 65_536
 """Changes of tokens, or of links, that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
@@ -333,19 +333,26 @@ class ZenohBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
 
-        def arrive(query: zenoh.Query) -> None:
+        arrivals = Arrivals(QUESTION_BYTES, lambda answerer: QUESTION_COST_BYTES + answerer.size)
+
+        def enter(query: zenoh.Query) -> None:
             answerer = ZenohAnswerer(self, topic, concrete, query)
             if not self.intake.concerns(query):
                 answerer.end()
+            elif answerer.size > topic.ask_bytes:
+                answerer.decoded()  # which rejects it
             elif undecoded:
                 asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
-                post(Undecoded(topic, answerer, answerer.decoded, asker, answerer.size))
-            elif (asked := answerer.decoded()) is not None:
+                post(Undecoded(topic, answerer, answerer.decoded, asker))
+            elif not arrivals.put(answerer):
+                answerer.end()
+
+        def arrive(answerer: ZenohAnswerer) -> None:
+            if (asked := answerer.decoded()) is not None:
                 post(asked)
 
         expression = self._pattern(topic, fields)
-        arrivals = Arrivals(_QUERY_BUFFER)
-        into = zenoh.handlers.Callback(guarded(arrive), indirect=False) if undecoded else _into(arrivals)
+        into = zenoh.handlers.Callback(guarded(enter), arrivals.end, indirect=False)
         queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
         if undecoded:

@@ -51,17 +51,28 @@ class Arrivals:
     comes. Zenoh's own thread needs the interpreter's lock to leave an item here, which suits rare items only:
     frequent samples belong into a channel.
 
-    most  items that wait; those that come then are dropped
+    most    weight of the items that wait; those that come then are dropped
+    weight  of an item
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, weight: Callable[[Any], int] = lambda item: 1) -> None:
         self._items: SimpleQueue[Any] = SimpleQueue()
         """Received items; None ends the queue."""
-        self._most = most
+        self._most, self._weight = most, weight
+        self._waiting = 0
+        """Weight of those items."""
+        self._lock = threading.Lock()
+        """Held to change it: several of Zenoh's threads put."""
 
-    def put(self, item: Any) -> None:
-        if self._items.qsize() < self._most:
+    def put(self, item: Any) -> bool:
+        """Adds an item; returns False if it is dropped."""
+        weight = self._weight(item)
+        with self._lock:
+            fits = self._waiting + weight <= self._most
+            self._waiting += weight if fits else 0
+        if fits:
             self._items.put(item)
+        return fits
 
     def end(self) -> None:
         """The entity is undeclared."""
@@ -69,7 +80,11 @@ class Arrivals:
 
     def take(self) -> Any:
         """The next item, once there is one; None after the last."""
-        return self._items.get()
+        item = self._items.get()
+        if item is not None:
+            with self._lock:
+                self._waiting -= self._weight(item)
+        return item
 
 
 def waiting_in(channel: Any) -> list[Any]:

@@ -205,6 +205,10 @@ class BoundaryAnswerer:
     def timeout_s(self) -> float:
         return self._answerer.timeout_s
 
+    @property
+    def size(self) -> int:
+        return self._answerer.size
+
     def waited_s(self) -> float:
         return self._crossing.read_as(f"waited for {self._number}", self._answerer.waited_s, float)
 

@@ -10,17 +10,22 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+_IDLE = 1024
+"""Senders without items that are remembered at least."""
+
 
 @dataclass(slots=True, eq=False)
 class _Flow(Generic[T]):
     """The waiting items of one sender, with the number and the price of each.
 
     paid  sum of the prices of what was taken, since it first waited
+    held  sum of the prices of what waits
     """
 
     sender: str
     rank: int
     paid: int
+    held: int = 0
     items: deque[tuple[int, int, T]] = field(default_factory=deque)
 
 
@@ -32,8 +37,8 @@ class FairQueue(Generic[T]):
     each other sender at most, however many those have. An idle sender saves up nothing. Items of a lower rank come
     before all of a higher one.
 
-    most       limit of items in all: beyond it the oldest of the highest rank is dropped
-    most_each  limit of items of one sender: beyond it the sender's oldest is dropped
+    most       limit of all prices together: beyond it the oldest of the highest rank are dropped
+    most_each  limit of the prices of one sender: beyond it the sender's oldest are dropped
     """
 
     def __init__(self, most: int, most_each: int) -> None:
@@ -46,25 +51,29 @@ class FairQueue(Generic[T]):
         """Rank -> what the flow taken from last had paid: a new flow begins there."""
         self._order: dict[int, OrderedDict[int, _Flow[T]]] = {}
         """Rank -> number of each item, in order of arrival, and its flow."""
+        self._held = 0
+        """Sum of the prices of all items."""
         self._next = 0
 
     def __len__(self) -> int:
         return sum(map(len, self._order.values()))
 
-    def put(self, sender: str, item: T, *, price: int = 1, rank: int = 0) -> T | None:
-        """Adds an item. Returns the item that is dropped for it, if one is."""
+    def put(self, sender: str, item: T, *, price: int = 1, rank: int = 0) -> list[T]:
+        """Adds an item. Returns those which are dropped for it."""
         self._next += 1
         flow = self._flows.get(sender)
         if flow is None:
             flow = self._flows[sender] = _Flow(sender, rank, self._clock.get(rank, 0))
             self._await_turn(flow)
-        dropped = None
-        if len(flow.items) >= self._most_each:
-            dropped = self._drop(flow)
         flow.items.append((self._next, price, item))
+        flow.held += price
+        self._held += price
         self._order.setdefault(flow.rank, OrderedDict())[self._next] = flow
-        if len(self) > self._most:
-            dropped = self._drop(self._first(max(rank for rank, order in self._order.items() if order)))
+        dropped = []
+        while flow.held > self._most_each:
+            dropped.append(self._drop(flow))
+        while self._held > self._most:
+            dropped.append(self._drop(self._first(max(rank for rank, order in self._order.items() if order))))
         return dropped
 
     def oldest(self) -> T | None:
@@ -90,6 +99,8 @@ class FairQueue(Generic[T]):
                 continue
             number, price, item = flow.items.pop() if newest(flow.items[0][2]) else flow.items.popleft()
             del self._order[rank][number]
+            flow.held -= price
+            self._held -= price
             self._clock[rank] = paid
             flow.paid = paid + price
             self._await_turn(flow)
@@ -102,7 +113,7 @@ class FairQueue(Generic[T]):
     def _await_turn(self, flow: _Flow[T]) -> None:
         self._next += 1
         heappush(self._turns, (flow.rank, flow.paid, self._next, flow))
-        if len(self._turns) > 2 * self._most:  # senders with ever new names, which have nothing more to say
+        if len(self._turns) > 2 * len(self) + _IDLE:  # senders with ever new names, which have nothing more to say
             self._turns = [turn for turn in self._turns if turn[3].items or turn[3] is flow]
             heapify(self._turns)
             self._flows = {turn[3].sender: turn[3] for turn in self._turns}
@@ -115,6 +126,8 @@ class FairQueue(Generic[T]):
         return min(firsts, key=lambda first: first[0])[1] if firsts else None
 
     def _drop(self, flow: _Flow[T]) -> T:
-        number, _, item = flow.items.popleft()
+        number, price, item = flow.items.popleft()
         del self._order[flow.rank][number]
+        flow.held -= price
+        self._held -= price
         return item

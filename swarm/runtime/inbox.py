@@ -6,16 +6,23 @@ import threading
 from collections import OrderedDict
 from collections.abc import Hashable
 
-from swarm.bus.bus import Asked, Event, Heard, HeardMany, Question, Undecoded
+from swarm.bus.bus import (
+    QUESTION_BYTES,
+    QUESTION_COST_BYTES,
+    Asked,
+    Event,
+    Heard,
+    HeardMany,
+    Question,
+    Undecoded,
+)
 from swarm.runtime.fair_queue import FairQueue
 from swarm.wire.topics import is_own
 
 CAPACITY = 4096
-"""Unread samples per topic, or questions: more than a process gets in a second. Beyond it the oldest goes."""
-PER_ASKER = CAPACITY // 4
-"""Unread questions per asker, or per topic where the key names no asker."""
-_BASE_PRICE = 64
-"""Price of a question without content, in bytes."""
+"""Unread samples per topic: more than a process gets in a second. Beyond it the oldest goes."""
+PER_ASKER_BYTES = QUESTION_BYTES // 4
+"""Bytes of unread questions per asker, or per topic where the key names no asker."""
 LATE_S = 0.5
 """Once the oldest question of an asker has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""
@@ -38,9 +45,9 @@ class Inbox:
 
     Samples    `CAPACITY` per topic, then the oldest goes. On topics whose samples each carry the whole state of
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
-    Questions  `CAPACITY` in all, and a quarter of that per asker, then the oldest is refused. One whose asker has
-               left is refused, too. One that is `Undecoded` is decoded in its turn. Askers take turns, and pay by
-               bytes; on a costly topic agents come before others, and askers without a name share one turn.
+    Questions  `QUESTION_BYTES` in all, and a quarter of that per asker, then the oldest is refused. One whose asker
+               has left is refused, too. One that is `Undecoded` is decoded in its turn. Askers take turns and pay
+               by bytes; on a costly topic agents come before others, and askers without a name share one turn.
     Batches    (`HeardMany`) are bounded by blocking their poster.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
@@ -66,7 +73,7 @@ class Inbox:
         """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
         """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
-        self._asked: FairQueue[tuple[int, Question]] = FairQueue(CAPACITY, PER_ASKER)
+        self._asked: FairQueue[tuple[int, Question]] = FairQueue(QUESTION_BYTES, PER_ASKER_BYTES)
         """Unread questions. The queue `_ASKED` stands for them in the order of turns, and is empty."""
         self._unread = 0
         """Events in all queues."""
@@ -88,8 +95,7 @@ class Inbox:
             newest = tuple(event.fields.values()) if event.topic.newest else None
             self._put(event, event.topic.name, newest)
         elif isinstance(event, Question):
-            dropped = self._put_question(event)
-            if dropped is not None:
+            for dropped in self._put_question(event):
                 _refuse(dropped, f"too many questions wait{f' of {dropped.asker}' if dropped.asker else ''}")
         elif isinstance(event, HeardMany):
             with self._lock:
@@ -135,22 +141,20 @@ class Inbox:
             self._ring()
         return dropped
 
-    def _put_question(self, question: Question) -> Question | None:
-        """Adds a question. Returns the one that has to go for it."""
+    def _put_question(self, question: Question) -> list[Question]:
+        """Adds a question. Returns those that have to go for it."""
         costly = question.topic.costly
         asker = question.asker or (_NAMELESS if costly else f"{_NAMELESS}{question.topic.name}")
         rank = 1 if costly and not is_own(asker) else 0
         with self._lock:
             self._next += 1
             self._queues.setdefault(_ASKED, OrderedDict())
-            price = _BASE_PRICE + question.size
+            price = QUESTION_COST_BYTES + question.size
             dropped = self._asked.put(asker, (self._next, question), price=price, rank=rank)
-            if dropped is None:
-                self._unread += 1
-            else:
-                self.counts["events_dropped"] += 1
+            self._unread += 1 - len(dropped)
+            self.counts["events_dropped"] += len(dropped)
             self._ring()
-        return None if dropped is None else dropped[1]
+        return [each for _, each in dropped]
 
     def take(self, timeout_s: float) -> Event | None:
         """The next event; None if there is none within the timeout, or if it is a question that is rejected. Raises

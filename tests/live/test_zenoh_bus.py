@@ -42,7 +42,7 @@ from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import GIVE_ORDER, NAMELESS_COST, NOTE, OBEYED, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import COST, GIVE_ORDER, NAMELESS_COST, NOTE, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
@@ -369,6 +369,19 @@ def test_a_router_passes_no_payload_which_is_longer_than_its_topic_allows(world)
     assert [len(each) for each in asked_of] == [ask]
     listening.undeclare()
     serving.undeclare()
+
+
+def test_a_question_longer_than_its_topic_allows_is_refused_before_it_waits(world):
+    bus, waiting = world.bus("a"), []
+    bus.serve(COST, waiting.append, undecoded=True, target="t0")
+    bus.serve(RUN, waiting.append, role="agent", id="a")
+    for topic, key in (
+        (COST, "swarm/target/t0/cost/agent.a"),
+        (RUN, "swarm/run/agent/a"),
+    ):  # without a router between
+        [reply] = bus.session.get(key, payload=bytes(topic.ask_bytes + 1), timeout=5.0)
+        assert f"payload of {topic.ask_bytes + 1:,} bytes" in reply.err.payload.to_string()
+    assert waiting == []
 
 
 class Deaf:

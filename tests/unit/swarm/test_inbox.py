@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from swarm.bus.bus import (
+    QUESTION_BYTES,
+    QUESTION_COST_BYTES,
     Appeared,
     Asked,
     AskEnded,
@@ -22,11 +27,15 @@ from swarm.bus.bus import (
     WorkDone,
 )
 from swarm.liveness import Peer
-from swarm.runtime.inbox import CAPACITY, PER_ASKER, Inbox
+from swarm.runtime.fair_queue import FairQueue
+from swarm.runtime.inbox import CAPACITY, PER_ASKER_BYTES, Inbox
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
 from swarm.wire.topics import COST, NAMELESS_ROUTE, NOTE, ROUTE, RUN, TRUE_POSE, Topic
+
+MOST = QUESTION_BYTES // QUESTION_COST_BYTES
+PER_ASKER = PER_ASKER_BYTES // QUESTION_COST_BYTES
 
 
 class Time:
@@ -50,7 +59,7 @@ class Asker:
     def __post_init__(self) -> None:
         self.asked_s = self.time.now_s
         self.question = Asked(self.topic, {"asker": self.name}, Nothing(), self)
-        self.undecoded = Undecoded(self.topic, self, self.decode, self.name, self.size)
+        self.undecoded = Undecoded(self.topic, self, self.decode, self.name)
 
     def decode(self) -> Asked | None:
         self.decoded += 1
@@ -332,7 +341,7 @@ def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
 # --- askers take turns --------------------------------------------------------------------------------------------
 
 
-def flooded(*askers: tuple[str, int], size: int = 450_000) -> tuple[Inbox, Time]:
+def flooded(*askers: tuple[str, int], size: int = 15_000) -> tuple[Inbox, Time]:
     """An inbox with expensive questions, a number of each asker."""
     inbox, clock = Inbox(), Time()
     for name, many in askers:
@@ -395,9 +404,9 @@ def test_a_full_queue_refuses_the_askers_own_question_and_then_the_oldest_strang
     for _ in range(PER_ASKER):
         inbox.post(Asker(clock, name="rover.q").undecoded)
     assert first.refusals == ["cost: too many questions wait of rover.q"]
-    for n in range(2 * CAPACITY):
+    for n in range(2 * MOST):
         inbox.post(Asker(clock, name=f"rover.x{n}").undecoded)
-    assert len(inbox) == CAPACITY
+    assert len(inbox) == MOST
     assert vehicle.refusals == []
     assert inbox.take(0) is vehicle.question
 
@@ -405,7 +414,40 @@ def test_a_full_queue_refuses_the_askers_own_question_and_then_the_oldest_strang
 def test_names_without_end_are_forgotten() -> None:
     inbox, clock = Inbox(), Time()
     inbox.post(Asker(clock, name="agent.a0").undecoded)
-    for n in range(3 * CAPACITY):
+    for n in range(3 * MOST):
         inbox.post(Asker(clock, name=f"agent.x{n}").undecoded)
         inbox.take(0)
-    assert len(inbox._asked._flows) <= 2 * CAPACITY
+    assert len(inbox._asked._flows) <= MOST
+
+
+@given(
+    st.lists(
+        st.none() | st.tuples(st.sampled_from("abcd"), st.integers(1, 60), st.integers(0, 1)),
+        min_size=10,
+        max_size=200,
+    )
+)
+def test_whatever_comes_what_waits_is_bounded_by_price_and_each_item_leaves_once(
+    steps: list[tuple[str, int, int] | None],
+) -> None:
+    """A step is a take, or an item with its sender, price and rank."""
+    queue: FairQueue[tuple[int, str, int]] = FairQueue(100, 40)
+    waiting: list[tuple[int, str, int]] = []
+    for number, step in enumerate(steps):
+        if step is None:
+            taken = queue.take()
+            assert (taken is None) == (not waiting)
+            left = [] if taken is None else [taken]
+        else:
+            sender, price, rank = step
+            waiting.append((number, f"{sender}{rank}", price))
+            left = queue.put(f"{sender}{rank}", waiting[-1], price=price, rank=rank)
+        for item in left:
+            waiting.remove(item)  # which raises if it had left before
+        held: Counter[str] = Counter()
+        for _, sender, price in waiting:
+            held[sender] += price
+        assert held.total() <= 100
+        assert max(held.values(), default=0) <= 40
+        assert len(queue) == len(waiting)
+        assert queue.oldest() == min(waiting, default=None)
