@@ -58,8 +58,9 @@ _SCALES = {2: 2.6, 3: 3.6, 4: 2.6, 6: 3.6}
 """Every n-th cell -> by what factor second differences at n cells must exceed those at half of that (rounded down)
 for the file to be resampled from cells so coarse. On a surface that a filter made they grow by up to 4 from one
 cell to two, on surveyed ground by 2.3 to 2.8 (three real models)."""
-_FOUND = 0.8
-"""Share of a lake that was found at a finer scale, with its shore to the cell: then it is left as it is."""
+_FOUND, _SHORE_RISE = 0.8, 0.02
+"""Share of a lake that was found at a finer scale; and of the rise of its shore, within two cells of the survey,
+that a filter may leave on the water."""
 _MUCH_WATER = 0.05
 _LEAST_SIDE, _SOME_ROWS = 16, 256
 _ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
@@ -102,21 +103,29 @@ def level_ground(elevation_m: Floats) -> LevelGround:
         known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
     if not known.all():
         elevation_m = np.where(known, elevation_m, np.float32(np.nan))
-    mask, patches, level = _at_one_scale(np.ascontiguousarray(elevation_m))
     rows, cols = elevation_m.shape
     bend_m = cache(partial(_bend_m, elevation_m))
-    for every, smooth in _SCALES.items():
-        if min(rows, cols) < every * _LEAST_SIDE or bend_m(every) <= smooth * bend_m(every // 2):
-            continue
+    scales = [
+        every
+        for every, smooth in _SCALES.items()
+        if min(rows, cols) >= every * _LEAST_SIDE and bend_m(every) > smooth * bend_m(every // 2)
+    ]
+    mask, patches, level = _at_one_scale(np.ascontiguousarray(elevation_m), bool(scales))
+    for every in scales:
         first = (every - 1) // 2  # a cell stands for those around it
-        coarse, at_scale, _ = _at_one_scale(np.ascontiguousarray(elevation_m[first::every, first::every]))
+        picked_m = np.ascontiguousarray(elevation_m[first::every, first::every])
+        coarse, at_scale, _ = _at_one_scale(picked_m, True)
         if sum(cells for _, cells in at_scale) * every**2 > sum(cells for _, cells in patches):
             patches = [(height_m, cells * every**2) for height_m, cells in at_scale]
-        wide = coarse.repeat(every, axis=0).repeat(every, axis=1)[:rows, :cols]
-        wide = np.pad(wide, [(0, most - has) for most, has in zip(mask.shape, wide.shape, strict=True)])
-        lakes, many = ndimage.label(wide)
+        wide_m = np.where(coarse, picked_m, np.float32(np.nan)).repeat(every, axis=0).repeat(every, axis=1)
+        wide_m = np.pad(wide_m, (0, every), constant_values=np.nan)[:rows, :cols]
+        # A lake which a finer scale has missed is added as it is, of others what the filter left at their shore.
+        lakes, many = ndimage.label(wide := ~np.isnan(wide_m))
         had = np.bincount(lakes[mask], minlength=many + 1)
         mask |= (had < _FOUND * np.bincount(lakes.reshape(-1)))[lakes] & wide
+        rise_m = ndimage.maximum_filter(np.nan_to_num(elevation_m), 2 * every + 1) - wide_m
+        with np.errstate(invalid="ignore"):
+            mask |= elevation_m - wide_m <= _SHORE_RISE * rise_m
     patches.sort(key=lambda patch: -patch[1])
     return LevelGround(mask, tuple(patches), float(np.count_nonzero(level & ~mask) / elevation_m.size))
 
@@ -132,14 +141,14 @@ def _bend_m(elevation_m: Floats, cells: int) -> float:
     return sum(bends)
 
 
-def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], Bools]:
+def _at_one_scale(elevation_m: Floats, is_resampled: bool) -> tuple[Bools, list[tuple[float, int]], Bools]:
     """Returns (mask of water, (height in m, cells) of each patch of it, mask of large level patches)."""
     step_m = _step_m(elevation_m)
-    found = _level_with(elevation_m, step_m)
+    found = _level_with(elevation_m, step_m, is_resampled)
     rounded_m = _rounded_m(found)
     if rounded_m > step_m:
         step_m = rounded_m
-        found = _level_with(elevation_m, step_m)
+        found = _level_with(elevation_m, step_m, is_resampled)
     water, unsure = _judged(found, _STILL_M)
     mask: Bools = water[found.labels]
     large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
@@ -153,10 +162,10 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
     return mask, patches, large[found.labels]
 
 
-def _level_with(elevation_m: Floats, step_m: float) -> Patches:
+def _level_with(elevation_m: Floats, step_m: float, is_resampled: bool) -> Patches:
     """The level patches of heights that are rounded to `step_m`."""
     least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
-    return level_patches(elevation_m, _SAME_M, least, step_m)
+    return level_patches(elevation_m, _SAME_M, least, step_m, is_resampled=is_resampled)
 
 
 def _rounded_m(found: Patches) -> float:

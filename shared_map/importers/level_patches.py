@@ -35,7 +35,8 @@ class Patches:
 
     labels    int32 (rows, cols), 1 .. count; 0 is no patch
     height_m  float32 (count + 1,), of the first cell of each; NaN of number 0
-    spread_m  float32 (count + 1,), from the lowest to the highest cell
+    spread_m  float32 (count + 1,), of an even slope whose heights vary as much, as ripples of a filter
+              are few; of means, from the lowest to the highest
     cells     int64 (count + 1,)
     edge      int64 (count + 1,): sides of its cells beyond which another cell lies
     differ    of these, those with another height beyond: the visible part of its shore
@@ -64,7 +65,13 @@ class Patches:
 
 
 def level_patches(
-    elevation_m: Floats, same_m: float, least_cells: int, step_m: float, shore_m: Floats | None = None
+    elevation_m: Floats,
+    same_m: float,
+    least_cells: int,
+    step_m: float,
+    shore_m: Floats | None = None,
+    *,
+    is_resampled: bool = False,
 ) -> Patches:
     """The patches of a height model.
 
@@ -81,6 +88,8 @@ def level_patches(
     shore_m : float32 (rows, cols), m, optional
         Heights also of cells that can be no part of a patch and are NaN in `elevation_m`. They are means, so that
         no filter has left ripples at shores.
+    is_resampled : bool
+        The filter which made its cells has also made a shore's steps smaller: the next cells count as well.
     """
     ripples = shore_m is None
     shore_m = elevation_m if shore_m is None else shore_m
@@ -88,23 +97,39 @@ def level_patches(
         elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE if ripples else _LEAST_ALIKE_MEANS
     )
     many = len(cells)
-    first, lowest, highest = (np.full(many, fill, np.float32) for fill in (np.nan, np.inf, -np.inf))
-    for row0, row1 in reversed(bands(elevation_m.shape[0])):
-        at = np.flatnonzero(labels[row0:row1])[::-1]  # backwards: the value of a patch's first cell is written last
-        of_cell, height_m = labels[row0:row1].reshape(-1)[at], elevation_m[row0:row1].reshape(-1)[at]
-        np.minimum.at(lowest, of_cell, height_m)
-        np.maximum.at(highest, of_cell, height_m)
-        first[of_cell] = height_m
+    from scipy import ndimage
+
+    first = np.full(many, np.nan, np.float32)
+    at, where = np.unique(labels, return_index=True)
+    first[at] = elevation_m.reshape(-1)[where]
+    first[0] = np.nan
+    total_m, total_m2 = np.zeros((2, many))
+    for row0, row1 in bands(elevation_m.shape[0]):
+        of_cell = labels[row0:row1][(inside := labels[row0:row1] > 0)]
+        above_m = elevation_m[row0:row1][inside].astype(np.float64) - first[of_cell]
+        total_m += np.bincount(of_cell, above_m, many)
+        total_m2 += np.bincount(of_cell, above_m**2, many)
+    variance = total_m2 / np.maximum(cells, 1) - (total_m / np.maximum(cells, 1)) ** 2
+    spread_m = np.sqrt(12 * np.maximum(variance, 0)).astype(np.float32)
+    if not ripples:
+        each = np.arange(many)
+        spread_m = ndimage.maximum(elevation_m, labels, each) - ndimage.minimum(elevation_m, labels, each)
     border = np.zeros(many, np.bool_)
     for line in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         border[line] = True
     border[0] = False
-    sides = _sides(shore_m, labels, cells, same_m, step_m, ripples)
-    return Patches(labels, first, highest - lowest, cells, border=border, **sides)
+    sides = _sides(shore_m, labels, cells, same_m, step_m, ripples, is_resampled)
+    return Patches(labels, first, spread_m, cells, border=border, **sides)
 
 
 def _sides(
-    elevation_m: Floats, labels: Labels, cells: Counts, same_m: float, step_m: float, ripples: bool
+    elevation_m: Floats,
+    labels: Labels,
+    cells: Counts,
+    same_m: float,
+    step_m: float,
+    ripples: bool,
+    is_resampled: bool,
 ) -> dict[str, Counts]:
     """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
     height, width = elevation_m.shape
@@ -127,6 +152,8 @@ def _sides(
             near = np.abs(above_m) <= 1.5 * step_m
             low = differs & (above_m < 0)
             ripple = (far_m > -_RIPPLE * above_m) & ripples
+            if is_resampled:
+                low |= differs & ~ripple & (far_m < -1.5 * max(step_m, 0.1))
         beside = differs & (beyond > 0) & (4 * cells[beyond] >= cells[patch])
         land = low & ~beside
         kinds = {
@@ -137,7 +164,7 @@ def _sides(
             "lower": land & ~ripple,
             "ripple": land & ripple,
             "terrace": beside & near,
-            "steep": differs & ~near,
+            "steep": differs & (~near | is_resampled & (np.abs(far_m) > 1.5 * step_m)),
         }
         for name, there in kinds.items():
             total[name] += np.bincount(patch[there], minlength=len(cells))

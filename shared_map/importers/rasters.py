@@ -139,6 +139,9 @@ def contents_of(dataset: Any, what: str, config: TerrainConfig) -> Contents:
 
 
 def _of_colours(dataset: Any, what: str) -> Contents:
+    if dataset.dtypes[0] != "uint8":
+        found = f"{dataset.count} bands of {dataset.dtypes[0]}, expected one of heights"
+        raise TerrainError(f"{what} has {found}: gdal_translate -b 1 takes it out; a photo goes into terrain.photo")
     fitting = encodings_of(dataset)
     if len(fitting) == 1:
         return Contents(encoding=fitting[0], how="as only so its colours are heights of a landscape")

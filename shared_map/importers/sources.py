@@ -152,7 +152,9 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         raise TerrainError(f"terrain {path} is a pipe or a device; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()
     if suffix not in _READERS and not is_raster(path):
-        raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
+        found = suffix or "a file without ending"
+        others = "`gdal_translate FILE out.tif` converts most others"
+        raise TerrainError(f"terrain {path}: {found} is unknown; give {FILE_KINDS}; {others}")
     return _READERS.get(suffix, _raster)(path, config, progress)
 
 

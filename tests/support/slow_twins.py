@@ -73,16 +73,19 @@ def cost_to_go(
     corner_cutting: bool = False,
     climb: Climb | None = None,
     length_weight: float = 0.0,
+    left_share: float = 0.0,
 ) -> NDArray[np.float64]:
     """Cheapest cost from every cell to the target on cells of one metre, by scipy on the graph of all steps with
     every edge turned round, so that a search from the target finds the ways to it.
 
     length_weight  what a metre costs beside its time
+    left_share     share of a step that has the pace of the cell which it leaves: half of it in GRASS, none in ours
     """
     into, out, costs = [], [], []
     for direction, here, there in _legal_steps(pace, neighbours, corner_cutting):
         length = step_length(direction, edge)
-        cost = pace.reshape(-1)[there].astype(np.float64) * length
+        left, entered = (pace.reshape(-1)[cells].astype(np.float64) for cells in (here, there))
+        cost = (left_share * left + (1 - left_share) * entered) * length
         if climb is not None:
             cost *= climb.along(here, there)
         allowed = np.isfinite(cost)
