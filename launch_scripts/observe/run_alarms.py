@@ -44,6 +44,7 @@ KINDS: Mapping[str, str] = {
     "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
     "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
     "target-lethal": "target on lethal ground",  # no route leads to it
+    "shut-in": "vehicle shut in",  # bodies leave it no cell to which it can drive
     "behind": "behind",  # a process skips ticks: the machine is too slow for it
     "restarted": "restarted",  # a process was started again after it had ended
 }
