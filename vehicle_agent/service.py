@@ -416,12 +416,15 @@ class AgentService:
         for text in bodies.complaints:
             self._warn("body", text)
         bodies.complaints.clear()
-        for id in self.agent.shut_in - self._shut_in:
-            row, col = self._replica.grid.row_col(self.agent.vehicles[id].cell)
-            self._warn(
-                "shut_in", f"{id} waits at row {row}, column {col}: bodies leave no cell to which it can drive"
-            )
-        self._shut_in = set(self.agent.shut_in)
+        shut_in = self.agent.shut_in
+        for id in sorted(shut_in - self._shut_in):
+            cell = self.agent.vehicles[id].cell
+            row, col = self._replica.grid.row_col(cell)
+            text = f"{id} waits at row {row}, column {col}: bodies leave no cell to which it can drive"
+            self._warn("shut_in", text)
+            self._member.alarms.begin("shut-in", id, text, now_ns, cell)
+        self._member.alarms.last_of("shut-in", shut_in, now_ns)
+        self._shut_in = set(shut_in)
 
     # --- driving and planners -------------------------------------------------------------------------------
 

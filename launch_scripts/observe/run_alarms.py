@@ -45,6 +45,7 @@ KINDS: Mapping[str, str] = {
     "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
     "target-lethal": "target on lethal ground",  # no route leads to it
     "goal-blocked": "cannot reach its place",  # it was sent there by an order; it asks again every 3 s
+    "shut-in": "vehicle shut in",  # bodies leave it no cell to which it can drive
     "behind": "behind",  # a process skips ticks: the machine is too slow for it
     "restarted": "restarted",  # a process was started again after it had ended
 }

@@ -73,6 +73,8 @@ class _Question:
     found: list[GoalAnswer] = field(default_factory=list)
     rests: list[float] = field(default_factory=list)
     """s, what remains after the steps of each route that are given."""
+    version: int = -1
+    """Version of the map on which they were found."""
 
     @property
     def done(self) -> bool:
@@ -99,6 +101,8 @@ class _ClassTrees:
     def work(self, question: _Question) -> int:
         """Answers as much of a question as a slice of cells gives. Returns the cells that it has grown."""
         request, grown = question.request, 0
+        if question.version != self.map_version:
+            question.found, question.rests, question.version = [], [], self.map_version
         while not question.done and grown < SLICE_CELLS:
             start = request.cells[len(question.found)]
             answer = self.trees.ask(request.to, start, SLICE_CELLS - grown)
@@ -124,7 +128,7 @@ class _ClassTrees:
         return PlaceRouteReply(
             to_cell=request.to,
             incarnation=incarnation,
-            map_version=self.map_version,
+            map_version=max(question.version, 0),
             routes=known.columns(),
             status=status,  # type: ignore[arg-type]
             vehicle_class=request.vehicle_class,

@@ -7,7 +7,9 @@ import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
 from swarm.errors import ConfigError
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.vehicles import Body, VehicleState
+from swarm.wire.topics import BODY, STATS
 
 
 def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() -> None:
@@ -42,6 +44,31 @@ def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> No
     assert world.count("marks") == 1
     assert world.count("reroute_requests") >= 1
     assert not np.isfinite(world.planners["t"].pace[1, 7])
+
+
+def test_a_vehicle_that_a_body_shuts_in_raises_an_alarm_until_the_body_leaves() -> None:
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(["#" * 9, "#.......#", "#" * 9]))
+    world.put_target("t", 1, 7)
+    person, (x_m, y_m) = world.bus("person"), world.terrain.grid.centre_m(world.terrain.grid.cell(1, 2))
+    stats: list[Stats] = []
+    world.bus("observer").subscribe(STATS, lambda event: stats.append(event.message))  # type: ignore[union-attr, arg-type]
+
+    def tell(seq: int, lease_s: float) -> None:
+        body = Body(id="p", incarnation=1, seq=seq, x_m=x_m, y_m=y_m, radius_m=1.0, lease_s=lease_s)
+        person.publish(BODY, body, id="p")
+
+    def alarms() -> list[tuple[str, int | None, bool]]:
+        told = stats[-1].alarms if stats else []
+        return [(each.about, each.cell, each.over_ns is None) for each in told if each.kind == "shut-in"]
+
+    world.start_all()
+    tell(1, 10.0)
+    world.until(alarms, within_s=10)
+    assert alarms() == [("a0-00", 10, True)]
+    tell(2, 0.0)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    world.until(lambda: alarms() == [("a0-00", 10, False)])
+    assert world.count("shut_in") == 1
 
 
 def test_marks_of_one_agent_spare_another_the_detour() -> None:
