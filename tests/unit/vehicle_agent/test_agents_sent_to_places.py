@@ -137,6 +137,26 @@ def test_a_place_without_a_way_blocks_until_there_is_one_and_a_stop_is_a_standby
     world.assert_lawful()
 
 
+def test_a_better_way_that_opens_is_taken_on_the_way() -> None:
+    gap = ["." * 20] * 10 + ["#" * 5 + "." + "#" * 13 + "."] + ["." * 20] * 9
+    world = SentWorld(scenario(2, [(2, 4), (2, 7)]).replace("seed = 3", "seed = 3\ntime_scale = 0.3"), gap)
+    zone = ZoneOrder(action="add", name="gap", polygon=[(10, 4), (10, 7), (11, 7), (11, 4)])
+    world.ask(ZONES, zone)
+    world.run(1.0)
+    world.send("a0-00", (18, 5))
+    world.until(lambda: world.where()["a0-00"][1] >= 8, within_s=60)
+    begun = len(world.followed)
+    world.ask(ZONES, replace(zone, action="remove", polygon=[]))
+    world.places.bus.close()
+    world.places = FakePlaces(world)
+    crossed: list[tuple[int, int]] = []
+    world.after_tick.append(lambda: crossed.append(world.where()["a0-00"]))
+    world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=300)
+    assert (10, 5) in crossed
+    routes = [each for each in world.followed[begun:] if each.vehicle == "a0-00"]
+    assert len(routes) <= 3, "a route that is the rest of the one before is not begun anew"
+
+
 def test_goals_and_progress_survive_the_agent_the_keeper_and_the_planner_of_places() -> None:
     world = SentWorld(scenario(2, [(5, 5), (5, 7)]), OPEN)
     world.send("a0-00", (5, 15), (15, 15), (15, 5), then="chase")
