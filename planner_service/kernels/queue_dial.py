@@ -52,7 +52,7 @@ _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
 WHOLE = -1
-"""As the most cells of a growth: all of them, from a new root."""
+"""A growth's number of cells: all of them, from a new root."""
 AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
 (docs/design/bucket-queues.md)."""
@@ -292,7 +292,7 @@ def grow_whole(grid: PaddedGrid, cost: Floats, root: int, buckets: Buckets, scra
 @kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], {BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
     """Goes back to a tree that was cut out (see `crops`): to its costs in buckets below `first`, which are exact on
-    the map as it is. Dearer cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
+    the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
     cell_cost, _, stride, rule, _ = grid
     width, circle = buckets
     touched, batch, queue = scratch
