@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
+import numpy as np
+
 from planner_service.strategy import (
     AHEAD,
     STRATEGIES,
@@ -16,6 +18,7 @@ from planner_service.strategy import (
     StrategyRow,
     WidestWindow,
 )
+from planner_service.tree.cost_changes import Cells
 from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -85,6 +88,7 @@ class GrowthTimes:
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
         """Moves in the last `_TICKS` ticks or so; the value when the row was chosen."""
         self._ticks = 0
+        self._near_cells = math.inf
         self._choose()
 
     def set_budget(self, cpu_budget: float) -> None:
@@ -102,6 +106,17 @@ class GrowthTimes:
         self._moves_per_tick += (moved - self._moves_per_tick) / self._ticks
         if abs(self._moves_per_tick - self._chosen_at) > _NOTICED:
             self._choose()
+
+    def note_near(self, cells: float) -> None:
+        """Notes how many cells a growth visits that goes as far as the askers are; inf where none can stop."""
+        if cells != self._near_cells:
+            self._near_cells = cells
+            self._choose()
+
+    @property
+    def near_ns(self) -> float:
+        """Returns the CPU time of a growth as far as the askers are; inf where none can stop."""
+        return self._near_cells * self.full_ns / self._grid.cells
 
     def observe_full_ns(self, took_ns: int) -> None:
         """Notes the time of a full search; not of one that found networks too. A simulation does not call it."""
@@ -124,7 +139,7 @@ class GrowthTimes:
 
     def _choose(self) -> None:
         widest = self.widest(WidestWindow.WHILE_CHEAPER)
-        exact_ns = self.exact_ns if self.mends_quickly else math.inf
+        exact_ns = min(self.exact_ns if self.mends_quickly else math.inf, self.near_ns)
         self._chosen_at = self._moves_per_tick
         times = Growths(
             self.full_ns, self.budget_ns, widest, self._grid.cells, exact_ns, moves_per_tick=self._moves_per_tick
@@ -139,6 +154,11 @@ class GrowthTimes:
         # Over half of the map, a full growth costs as much: that is the worker's.
         share = min(INLINE_NS / self.full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2
+
+    @property
+    def most_cells(self) -> int:
+        """Returns how many cells may be searched on the thread that answers."""
+        return int(INLINE_NS / self.full_ns * self._grid.cells) if self._has_worker else self._grid.cells
 
     def is_quick(self, cells: int) -> bool:
         """Returns True if this number of cells may be searched on the thread that answers."""
@@ -165,6 +185,35 @@ def _median_with(took_ns: deque[int], newest_ns: int) -> int:
     """The median of the last times and one more, which is kept."""
     took_ns.append(newest_ns)
     return sorted(took_ns)[len(took_ns) // 2]
+
+
+class Askers:
+    """Cells from which routes and costs were asked lately: a growth that stops goes as far as they are.
+
+    cells  those asked from between the last two updates of the tree in which any were
+    """
+
+    def __init__(self) -> None:
+        self.cells: Cells = np.empty(0, np.int64)
+        self._fresh: list[Cells] = []
+        self._needed = deque([0], maxlen=_TICKS)
+
+    def note(self, cells: Cells, needed: int) -> None:
+        """Notes cells that asked, and about how many a growth as far as they are has to visit."""
+        self._fresh.append(cells)
+        self._needed[-1] = max(self._needed[-1], needed)
+
+    def turn(self) -> None:
+        """Notes that the tree is updated now."""
+        if self._fresh:
+            self.cells = np.unique(np.concatenate(self._fresh))
+            self._fresh = []
+        self._needed.append(0)
+
+    @property
+    def needed(self) -> int:
+        """Returns about how many cells a growth visits as far as the farthest of the last updates."""
+        return max(self._needed)
 
 
 class WindowSchedule:

@@ -16,7 +16,7 @@ from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
-from planner_service.target_tree import TargetTree, Update
+from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
 from shared_map.cost_map import CostMap, merged
@@ -228,10 +228,9 @@ class Planner:
         """Goes by what the worker found."""
         self.tree.take_strides(search)
 
-    @property
-    def must_wait(self) -> bool:
-        """Returns True if there is no tree to answer from now, but will be once the search under way is adopted."""
-        return not self.tree.ready and self._growing_since_ns is not None
+    def must_wait(self, cells: Sequence[int]) -> bool:
+        """Returns True if no tree answers these cells now, but one will once the search under way is adopted."""
+        return not self.tree.knows(cells) and (self._growing_since_ns is not None or self.tree.wants_full)
 
     @property
     def begins(self) -> bool:
@@ -257,7 +256,7 @@ class Planner:
         self.tree.times.note_tick(moved and self._told is not None)
         if moved or (now_known != self._told and self._may_not_wait(now_ns)):
             self._take_in(now_known, now_ns)
-        if self._wants_full and self._growing_since_ns is None:
+        if (self._wants_full or self.tree.wants_full) and self._growing_since_ns is None:
             return [self._grow(now_ns)]
         return []
 
@@ -294,6 +293,8 @@ class Planner:
 
     def _take_in(self, news: tuple[int, int], now_ns: int) -> None:
         dirty = self._take_dirty(now_ns)
+        if not self.leads:  # no query comes here until it takes over
+            self.tree.expect([follower.cell for _, follower in self.followers.all_items()])
         began_ns = self._now()
         update = self.tree.update(self._cost_map.pace_s_per_m, news[0], dirty, news[1])
         self._told = news
@@ -337,20 +338,20 @@ class Planner:
         if update.repair_ns:
             self.counters.observe("repair_ms", update.repair_ns / 1e6)
             self._rests_until_ns = now_ns + min(self.tree.times.rest_ns(update.repair_ns), LONGEST_WAIT_NS)
-        if update.kind in ("full", "exact"):
+        if update.kind in ("full", "bounded", "exact"):
             self._exact_ns = now_ns
-            self._record_growth(took_ns - update.repair_ns, exact_move=update.kind == "exact")
+            self._record_growth(took_ns - update.repair_ns, update.kind)
             self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
 
-    def _record_growth(self, took_ns: int, exact_move: bool = False) -> None:
+    def _record_growth(self, took_ns: int, kind: Kind = "full") -> None:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
-        if self._stopwatch is not None:
-            (self.tree.times.observe_exact_ns if exact_move else self.tree.times.observe_full_ns)(took_ns)
+        if self._stopwatch is not None and kind != "bounded":
+            (self.tree.times.observe_exact_ns if kind == "exact" else self.tree.times.observe_full_ns)(took_ns)
 
     def _now(self) -> int:
         return 0 if self._stopwatch is None else self._stopwatch()

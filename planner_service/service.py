@@ -367,7 +367,11 @@ class PlannerService:
                 continue
             planner = self._planners.used(name, now_ns)
             crowded = len(self._held) + len(held) - n > _MOST_HELD
-            must_wait = self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS
+            must_wait = (
+                self._planners.must_wait(name, request.cells, now_ns)
+                and not crowded
+                and now_ns - asked_ns < _HOLD_NS
+            )
             if must_wait or spent > _AT_ONCE:
                 self._held.append((asked_ns, event))
                 continue

@@ -60,6 +60,9 @@ class StrategyRow:
 
     thins_far_cells     section 3.3.3, multi-resolution: far from the target only the ways between blocks of 16,
                         32, ... cells are grown, a stride that doubles with the distance
+    stops_at_askers     a growth for a move goes only as far as the farthest asker, which is "as fast as a
+                        single-path planning procedure from the target to the farthest vehicle" (section 3.3.1).
+                        With exact moves, while that takes less time
     renews_loose_bounds a served route whose certified gap exceeds `planner.MAX_GAP` asks for a full growth; the
                         strategies of the paper never do
     """
@@ -69,6 +72,7 @@ class StrategyRow:
     thins_far_cells: bool = False
     widest_window: WidestWindow = WidestWindow.WHILE_CHEAPER
     renews_loose_bounds: bool = False
+    stops_at_askers: bool = False
 
     @property
     def is_exact(self) -> bool:
@@ -123,7 +127,7 @@ class StrategyWorld:
 
 
 ROWS: Mapping[str, StrategyRow] = {
-    "full": StrategyRow(OnMove.WHOLE_TREE),
+    "full": StrategyRow(OnMove.WHOLE_TREE, stops_at_askers=True),
     "exact": StrategyRow(OnMove.EXACT_MOVE),
     "variable_range": StrategyRow(OnMove.BLOCK_WINDOW),
     "multi_resolution": StrategyRow(
@@ -137,7 +141,7 @@ Stage = Literal["exact", "rotate", "coarsen"]
 
 _ROTATE = StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True)
 STAGES: Mapping[Stage, StrategyRow] = {
-    "exact": StrategyRow(OnMove.EXACT_MOVE, renews_loose_bounds=True),
+    "exact": StrategyRow(OnMove.EXACT_MOVE, renews_loose_bounds=True, stops_at_askers=True),
     "rotate": _ROTATE,
     "coarsen": replace(_ROTATE, thins_far_cells=True),
 }

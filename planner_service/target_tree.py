@@ -15,12 +15,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.growth_times import GrowthTimes, WindowLimit, exact_half
+from planner_service.growth_times import Askers, GrowthTimes, WindowLimit, exact_half
+from planner_service.kernels.layout import NONE
+from planner_service.kernels.route_walk import UNREACHABLE
 from planner_service.planner_actions import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.partial_growth import PartialGrowth
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import StrideNetwork, StrideSearch, StrideShelf, StrideUpkeep
@@ -31,15 +34,15 @@ from swarm.grid import GridSpec, Window
 from swarm.wire.route_columns import NO_TARGET, RouteBatch
 
 _NO_WINDOW = Window(0, 0, 0, 0)
-Kind = Literal["none", "full", "exact", "window", "repair", "coarse", "forced"]
+Kind = Literal["none", "full", "bounded", "exact", "window", "repair", "coarse", "forced"]
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
     """Changes by one call.
 
-    kind        the most expensive work: none, full search, tree made exact by its parents, window, repair after map
-                changes, window and strides beyond it, forced window
+    kind        the most expensive work: none, full search, search as far as the farthest asker, tree made exact by
+                its parents, window, repair after map changes, window and strides beyond it, forced range
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
     wants_full  please run `full_job` on a worker, and `adopt` what it returns
@@ -63,6 +66,9 @@ class Update:
         return Update("window", window, cells, self.wants_full, repaired.repair_ns)
 
 
+_CELLS_PER_SQUARE = 8
+"""A growth as far as an asker d rows or columns away takes as long as this times d * d cells of a whole growth:
+`bench scale --within` shows from where on an exact move takes less."""
 _NEAR_CELLS = 256
 """Rows and columns about a target within which the nearest open cell is looked for: some milliseconds."""
 
@@ -157,6 +163,10 @@ class TargetTree:
         self._windows = WindowLimit(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
+        # Growths that stop, and who has asked: how far they go. Some lay farther than a growth may go here.
+        self._growth = PartialGrowth(self._costs)
+        self._askers = Askers()
+        self._too_far = False
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
         self._is_better_bound = False
 
@@ -196,14 +206,22 @@ class TargetTree:
         """
         changes = self._learn(pace, dirty)
         self.map_version = map_version
+        self._askers.turn()
+        self.times.note_near(self._askers.needed if self._growth.usable else np.inf)
         return self._follow(target_cell, changes) if self._set_target(target_cell, changes) else Update("none")
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
         """Returns a full search for a worker, on the last known map: see `growth_job`."""
+        self._too_far = False
         leads_there = self.ready and self._state is not State.STALE and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
         return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces)
+
+    @property
+    def wants_full(self) -> bool:
+        """Please run `full_job`: an asker is farther away than a growth may go on this thread."""
+        return self._too_far and not self._job_out
 
     @property
     def wants_strides(self) -> bool:
@@ -268,6 +286,8 @@ class TargetTree:
         wanted = self._inside(cells)
         if wanted.size == 0 or self._tree.exact:
             return Update("none")
+        if (forced := self._force_near(wanted)) is not None:
+            return forced
         if self.times.is_short(self.times.full_ns):
             return self._grow_full(target)
         if self._can_mend and self.times.is_short(self.times.exact_ns):
@@ -289,7 +309,13 @@ class TargetTree:
         asked = np.asarray(cells, np.int64).reshape(-1)
         if not self.ready:
             return RouteBatch.none(asked, NO_TARGET)
-        return read_routes(self._tree, self._bounds, asked, max_cells)
+        self._reach(asked)
+        routes = read_routes(self._tree, self._bounds, asked, max_cells)
+        if isinstance(self._tree, CostToGoTree) and self._tree.bound < np.inf:
+            unknown = routes.statuses == UNREACHABLE
+            routes.statuses[unknown] = NO_TARGET
+            routes.lower_bound_s[unknown] = self._tree.bound * self._costs.time_share
+        return routes
 
     def cost_to_go_at(self, cells: Any) -> Floats:
         """float32, s, per cell; inf where there is no way or the cell is outside."""
@@ -297,6 +323,7 @@ class TargetTree:
         costs: Floats = np.full(asked.size, np.inf, np.float32)
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
+            self._reach(asked)
             starts = self._costs.pad_all(asked[inside])
             costs[inside] = self._tree.cost_at(starts)
         return costs
@@ -310,6 +337,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._costs.apply(pace, dirty)
+        self._growth.learn(changes)
         self._strides.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
@@ -352,6 +380,8 @@ class TargetTree:
         if self._state is State.STALE:
             return self._grow_full(target_cell)
         self._windows.moves += target_cell != self._tree.root
+        if (near := self._follow_near(target_cell, changes)) is not None:
+            return near
         grows_anew = self.strategy.on_move is OnMove.WHOLE_TREE and self._is_quick
         if grows_anew and self._decide(target_cell).how == "whole":
             return self._grow_full(target_cell)
@@ -434,7 +464,15 @@ class TargetTree:
 
     def _grow_full(self, target_cell: int) -> Update:
         """Grows the whole tree: here or, where that would take too long, on the worker. The one that there is
-        serves no more."""
+        serves no more. Where growths can stop, and the row asks for no more or the worker has to grow the rest, it
+        goes as far as the askers are."""
+        if self._growth.usable and (self._stops or not self._is_quick):
+            near = self._grow_near(target_cell, rest=not self._stops)
+            if near is not None:
+                return near
+        return self._grow_whole(target_cell)
+
+    def _grow_whole(self, target_cell: int) -> Update:
         if not self._is_quick:
             self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
@@ -445,6 +483,118 @@ class TargetTree:
         self._windows.note_whole(target_cell)
         self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
+
+    # --- as far as the askers are --------------------------------------------------------------------------------
+
+    @property
+    def _stops(self) -> bool:
+        """Returns True if a growth is to go only as far as the askers: with every move of brute force,
+        and instead of exact moves that take longer."""
+        row = self.strategy
+        if not (row.stops_at_askers and self._growth.usable):
+            return False
+        if row.on_move is OnMove.WHOLE_TREE:
+            return self._is_quick or self.times.is_short(self.times.near_ns)
+        return self.times.near_ns < self.times.exact_ns
+
+    @property
+    def _is_whole(self) -> bool:
+        """Returns True if a cell without a cost has no way."""
+        return isinstance(self._tree, PieceTree) or self._tree.bound == np.inf
+
+    def _follow_near(self, target_cell: int, changes: Changes | None) -> Update | None:
+        """Follows by a growth that stops; None where the whole tree is to be kept."""
+        whole, moved = self._is_whole, target_cell != self._tree.root
+        if not moved and whole:
+            return None
+        if not moved and changes is not None and not changes.cells.size:
+            return Update("none")
+        if not self._stops and whole:
+            return None
+        return self._grow_full(target_cell)
+
+    def _grow_near(self, target_cell: int, rest: bool = False) -> Update | None:
+        """Grows as far as the askers are, or as is quick. None if costs are too large for that.
+
+        rest  the worker is to grow the whole tree
+        """
+        self._growth.begin(self._costs.pad(target_cell))
+        grown = self._growth.go_on(self._passable(self._askers.cells), self.times.most_cells)
+        if grown < 0:
+            return None
+        self._take_grown(target_cell)
+        self._state = State.CURRENT
+        self._windows.note_whole(target_cell)
+        self._bounds.forget()
+        self._is_better_bound = False
+        return Update("bounded", self._grid.window, grown + 1, wants_full=rest and not self._job_out)
+
+    def _take_grown(self, target_cell: int) -> None:
+        if not isinstance(self._tree, CostToGoTree):
+            self._tree = CostToGoTree(self._costs)
+        self._tree.take_grown(target_cell, self._growth)
+
+    def knows(self, cells: Any) -> bool:
+        """Returns True if these cells are answered for good; if not, a worker's tree is to come."""
+        if self.ready and not self._is_whole:
+            self._reach(np.asarray(cells, np.int64))
+            tree = self._tree
+            if isinstance(tree, CostToGoTree) and tree.bound < np.inf:
+                return bool((tree.cost[self._open(self._inside(cells))] < np.inf).all())
+        return self.ready
+
+    def _reach(self, asked: NDArray[np.int64]) -> None:
+        """Goes on with a growth that has stopped as far as these cells."""
+        if not self.strategy.stops_at_askers and self._is_whole:
+            return
+        tree, starts = self._tree, self._open(self._inside(asked))
+        if not self._is_whole and isinstance(tree, CostToGoTree):
+            missing = starts[tree.cost[starts] == np.inf]
+            if missing.size:
+                if self._growth.go_on(missing, self.times.most_cells) < 0:
+                    self._too_far = True
+                    return
+                self._take_grown(tree.root)
+                self._too_far |= not self._is_whole and bool((tree.cost[missing] == np.inf).any())
+        self._note(starts)
+
+    def expect(self, cells: Any) -> None:
+        """Notes cells that will be asked from, as those of a standby's followers: a growth goes as far."""
+        if self.ready and self._growth.usable:
+            self._note(self._open(self._inside(cells)))
+
+    def _note(self, starts: NDArray[np.int64]) -> None:
+        """Notes padded cells that asked, and how far a growth must go for them."""
+        if not starts.size:
+            return
+        tree, root = self._tree, self._costs.pad(self._tree.root)
+        if (self._is_whole or self._too_far) and (tree.parent[starts[starts != root]] == NONE).any():
+            self._askers.note(starts, self._grid.cells)
+            return
+        rows, cols = np.divmod(starts, self._costs.stride)
+        row, col = divmod(root, self._costs.stride)
+        self._askers.note(
+            starts, _CELLS_PER_SQUARE * int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) ** 2
+        )
+
+    def _open(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of some cells of the grid that are passable, padded."""
+        return self._passable(self._costs.pad_all(cells))
+
+    def _passable(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
+        return starts[self._costs.cell_cost[starts] < np.inf]
+
+    def _force_near(self, wanted: NDArray[np.int64]) -> Update | None:
+        """Makes the tree exact as far as these cells are; None if that takes too long here."""
+        tree, growth = self._tree, self._growth
+        if not (isinstance(tree, CostToGoTree) and growth.usable and tree.precise and self._all_kernels()):
+            return None
+        growth.begin(self._costs.pad(tree.root))
+        starts = self._open(wanted)
+        grown = growth.go_on(starts, self.times.most_cells)
+        if grown < 0 or (growth.bound < np.inf and not (growth.cost[starts] < np.inf).all()):
+            return None
+        return Update("forced", tree.merge_grown(growth), grown + 1)
 
     @property
     def _in_pieces(self) -> bool:

@@ -69,11 +69,11 @@ class ClassPlanners:
         self._used_ns[name] = now_ns
         return planner
 
-    def must_wait(self, name: str, now_ns: int) -> bool:
-        """Returns True if a query should wait: there is no tree to answer from yet, but soon."""
+    def must_wait(self, name: str, cells: list[int], now_ns: int) -> bool:
+        """Returns True if a query from these cells should wait: no tree answers them yet, but soon."""
         planner = self._by_class[name]
         is_new = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
-        return planner.must_wait or (is_new and planner.begins)
+        return planner.must_wait(cells) or (is_new and planner.begins)
 
     def drop_unused(self, now_ns: int) -> None:
         """Drops trees that had no query for 60 s."""

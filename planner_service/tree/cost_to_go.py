@@ -25,6 +25,7 @@ from planner_service.kernels.repair import repair
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import FINE, KeptScratch, box_of, grow_window
+from planner_service.tree.partial_growth import PartialGrowth
 from planner_service.tree.strides import StrideNetwork
 from shared_map.array_files import Floats
 from swarm.grid import Window
@@ -59,6 +60,11 @@ class CostToGoTree:
         `move` to another root and `grow_strides` reset it, `repair` keeps it."""
         self.reach = 0.0
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
+        self.bound = math.inf
+        """s; a cell with no cost has no way, or costs this at least. inf of a whole tree: then it has no way. Only
+        `take_grown` makes a tree that is not whole, which is exact; it can be read, and be grown again."""
+        self._box = 0, 0, 0, 0
+        """Box of the cells that have a cost, if the tree is not whole."""
         self.window_bound: WindowBound | None = None
         """Bound proven by the last window, as long as its root is the tree's. `move` sets it, a growth resets it,
         and so does the owner (to None) when a cell gets cheaper: it bounds from below."""
@@ -102,8 +108,48 @@ class CostToGoTree:
         self.relabel()
         self.reach = float(self.cost[np.isfinite(self.cost)].max())
 
+    def take_grown(self, root: int, growth: PartialGrowth) -> None:
+        """Becomes the tree in hand of a growth that has stopped: exact as far as that went. The work follows the
+        size of that tree, and of the one before."""
+        grid = self.cost_grid
+        if not self.cost.size or self.bound == math.inf:
+            self.cost = np.full(grid.size, np.inf, np.float32)
+            self.parent = np.full(grid.size, NONE, np.uint8)
+        for array, nothing in ((self.cost, np.inf), (self.parent, NONE)):
+            row0, col0, row1, col1 = self._box
+            array.reshape(-1, grid.stride)[row0:row1, col0:col1] = nothing
+        self._box = row0, col0, row1, col1 = growth.box()
+        np.abs(growth.inside(self._box), out=self.cost.reshape(-1, grid.stride)[row0:row1, col0:col1])
+        unpadded = row0 - 1, col0 - 1, row1 - 1, col1 - 1
+        point_to_parents(grid.padded, grid.climbs, self.cost, growth.root, unpadded, self.parent)
+        self.reach = growth.reach
+        self._ways_changed()
+        self._become_exact(root)
+        self.bound = growth.bound
+
+    def merge_grown(self, growth: PartialGrowth) -> Window:
+        """Lowers the costs to those of a growth from the same root that has stopped, whose cells become exact.
+        Returns the window that holds them. Raises ValueError unless the tree is `precise`."""
+        if not self.precise:
+            raise ValueError("costs are too large for float32 to tell parents by: grow the tree")
+        grid = self.cost_grid
+        row0, col0, row1, col1 = growth.box()
+        grown = np.full((row1 - row0 + 2, col1 - col0 + 2), np.inf, np.float32)
+        np.abs(growth.inside((row0, col0, row1, col1)), out=grown[1:-1, 1:-1])
+        part, box = grown.reshape(-1), (row0 - 1, col0 - 1, row1 - 1, col1 - 1)
+        merge_window(part, box, self.offset, growth.root, self.cost, grid.stride)
+        around = (max(box[0] - 1, 0), max(box[1] - 1, 0), min(row1, grid.grid.rows), min(col1, grid.grid.cols))
+        point_to_parents(grid.padded, grid.climbs, self.cost, growth.root, around, self.parent)
+        self._ways_changed()
+        # No cell beyond costs less than the growth's bound. The border, of which a heuristic knows nothing, is the
+        # rim by which all of them come in.
+        rim = growth.bound if growth.bound < math.inf else self.reach + self.offset
+        self.window_bound = (part, box, np.zeros(1, np.int64), np.array((rim,)))
+        return Window(*box)
+
     def _become_exact(self, root: int) -> None:
         self.root = root
+        self.bound = math.inf
         self.offset = 0.0
         self.window_bound = None
         self.exact = True

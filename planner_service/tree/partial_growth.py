@@ -80,6 +80,11 @@ class PartialGrowth:
         return self._grid.climbs is None and self._needed(self._narrow) <= MOST_BUCKETS
 
     @property
+    def reach(self) -> float:
+        """Returns what no cost of the tree in hand exceeds, s."""
+        return (int(self._state[0]) + 1) * self._width
+
+    @property
     def _narrow(self) -> float:
         return float(np.float32(self._grid.lowest_cell_cost * NARROW))
 
@@ -129,12 +134,12 @@ class PartialGrowth:
         return self.touched - before
 
     def _find_bound(self) -> None:
-        self.bound = (int(self._state[0]) + 1) * self._width if self._state[1] else math.inf
+        self.bound = self.reach if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
         """Returns the tree in hand, as an array of its own; then there is none in hand."""
         box = self.box()
-        inner = self._inside(box)
+        inner = self.inside(box)
         tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
         self._empty(inner)
         return tree
@@ -155,19 +160,22 @@ class PartialGrowth:
     def forget(self) -> None:
         """There is no tree in hand any more. The work follows the size of the tree."""
         if self.root >= 0:
-            self._empty(self._inside(self.box()))
+            self._empty(self.inside(self.box()))
 
-    def _inside(self, box: tuple[int, int, int, int]) -> Floats:
+    def inside(self, box: tuple[int, int, int, int]) -> Floats:
+        """Returns a view of the costs of a box of padded rows and columns."""
         row0, col0, row1, col1 = box
         inner: Floats = self.cost.reshape(-1, self._grid.stride)[row0:row1, col0:col1]
         return inner
 
     def _empty(self, inner: Floats) -> None:
-        np.copyto(inner, np.inf, where=inner >= 0)
+        np.copysign(np.float32(np.inf), inner, out=inner)  # what is lethal stays WALL, which is -inf
         self.root = -1
 
     def learn(self, changes: Changes) -> None:
         """The map has changed: the tree in hand is forgotten."""
+        if not changes.cells.size:
+            return
         self.forget()
         if self.cost.size:
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)

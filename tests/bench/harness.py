@@ -37,6 +37,7 @@ BENCHMARKS = {
     "start": "bench.planning.cold_start",
     "paper": "bench.planning.strategies",
     "gap": "bench.planning.strategies",
+    "scale": "bench.planning.strategies",
     "certificates": "bench.planning.certificates",
     "pulled": "bench.planning.pulled",
     "air": "bench.planning.air",

@@ -9,10 +9,12 @@ from support.kernel_oracle import WALLS, unpadded
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.goal_trees import GoalTrees
+from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
 
 ROUNDING = 1e-5
@@ -164,6 +166,38 @@ def test_far_changes_and_dear_ones_beside_the_route_need_no_growth() -> None:
     pace[30, 20] = np.inf
     trees.changed(ground.apply(pace, [Window(30, 20, 31, 21)]))
     assert trees.ask(goal, start, 1 << 40).grown_cells > 0
+
+
+@pytest.mark.parametrize("strategy", ["full", "auto"])
+def test_a_tree_follows_its_target_no_farther_than_its_askers(strategy: Strategy) -> None:
+    rng = np.random.default_rng(4)
+    pace = random_pace(rng, 120, 130, 3.0, 0.1)
+    pace[40:81, 40:81] = np.clip(pace[40:81, 40:81], 1.0, 3.0)
+    grid = GridSpec(*pace.shape, 1.0)
+    tree = TargetTree(grid, PlannerConfig(strategy=strategy))
+    kinds: list[str] = []
+
+    def followed(target: int, asked: np.ndarray, dirty: list[Window]) -> int:
+        update = tree.update(pace, target, dirty, len(kinds))
+        routes, best = tree.routes(asked), naive.cost_to_go(pace, target, **RULES[0]).flat[asked]
+        np.testing.assert_allclose(routes.cost_s, best, rtol=ROUNDING)
+        assert (routes.lower_bound_s <= best * (1 + 1e-12)).all()
+        assert (routes.lower_bound_s >= best * (1 - 10 * ROUNDING)).all()
+        kinds.append(update.kind)
+        return update.cells
+
+    for n in range(20):
+        dirty = [marked(rng, pace[40:81, 40:81], 3.0)] if n % 3 == 0 else []
+        pace[40:81, 40:81] = np.clip(pace[40:81, 40:81], 1.0, 3.0)
+        near = grid.cell(60, 50 + n) + np.array([0, 6, -6 * grid.cols, 5 * grid.cols - 5])
+        changed = [Window(w.row0 + 40, w.col0 + 40, w.row1 + 40, w.col1 + 40) for w in dirty]
+        assert followed(grid.cell(60, 50 + n), near, changed) < 2_000
+    assert set(kinds) == {"bounded"}
+    far = np.flatnonzero(np.isfinite(pace))[[0, -1]]
+    far = far[np.isfinite(naive.cost_to_go(pace, grid.cell(60, 70), **RULES[0]).flat[far])]
+    for n in range(4):
+        followed(grid.cell(60, 70 + n), far, [])
+    assert kinds[-1] == ("exact" if strategy == "auto" else "bounded")
 
 
 def test_cells_of_the_grid_are_what_padded_ones_are() -> None:

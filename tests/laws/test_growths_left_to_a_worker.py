@@ -48,8 +48,8 @@ def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
 def test_after_a_jump_the_older_tree_leads_where_it_led_and_follows_the_map() -> None:
     pace = random_pace(np.random.default_rng(1), 40, 40, 5.0, 0.1)
     play = Play(pace, PlannerConfig(k_min=0), has_worker=True, chosen_by=STAGES["rotate"])
-    assert not play.tree.ready
     assert play.last.wants_full
+    play.check()
     play.happen(Job("begin"))
     play.happen(Job("end"))
     before = play.target

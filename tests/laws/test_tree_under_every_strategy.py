@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import slow_twins as naive
 from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import (
@@ -122,13 +123,16 @@ def test_what_got_cheaper_while_a_worker_grew_lowers_the_bounds_that_its_tree_gi
     play.check()
 
 
-def test_a_forced_full_growth_is_a_full_growth() -> None:
+def test_a_forced_range_gives_the_best_route_and_proves_it() -> None:
     pace = random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1)
     play = Play(pace, PlannerConfig(k_min=0, cpu_budget=1e-9), chosen_by=STAGES["rotate"])
     while play.last.kind != "window":
         play.happen(Move(1, 1))
-    assert play.tree.force([0]).kind == "full"
-    assert play.tree.force([0]).kind == "none", "there is nothing better to be had"
+    assert play.tree.force([0]).kind == "forced"
+    route, best = play.tree.routes([0])[0], naive.cost_to_go(play.pace, play.target, **play.rules)
+    assert route.cost_s == pytest.approx(best.flat[0], rel=1e-5)
+    assert route.lower_bound_s == pytest.approx(best.flat[0], rel=1e-4)
+    play.check()
 
 
 @given(st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 5))

@@ -140,14 +140,20 @@ class Play:
         assert self.has_worker or target == self.target
         optimum = naive.cost_to_go(self.pace, target, **self.rules).reshape(-1)
         lethal = ~np.isfinite(self.pace.reshape(-1))
+        known = np.ones(self.grid.cells, np.bool_)
         for cell, route in enumerate(routes):
             if lethal[cell]:
                 assert route.status is RouteStatus.LETHAL_START
+            elif route.status is RouteStatus.NO_TARGET:  # farther than the first growth could go
+                assert self.has_worker
+                assert not self.tree._is_whole
+                assert route.lower_bound_s <= optimum[cell]
+                known[cell] = False
             elif not math.isfinite(optimum[cell]):
                 assert route.status is RouteStatus.UNREACHABLE
             else:
                 assert route.status is RouteStatus.OK
-        served = np.isfinite(optimum) & ~lethal
+        served = np.isfinite(optimum) & ~lethal & known
         cells = np.flatnonzero(served)
         last, seconds = naive.drive(self.grid, self.config, self.pace, self.rules["climb"], routes)
         assert (last[cells] == target).all(), "a route enters a lethal cell, squeezes or leaves the grid"

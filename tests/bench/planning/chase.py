@@ -52,6 +52,7 @@ class Plan:
     max_cells   steps that a route is given for; 0 is the whole route
     judge_every period, in frames, of the check of one target's tree against an exact one
     probes      cells of that check, drawn again each time; vehicles that drive are asked instead
+    within      cells; vehicles and probes are drawn so near to their target. 0: anywhere
     seconds     a strategy that has taken so much CPU time is measured no further; `FEWEST` frames it always gets
     """
 
@@ -63,6 +64,7 @@ class Plan:
     max_cells: int = 0
     judge_every: int = 1
     probes: int = 200
+    within: int = 0
     seconds: float = float("inf")
     seed: int = 1
 
@@ -219,6 +221,8 @@ class _Crowd:
         self._walkers = walkers
         self._rng = rng
         self._exact = TargetTree(field.grid, exact)
+        if plan.within:
+            self.places = [self._near(n, len(each)) for n, each in enumerate(places)]
 
     def step(self) -> None:
         """Moves targets and vehicles by one frame."""
@@ -232,8 +236,17 @@ class _Crowd:
 
     def exact_routes(self, n: int) -> RouteBatch:
         """The first steps of optimal routes to target n, from where it is judged."""
-        cells = self.places[n] if self._plan.speed else self._field.draw(self._plan.probes, self._rng)
+        cells = self.places[n] if self._plan.speed else self._near(n, self._plan.probes)
         return self._tree_of(n).routes(cells, 1)
+
+    def _near(self, n: int, count: int) -> Cells:
+        """Cells to ask from, as near to a target as the plan says."""
+        if not self._plan.within:
+            return self._field.draw(count, self._rng)
+        window = self._field.grid.around(self.targets[n], self._plan.within)
+        rows, cols = np.divmod(self._field.terrain.home, self._field.grid.cols)
+        inside = (rows >= window.row0) & (rows < window.row1) & (cols >= window.col0) & (cols < window.col1)
+        return self._rng.choice(self._field.terrain.home[inside], count)
 
     def _driven(self, n: int) -> Cells:
         routes = self._tree_of(n).routes(self.places[n], self._plan.speed)

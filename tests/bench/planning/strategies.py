@@ -1,4 +1,4 @@
-"""Strategies of following a target beside each other: the paper's tables, and their gap to the optimum.
+"""Strategies of following a target beside each other: the paper's tables, by size, and their gap to the optimum.
 
 The paper is Wan, Zhang, Murray, Kaufman: "Automatic target tracking on multi-resolution terrain". Its set-up is
 taken over: 512 x 512 cells, 300 frames, an edge costs what the cell that it enters costs.
@@ -7,18 +7,20 @@ taken over: 512 x 512 cells, 300 frames, an edge costs what the cell that it ent
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
-from support.fields import Field, make_field
+from support.fields import FIELDS, Field, make_field
 
-from bench.harness import FieldOption, Seed, benchmark, names_of, track
+from bench.harness import FieldOption, Seed, benchmark, names_of, numbers_of, track
 from bench.planning.chase import Plan, Tally, chase
 from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy, Walk
+from swarm.errors import ConfigError
 
 PAPERS: Strategy = "variable_range+multi_resolution"
 TABLE_1 = [(targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)]
@@ -33,6 +35,9 @@ _NOT_STATED = (
     "frame, k_min is {k_min}, and a block is crossed in row or column."
 )
 WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in ("still", "external"))
+Point = tuple[int, int, int]
+"""Cells a side, targets, vehicles."""
+
 _ALLOWED = get_args(Strategy)
 _ALL = ",".join(_ALLOWED)
 _GAPS = ("gap_mean", "gap_p95", "gap_max")
@@ -107,6 +112,81 @@ def _of_table_2(name: Strategy, rows: dict[Strategy, dict[str, Any]]) -> dict[st
     }
 
 
+def points_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int], full: bool) -> list[Point]:
+    """Every combination; or, unless `full`, one thing at a time varied from `base_of`."""
+    if full:
+        return sorted(itertools.product(sizes, targets, vehicles))
+    size, many, count = base_of(sizes, targets, vehicles)
+    return sorted(
+        {(each, many, count) for each in sizes}
+        | {(size, each, count) for each in targets}
+        | {(size, many, each) for each in vehicles}
+    )
+
+
+def base_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int]) -> Point:
+    """The smallest size, and the middle ones of the numbers of targets and vehicles."""
+    return min(sizes), sorted(targets)[len(targets) // 2], sorted(vehicles)[len(vehicles) // 2]
+
+
+@benchmark(
+    columns=("size", "targets", "vehicles", "strategy", "frame_ms_mean", "gap_p95", "proven_p95", "frames"),
+)
+def scale(
+    sizes: Annotated[
+        str | None,
+        typer.Option(help="Cells a side, several with commas.", show_default="512,1024,2048; --full: and 4096"),
+    ] = None,
+    targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10,100",
+    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles.")] = "10,100,1000,10000",
+    strategies: Strategies = _ALL,
+    full: Annotated[bool, typer.Option("--full", help="Every combination: takes hours.")] = False,
+    field: Annotated[str, typer.Option(help="terrain, uniform or maze.")] = "terrain",
+    frames: Frames = 40,
+    seconds: Annotated[float, typer.Option(min=0.01, help="CPU time a strategy gets at each point.")] = 6.0,
+    max_cells: Annotated[int, typer.Option(min=0, help="Steps given to a vehicle; 0 is the whole route.")] = 256,
+    within: Annotated[int, typer.Option(min=0, help="Cells from a target to its vehicles; 0: anywhere.")] = 0,
+    seed: Seed = 1,
+) -> dict[str, Any]:
+    """Milliseconds a frame and gap per strategy, from small to large.
+
+    \b
+    ./launch_scripts/bench scale --sizes 4096 --targets 10 --vehicles 1000 --frames 120
+    ./launch_scripts/bench scale --sizes 128,512,2048 --targets 1 --vehicles 10 --within 60
+
+    Varies one thing at a time, from the smallest size and the middle numbers of targets and vehicles: some four
+    minutes on a quiet machine, and six more for a size of 4096. --full takes every combination. Trees that do not
+    fit into half of the free memory are run in groups.
+    """
+    if field not in FIELDS:
+        raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
+    sizes = sizes or ("512,1024,2048,4096" if full else "512,1024,2048")
+    axes = (numbers_of(sizes, "sizes", 16), numbers_of(targets, "targets"), numbers_of(vehicles, "vehicles"))
+    chosen = names_of(strategies, "strategies", _ALLOWED)
+    load_all()
+    rows: list[dict[str, Any]] = []
+    entrants = {name: PlannerConfig(strategy=name) for name in chosen}
+    stage: Field | None = None
+    for side, many, count in track(points_of(*axes, full)):
+        if stage is None or stage.pace.shape[0] != side:
+            stage = None  # the older one is let go before the next is made
+            stage = Field(make_field(field, side, seed))
+        plan = Plan(
+            targets=many,
+            vehicles=count,
+            frames=frames,
+            max_cells=max_cells,
+            judge_every=min(2, frames),
+            within=within,
+            seconds=seconds,
+            seed=seed,
+        )
+        for name, tally in chase(stage, entrants, plan).items():
+            rows.append({"size": side, "targets": many, "vehicles": count, "strategy": name, **tally.row()})
+    base = dict(zip(("size", "targets", "vehicles"), base_of(*axes), strict=True))
+    return {"field": field, "seconds": seconds, "max_cells": max_cells, "base": base, "rows": rows}
+
+
 @benchmark(columns=("walk", "strategy", *_GAPS, "proven_p50", "proven_p95", "frame_ms_mean", "growths_a_frame"))
 def gap(
     dem: Annotated[str, typer.Option(help="An elevation file, or terrain, uniform, maze.")] = "terrain",
@@ -148,7 +228,7 @@ def gap(
     rows = []
     for (path, name), tally in tallies.items():
         row = {"walk": path, "vehicle_speed": drives[path], "strategy": name, **tally.row()}
-        growths = row["updates"].get("full", 0) + row["updates"].get("job", 0)
+        growths = sum(row["updates"].get(kind, 0) for kind in ("full", "bounded")) + row["updates"].get("job", 0)
         rows.append({**row, "growths_a_frame": round(growths / row["frames"], 2)})
     return {
         "dem": Path(dem).name,
