@@ -183,6 +183,11 @@ class Holdings:
             return path
         return [*path[:1], *takewhile(lambda cell: self.may_enter(vehicle, cell), path[1:])]
 
+    @property
+    def waits(self) -> bool:
+        """True if a vehicle of ours waits for another."""
+        return any(entry.after for path in self._entries.paths.values() for entry in path)
+
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to a later cell of its path. Raises ValueError if it must not be there."""
         while self._paths[vehicle][0] != cell:
