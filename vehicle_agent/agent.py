@@ -34,8 +34,8 @@ from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
-"""A vehicle waits behind others that do not go on for the time of so many cells, or so many seconds if that is
-more."""
+"""Patience of a vehicle behind others that do not go on: the time of this number of cells, or these seconds if that
+is more."""
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 

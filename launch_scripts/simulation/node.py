@@ -223,7 +223,7 @@ class Node:
 
     @property
     def _driven(self) -> int:
-        """How often the service has driven its vehicles, which agents do between ticks, too."""
+        """Number of times that the service has driven its vehicles, which agents do between ticks, too."""
         return getattr(self.service, "driven", 0)
 
     def crash(self) -> None:
