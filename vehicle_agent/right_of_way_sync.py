@@ -171,6 +171,18 @@ class RightOfWaySync:
         for heard in (*self._bus.collected(LEFT), *self._bus.collected(GRANTED)):
             yield self.hear(heard.message, now_ns)
 
+    def is_awaited(self, message: Message) -> bool:
+        """Returns True if a vehicle may stand because it waits for what this says."""
+        holdings = self.core.holdings
+        match message:
+            case Left():
+                return holdings.waits
+            case Granted(grants=grants):
+                return any(len(entries) > 1 and len(holdings.path(id)) < 2 for id, entries in grants.items())
+            case Standing(vehicles=stands):
+                return any(stand.better for stand in stands)
+        return False
+
     def hear(self, message: Message, now_ns: int) -> list[str]:
         """Takes up what a host or a warden says. Returns the vehicles that have found their places by it."""
         match message:

@@ -178,8 +178,10 @@ class AgentService:
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
         if isinstance(event, Heard) and isinstance(event.message, Left | Granted | Standing):
+            awaited = self._right_of_way.is_awaited(event.message)
             self._place(self._right_of_way.hear(event.message, now_ns))
-            self._act(now_ns)
+            if awaited:
+                self._act(now_ns)
             return
         if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
             return

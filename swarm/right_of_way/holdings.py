@@ -12,7 +12,7 @@ import msgspec
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Left, Number, Stand, Standing
+from swarm.wire.messages.traffic import Entry, Granted, Left, Number, Stand, Standing
 
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
@@ -176,12 +176,24 @@ class Holdings:
                 return True
         return False
 
+    def awaits(self, vehicle: str) -> Entry | None:
+        """Returns the next entry of a vehicle while others are before it; None if it may enter, or has none."""
+        for entry in self._entries.paths.get(vehicle, ())[1:2]:
+            if not self._entries.may_enter(entry):
+                return entry
+        return None
+
     def open(self, vehicle: str) -> Sequence[int]:
         """The first cells of a path, up to the first that the vehicle may not enter yet."""
         path = self.path(vehicle)
         if not any(entry.after for entry in self._entries.paths.get(vehicle, ())):
             return path
         return [*path[:1], *takewhile(lambda cell: self.may_enter(vehicle, cell), path[1:])]
+
+    @property
+    def waits(self) -> bool:
+        """True if a vehicle of ours waits for another."""
+        return any(entry.after for path in self._entries.paths.values() for entry in path)
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to a later cell of its path. Raises ValueError if it must not be there."""

@@ -15,7 +15,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left, Stored, Table
+from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -23,6 +23,7 @@ from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWa
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS
 LOOK_AHEAD = 3
+PATIENCE_NS = 8 * TICK_NS
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,7 @@ class Process:
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
         self.own_time = OwnTime(TICK_NS)
         self.ages: dict[str, int] = {}
+        self.waits: dict[str, tuple[Entry | None, int]] = {}
         self.tokens: set[Peer] = set()
 
     def make_rights(self) -> RightOfWay:
@@ -187,9 +189,12 @@ class Process:
 
     def drive(self, vehicle: str) -> None:
         holdings, chance = self.rights.holdings, self.world.chance
-        path = holdings.path(vehicle)
-        waits = len(path) > 1 and not holdings.may_enter(vehicle, path[1])
-        if chance.random() < (0.15 if waits else 0.05):
+        awaits = holdings.awaits(vehicle)
+        entry, since_ns = self.waits.get(vehicle, (None, 0))
+        if awaits != entry:
+            self.waits[vehicle] = awaits, self.world.now_ns
+        waits_long = awaits is not None and awaits == entry and self.world.now_ns - since_ns > PATIENCE_NS
+        if waits_long or chance.random() < 0.05:
             holdings.give_back(vehicle)
         while len(holdings.path(vehicle)) > 1 and chance.random() < 0.7:
             cell = holdings.path(vehicle)[1]

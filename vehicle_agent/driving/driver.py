@@ -9,6 +9,7 @@ from itertools import pairwise
 from shared_map.terrain.step_climb import Climb, may_be_pulled
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
+from swarm.wire.messages.traffic import Entry
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
@@ -55,8 +56,8 @@ class Driver:
         self._pulled = pulled and may_be_pulled(local_map.climb)
         self._left_s: dict[str, float] = {}
         self.patience_ns = NS_PER_S
-        self._waits: dict[str, tuple[int, int]] = {}
-        """Vehicle -> the cell before which it waits for others, and since when."""
+        self._waits: dict[str, tuple[Entry, int]] = {}
+        """Vehicle -> the entry which waits for others, and since when nothing has changed."""
         self._rolling: set[str] = set()
         """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
         measured."""
@@ -160,14 +161,14 @@ class Driver:
 
     def wait(self, vehicle: Vehicle, now_ns: int) -> None:
         """Gives back entries behind others that have not gone on for long, so that no circle of waiting lasts."""
-        path = self._holdings.path(vehicle.id)
-        if len(path) < 2 or self._holdings.may_enter(vehicle.id, path[1]):
+        awaits = self._holdings.awaits(vehicle.id)
+        if awaits is None:
             self._waits.pop(vehicle.id, None)
             return
-        since = self._waits.setdefault(vehicle.id, (path[1], now_ns))
-        if since[0] != path[1]:
-            self._waits[vehicle.id] = path[1], now_ns
-        elif now_ns - since[1] > self.patience_ns:
+        before, since_ns = self._waits.setdefault(vehicle.id, (awaits, now_ns))
+        if before != awaits:  # another, or one of those before it has gone on
+            self._waits[vehicle.id] = awaits, now_ns
+        elif now_ns - since_ns > self.patience_ns:
             del self._waits[vehicle.id]
             vehicle.motion.turn_back()
             self._holdings.give_back(vehicle.id)

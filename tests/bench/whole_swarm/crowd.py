@@ -20,6 +20,7 @@ from bench.whole_swarm.ideal_crowd import drive_ideal
 from launch_scripts.simulation import worlds as crowded
 from launch_scripts.simulation.many_seeds import in_processes, parse_seeds
 from launch_scripts.simulation.worlds import CROWDS
+from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.runtime.process import collected_rarely
 from swarm.wire.fields import column
@@ -104,6 +105,7 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
     began_s = time.perf_counter()
     simulation, limit = Simulation(scenario, terrain=terrain), TimeLimit(LIMIT_S)
     drives = Drives(terrain.grid.cols)
+    steps: dict[str, int] = {}
     ideal, alone = (
         drive_ideal(terrain.pace_s_per_m, vehicles, seed, int(seconds / STEP_S), follow) for follow in (True, False)
     )
@@ -111,7 +113,11 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
     def hear(event: Event) -> None:
         assert isinstance(event, Heard)
         assert isinstance(event.message, Fleet)
-        drives.hear(event.message)
+        # Agents report between ticks, too: the first report of each step counts.
+        step = int(event.message.stamp_ns / NS_PER_S / STEP_S)
+        if steps.get(event.message.author) != step:
+            steps[event.message.author] = step
+            drives.hear(event.message)
 
     simulation.network.bus("crowd-0", scenario.network.namespace).subscribe(FLEET, hear)
     with collected_rarely():
