@@ -6,7 +6,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,8 +14,6 @@ from typing import Literal
 from swarm.config.ground import WayConfig
 
 Kind = Literal["road", "water"]
-MOST_WIDTH_M = 10_000.0
-"""The bound of widths in settings, too (`width_m` in `swarm.config.ground`): a wider line is a mistake of units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,34 +28,22 @@ class Way:
     factor: float | None
 
 
-def _built_in() -> dict[Kind, dict[str, Way]]:
-    tables = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
-    kinds: tuple[Kind, ...] = ("road", "water")
-    return {
-        kind: {
-            name: Way(width_m, None if factor == "lethal" else factor)
-            for name, (width_m, factor) in tables[kind].items()
-        }
-        for kind in kinds
-    }
+_TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
 
 
-BUILT_IN: Mapping[Kind, Mapping[str, Way]] = _built_in()
+def _built_in(kind: Kind) -> dict[str, Way]:
+    rows = _TABLES[kind].items()
+    return {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows}
+
+
+BUILT_IN: Mapping[Kind, Mapping[str, Way]] = {"road": _built_in("road"), "water": _built_in("water")}
 COLUMNS: Mapping[Kind, tuple[str, ...]] = {
     "road": ("highway", "fclass"),
     "water": ("waterway", "natural", "landuse", "fclass"),
 }
 """Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "area", "inclusion")
-_MOST_RADIUS_M = 200_000.0
-_EXTENTS = {
-    "radius": (2.0, _MOST_RADIUS_M),
-    "radius_m": (2.0, _MOST_RADIUS_M),
-    "diameter": (1.0, 2 * _MOST_RADIUS_M),
-    "width": (1.0, MOST_WIDTH_M),
-    "width_m": (1.0, MOST_WIDTH_M),
-    "est_width": (1.0, MOST_WIDTH_M),
-}
+_EXTENTS: Mapping[str, Sequence[float]] = _TABLES["extents"]
 """Columns of a point's or a line's own extent, in any case -> its width over it, and the largest width, metres."""
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""

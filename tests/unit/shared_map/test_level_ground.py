@@ -88,10 +88,12 @@ DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
 REAL = {"davosdorf": DATA / "davosdorf/davosdorf.tif"}
 FILTERS = [(how, factor) for how in ("bilinear", "cubic", "lanczos") for factor in (0.7, 1.5, 2.0, 3.0)]
 RESAMPLED = {
-    "coast, 48 % sea, float32": 0.03,
-    "coast, 75 % sea, float32": 0.03,
+    "coast, 48 % sea, float32": 0.025,
+    "coast, 75 % sea, float32": 0.02,
     "coast, laser, +-0.1 m everywhere": 0.02,
     "lakes, laser, +-0.1 m on water": 0.05,
+    "coast, whole metres": 0.05,
+    "lakes, whole metres": 0.13,
     "davosdorf": 0.07,
 }
 """Model -> share of its water that a resampling may take, whose shores are a cell wide."""
