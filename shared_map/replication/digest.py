@@ -48,6 +48,10 @@ class Ledger:
             if not numbers:
                 del self._numbers[author]
 
+    def tiles_of(self, author: str) -> list[int]:
+        """Tiles of which a set of an author is held, in order."""
+        return sorted(self._numbers.get(author, ()))
+
     @property
     def authors(self) -> list[str]:
         """Authors of whom a set is held, in order."""

@@ -197,7 +197,8 @@ class HeldSets:
     def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
         """The sets of `answer`, and None after those of each tile, found as they are needed."""
         wanted = frozenset(request.authors)
-        for tile in sorted(set(request.tiles)) if request.tiles else self.tiles:
+        every = self.tiles if author is None else self.ledger.tiles_of(author)
+        for tile in sorted(set(request.tiles)) if request.tiles else every:
             if author is None:
                 yield from (each for each in self.of_tile(tile) if not wanted or each.author in wanted)
             elif not wanted or author in wanted:

@@ -55,6 +55,9 @@ def test_what_was_lost_is_fetched_after_comparing_digests(sets: list[MarkSet], l
     for author, tiles in asked:
         for each in whole.held.answer(MarksRequest(authors=[author], tiles=tiles)):
             assert partial.merge([each]).sets == [each], "only what differs is fetched"
+        theirs = list(whole.held.asked(MarksRequest(), author))
+        assert [each for each in theirs if each] == whole.held.answer(MarksRequest(authors=[author]))
+        assert theirs.count(None) == len(theirs) / 2, "only tiles of the author are looked at"
     assert partial.missing(whole.held.ledger.held()) == []
     assert fingerprint(partial.held.ledger.held()) == fingerprint(whole.held.ledger.held())
     # Sets that differ under one number are damage, which digests do not show.
