@@ -31,6 +31,8 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.vehicles import VehicleState
 
 BACKGROUND = (17, 22, 28)
+_BARE = (44, 50, 52)
+"""Colour of ground whose picture has not come yet; rerun's own is white."""
 WIDTH_PX, HEIGHT_PX = 1840, 156
 _TEXT = (223, 227, 232)
 _ROWS = ((4, 25), (5, 21))
@@ -244,6 +246,7 @@ def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None)
             kind=rrb.Eye3DKind.Orbital, position=eye, look_target=look, eye_up=(0, 0, 1)
         ),
         overrides=_sizes(level_for(vehicles)),
+        defaults=[rr.Mesh3D.from_fields(albedo_factor=_BARE)],
     )
 
 

@@ -37,8 +37,9 @@ from swarm.files import check_writable, writing
 
 log = logging.getLogger(__name__)
 
-_MEMORY = "32MiB"
-"""Limit of the stream's store for later viewers; the oldest goes first. The process grows by twice as much."""
+_MEMORY = "4MiB"
+"""Limit of the stream's store for later viewers; the oldest goes first. About as much as everything once: a viewer
+comes to what is drawn for it only after all of this, on bare ground."""
 _PACK_S = 1.0
 """Interval at which rerun packs logged data of an entity into one chunk, unless the service flushes it for viewers.
 Ten chunks a second take its threads five times the CPU, and twice the space."""

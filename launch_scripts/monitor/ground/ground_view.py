@@ -72,6 +72,7 @@ _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
 _MARGIN_COLOUR = (200, 206, 214)
 _LINE_PX = 1.3
+_AS_PAINTED = (255, 255, 255)
 _WHOLE_SIDE = 112
 _BAR_SHARE = 0.25
 """Largest share of the terrain's width."""
@@ -228,7 +229,9 @@ class GroundView:
         height, width, _ = image.shape
         form = rr.components.ImageFormat(width=width, height=height, color_model="RGB", channel_datatype="U8")
         pixels = np.ascontiguousarray(image).tobytes()
-        texture = rr.Mesh3D.from_fields(albedo_texture_buffer=pixels, albedo_texture_format=form)
+        texture = rr.Mesh3D.from_fields(
+            albedo_texture_buffer=pixels, albedo_texture_format=form, albedo_factor=_AS_PAINTED
+        )
         self._pen.log(f"{entity}/{tile}", texture)
 
     def _legend(self, layer: Layer) -> None:

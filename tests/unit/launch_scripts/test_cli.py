@@ -57,11 +57,6 @@ def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     assert own == TlsConfig(ca=ca, certificate=str(tmp_path), key=str(tmp_path))
 
 
-def test_options_override_the_network_of_the_file() -> None:
-    changed = options.with_network(Scenario(), connect="tcp/127.0.0.1:9", namespace="other").network
-    assert (changed.connect, changed.namespace) == (("tcp/127.0.0.1:9",), "other")
-
-
 def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> None:
     scenario = options.with_port(Scenario(), 8000)
     assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)

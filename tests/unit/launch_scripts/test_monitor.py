@@ -103,6 +103,9 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
+    assert {"albedo_factor", "albedo_texture_buffer"} <= components(
+        tmp_path / "run.rrd", "/world/ground/0"
+    ).keys(), "a picture is as bright as it is painted, bare ground is not"
 
 
 def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[Any]]:
