@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import zenoh
@@ -15,6 +15,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.topics import FLEET, POSE
 
 _WAITING = 10_000
@@ -34,7 +35,8 @@ class Attacker:
         """Key -> the last sample under it."""
         self._namespace = network.namespace
         self._captures: dict[str, int] = {}
-        """Target -> how often it was captured, by its last pose."""
+        """Target -> how often it was captured, by its last pose. A tracker that starts again counts from 0."""
+        self._captured = 0
         self._heard = (
             self._subscribe(FLEET.expression(network.namespace), self._hear_fleet),
             self._subscribe(POSE.expression(network.namespace), self._hear_pose),
@@ -49,12 +51,13 @@ class Attacker:
 
     def _hear_pose(self, sample: Any) -> None:
         with contextlib.suppress(ProtocolError):
-            pose = decode(sample.payload.to_bytes(), POSE.message)
-            self._captures[pose.target] = pose.captures  # type: ignore[attr-defined]
+            pose = cast(TargetPose, decode(sample.payload.to_bytes(), POSE.message))
+            self._captured += max(pose.captures - self._captures.get(pose.target, 0), 0)
+            self._captures[pose.target] = pose.captures
 
     def captures(self) -> int:
         """Captures of all targets until now."""
-        return sum(self._captures.values())
+        return self._captured
 
     def _hear(self, sample: Any) -> None:
         key = str(sample.key_expr)
