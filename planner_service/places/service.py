@@ -51,8 +51,10 @@ TREES_BYTES = 256 << 20
 """Room for the trees that are kept, of all classes together, besides one in hand of each class."""
 SLICE_CELLS = 1 << 16
 """Cells that are grown before others have their turn: 1 to 4 ms."""
-_MOST_WAITING, _MOST_EACH = 4096, 256
-"""Questions that wait, of all askers and of one. Of more the oldest are refused."""
+_MOST_WAITING, _MOST_EACH = 1 << 17, 1 << 15
+"""Prices of the questions that wait, of all askers and of one. Of more the oldest are refused."""
+_BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
+"""Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
 _HOLD_NS = NS_PER_S
 """A question waits so long at most for its growth; then it is answered as far as it is known."""
 _CELL_NS = 25
@@ -282,16 +284,16 @@ class PlacesService:
 
     def _wait(self, question: _Question, price: int) -> None:
         asker = question.event.asker
-        dropped = self._waiting.put(asker, question, price=price, rank=0 if is_own(asker) else 1)
-        if dropped is not None:
+        for dropped in self._waiting.put(asker, question, price=price, rank=0 if is_own(asker) else 1):
             self._refuse(dropped.event, "too many questions wait here already: ask again in a second")
 
     def _price(self, request: PlaceRouteRequest) -> int:
-        """Cells that a slice of an answer will grow at most: three times the square of the way there."""
+        """The price of the next slice: a growth takes about three times the square of the distance in cells."""
         cols = self._cost_map.grid.cols
         row, col = divmod(request.to, cols)
         away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
-        return min(3 * max(away, default=0) ** 2, SLICE_CELLS) + len(request.cells) + 1
+        cells = min(3 * max(away, default=0) ** 2, SLICE_CELLS)
+        return _BASE_PRICE + len(request.cells) + cells // _CELLS_OF_A_PRICE
 
     def _go_on(self) -> None:
         """Gives the worker the next slice, if it has none."""
