@@ -45,7 +45,7 @@ class Collision:
     evidence: tuple[Stay, Stay] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
-        """Returns what was found, and the reports which prove it; times are since the run began."""
+        """Returns the finding and the reports which prove it; times are since the run began."""
         return f"{self.first} and {self.second} on one cell{_proven(self.evidence, began_ns)}"
 
 
@@ -59,7 +59,7 @@ class LethalEntry:
     evidence: tuple[Stay] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
-        """Returns what was found, and the report which proves it."""
+        """Returns the finding and the report which proves it."""
         return f"{self.vehicle} entered a lethal cell{_proven(self.evidence, began_ns)}"
 
 
@@ -80,7 +80,7 @@ class BodyHit:
     evidence: tuple[Stay, Cover] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
-        """Returns what was found, and the reports which prove it."""
+        """Returns the finding and the reports which prove it."""
         if self.by_vehicle:
             found = f"{self.vehicle} drove into body {self.body}, which had closed the cell for {self.said_s:.1f} s"
         elif self.said_s < 0.0:
