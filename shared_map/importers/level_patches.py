@@ -100,9 +100,8 @@ def level_patches(
     from scipy import ndimage
 
     first = np.full(many, np.nan, np.float32)
-    at, where = np.unique(labels, return_index=True)
-    first[at] = elevation_m.reshape(-1)[where]
-    first[0] = np.nan
+    at = np.flatnonzero(labels)[::-1]  # backwards: the value of a patch's first cell is written last
+    first[labels.reshape(-1)[at]] = elevation_m.reshape(-1)[at]
     total_m, total_m2 = np.zeros((2, many))
     for row0, row1 in bands(elevation_m.shape[0]):
         of_cell = labels[row0:row1][(inside := labels[row0:row1] > 0)]
