@@ -78,7 +78,8 @@ def built(
         case "places":
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
-            return PlacesService(setup, terrain, bus, post, boundary.function("kernels of classes", None, bool))
+            ready: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
+            return PlacesService(setup, terrain, bus, post, boundary.worker(outside.worker), ready)
         case "targets":
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)

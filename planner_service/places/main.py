@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import closing
 
 from planner_service.kernel_build import KernelLoader, place_kernels
 from planner_service.places.service import PlacesService
@@ -13,7 +14,7 @@ from swarm.bus.bus import Bus
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import tick_phase
+from swarm.runtime.process import ThreadWorker, tick_phase
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
 
     def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> PlacesService:
         ready = boundary.function("kernels of classes", lambda: kernels.classes_complete, bool)
-        return PlacesService(setup, terrain, bus, inbox.post, ready)
+        return PlacesService(setup, terrain, bus, inbox.post, boundary.worker(worker), ready)
 
-    run_role(setup, terrain.digest, stop_when, make, inbox, scenario.planner.tick_hz, tick_phase(setup.id))
+    with closing(ThreadWorker("grow-goals", inbox)) as worker:
+        tick_hz = scenario.planner.tick_hz
+        run_role(setup, terrain.digest, stop_when, make, inbox, tick_hz, tick_phase(setup.id))

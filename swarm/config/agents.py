@@ -60,6 +60,10 @@ def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
     ]
 
 
+PLACE_TREES_BYTES = 256 << 20
+"""Trees to places, of all classes, that one process keeps. Beside them one of each class is in hand."""
+
+
 def places_of(scenario: Scenario) -> list[str]:
     """Ids of the processes that plan routes to places."""
     return ["all"] if scenario.planner.places else []

@@ -15,6 +15,7 @@ import planner_service.places.service as places
 from planner_service.places.service import PlacesService, read_by_all
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.bus.scheduler import InlineWorker
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.wire.messages.map_data import MarkKind
@@ -31,7 +32,9 @@ class PlacesWorld(SwarmModel):
     def __init__(self, pace: Pace) -> None:
         super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario("[[targets]]\n[[groups]]"))
         setup = self.setup("places", "all")
-        self.service = self.start("places", lambda bus, post: PlacesService(setup, self.terrain, bus, post))
+        self.service = self.start(
+            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+        )
         self.client = self.bus("client")
         self.run(1.0)
 
@@ -47,11 +50,15 @@ class PlacesWorld(SwarmModel):
         while True:
             heard = self.ask(to, *cells, **fields)
             self.until(lambda heard=heard: heard, within_s=2.0)  # type: ignore[misc]
-            assert isinstance(heard[0], Replied), heard
-            reply = heard[0].message
-            assert isinstance(reply, PlaceRouteReply)
+            reply = reply_of(heard)
             if reply.status != "growing":
                 return reply
+
+
+def reply_of(heard: list[Event]) -> PlaceRouteReply:
+    assert isinstance(heard[0], Replied), heard
+    assert isinstance(heard[0].message, PlaceRouteReply)
+    return heard[0].message
 
 
 @pytest.mark.seeds(5)
@@ -100,11 +107,27 @@ def test_a_part_of_a_route_says_what_the_rest_costs() -> None:
     assert part.cost_s == whole.cost_s
 
 
+def test_a_far_goal_grows_by_slices_and_a_near_one_does_not_wait_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "_SLICE_CELLS", 64)
+    world = PlacesWorld(flat())
+    far = world.ask(GRID.cell(1, 1), GRID.cell(30, COLS - 2), asker="rover.far")
+    near = world.ask(GRID.cell(2, 2), GRID.cell(2, 4), asker="rover.near")
+    world.until(lambda: near, within_s=2.0)
+    assert not far, "the near one came later and is answered first"
+    world.until(lambda: far, within_s=2.0)
+    assert [reply_of(heard).routes[0].status for heard in (far, near)] == [RouteStatus.OK] * 2
+    monkeypatch.setattr(places, "_WITHIN_NS", 0)
+    other = world.ask(GRID.cell(30, 1), GRID.cell(30, 1), GRID.cell(1, COLS - 2))
+    world.until(lambda: other, within_s=2.0)
+    reply = reply_of(other)
+    assert reply.status == "growing", "time is up after its first slice"
+    assert [route.status for route in reply.routes] == [RouteStatus.OK, RouteStatus.NO_TARGET]
+
+
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(places, "_BUDGET_BYTES", 100_000)
-    monkeypatch.setattr(places, "_AT_ONCE_CELLS", 4 * GRID.cells)
+    monkeypatch.setattr(places, "PLACE_TREES_BYTES", 100_000)
     world = PlacesWorld(flat())
     chance = random.Random(1)
     asked = [
