@@ -26,7 +26,7 @@ HostName = Annotated[
     ),
 ]
 """A label of DNS, so that it can be part of a host's name, a unit's and a certificate's."""
-HostRole = Literal["router", "keeper", "monitor", "planner", "targets", "agent"]
+HostRole = Literal["router", "keeper", "monitor", "planner", "places", "targets", "agent"]
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 HOST_ROLES: tuple[HostRole, ...] = get_args(HostRole)
 

@@ -29,7 +29,7 @@ from swarm.liveness import job_of
 
 LAUNCHER_CORES = 0.06
 """Cores that a machine's launcher takes in a swarm of 1,000 vehicles, by `./launch_scripts/bench swarm`."""
-_CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09}
+_CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09, "places": 0.1}
 """Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, by `./launch_scripts/bench swarm`."""
 _CORES_PER_VEHICLE = 0.00066
 """Cores of an agent; from the same table."""
@@ -157,7 +157,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
     for role in ROLES:
-        if TABLE[role].expendable:
+        if TABLE[role].expendable or not TABLE[role].jobs(scenario):
             continue
         found = sum(role in host.roles for host in hosts.hosts)
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))

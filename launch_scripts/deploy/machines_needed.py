@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from launch_scripts.process_table import LAUNCHER, ROLES
+from launch_scripts.process_table import LAUNCHER
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
@@ -136,7 +136,7 @@ class Estimate:
 
     def __init__(self, swarm: Swarm, standbys: int = 0) -> None:
         self._swarm = swarm
-        self._count = dict.fromkeys((*ROLES, LAUNCHER), 1)
+        self._count = dict.fromkeys((*_SINGLE, *_SPREAD, "router", LAUNCHER), 1)
         self._count |= {"agent": swarm.agents, "planner": swarm.targets * (1 + standbys)}
         self._one = one_process(swarm)
         self._cpu = {role: self._one["cpu_ms_per_s"][role] / 1000 for role in self._count}

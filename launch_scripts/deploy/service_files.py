@@ -113,6 +113,7 @@ def _words(process: PlannedProcess, run_id: str) -> list[str]:
         "planner": ["--target", job, "--rank", str(rank)],
         "targets": ["--rank", str(rank)],
         "monitor": [],
+        "places": [],
     }.get(process.role, ["--id", process.id])
     run = [] if process.role == ROUTER else ["--run-id", run_id]
     told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]

@@ -190,7 +190,7 @@ def new_run_id() -> str:
 _HIGHEST = 1 << 61
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
-_LATER_KEYS = (("map", "plot_regions"),)
+_LATER_KEYS = (("map", "plot_regions"), ("planner", "places"))
 """Sections and keys that the version before does not know: at their default they change no id, so that parts of
 both versions agree on one."""
 

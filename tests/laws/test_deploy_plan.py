@@ -18,7 +18,7 @@ from launch_scripts.launcher.options import UpOptions, chosen_processes
 from launch_scripts.process_table import processes_of
 from swarm.bus.access_control import access_control
 from swarm.config.agents import plan_agents
-from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig, VehicleConfig
+from swarm.config.scenario import GroupConfig, PlannerConfig, Scenario, StandbyConfig, TargetConfig, VehicleConfig
 from swarm.errors import ConfigError
 
 SCENARIOS = st.builds(
@@ -27,6 +27,7 @@ SCENARIOS = st.builds(
         groups=tuple(GroupConfig(name=f"g{n}", vehicles=vehicles) for n, vehicles in enumerate(groups)),
         vehicles=VehicleConfig(per_agent=per_agent),
         standbys=StandbyConfig(planner=planners, targets=movers),
+        planner=PlannerConfig(places=movers > 0),
     ),
     st.integers(1, 12),
     st.lists(st.integers(1, 120), min_size=1, max_size=3),

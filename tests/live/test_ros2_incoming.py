@@ -236,3 +236,11 @@ def test_a_polygon_is_a_zone_and_a_grid_is_marks_until_they_are_drawn_again(
     assert swarm.frame.grid.cell(90, 21) not in lethal()
     peer.put("/works", "geometry_msgs/msg/PolygonStamped", hz=2, header={"frame_id": "map"})
     eventually(lambda: not swarm.orders().zones(), 15, "the end of the zone")
+
+
+def test_a_vehicle_of_the_swarm_is_sent_where_ros_says(swarm: Swarm, peer: RosPeer) -> None:
+    orders, place = swarm.orders(), pose_at(swarm, 40, 60)
+    eventually(lambda: peer.put("/a0_01/goal_pose", POSE, **place) or orders.goals(), 20, "a goal")
+    (goals,) = orders.goals()
+    assert (goals.name, goals.cells, goals.then) == ("a0-01", [swarm.frame.grid.cell(40, 60)], "hold")
+    orders.recall("a0-01")

@@ -142,7 +142,7 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("check", "m") == ["mine.toml", "maps/"] or offered("check", "m") == ["maps/", "mine.toml"]
     assert offered("simulate", "maps/a") == ["maps/alps.toml"]
     assert offered("simulate", "ma") == ["maps/", "maze"]
-    assert offered("up", "jacksboro", "--only", "p") == ["planner"]
+    assert offered("up", "jacksboro", "--only", "p") == ["planner", "places"]
     assert offered("runs", "compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
     assert "LAST" in offered("runs", "compare", "")
     monkeypatch.chdir(newest_run / "maps")
