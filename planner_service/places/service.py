@@ -44,7 +44,7 @@ _SLICE_NS = 2_000_000
 _CELLS_OF_A_PRICE = 1 << 8
 """Cells grown at the price of one route that needs no growth, some 10 us."""
 _WITHIN_NS = NS_PER_S // 2
-"""A question that still grows after so long is answered with what is known."""
+"""A question that still grows after so long is answered with the routes that are known."""
 _TAG = "grow-goals"
 _MOST_ROUTES = 1000
 _MOST_HELD = 4096
@@ -102,7 +102,7 @@ class _Question:
 
 @dataclass(frozen=True, slots=True)
 class _Slice:
-    """A turn's result: routes that are known by now, and what was grown for them."""
+    """The result of a turn: routes that are known by now, and the cells grown for them."""
 
     routes: list[Route]
     grown_cells: int
