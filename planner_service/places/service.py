@@ -30,7 +30,7 @@ from shared_map.vehicle_class_grounds import class_terrains
 from shared_map.vehicle_class_maps import ClassMaps
 from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
-from swarm.config.agents import place_job, plan_agents, readable_groups
+from swarm.config.agents import PLACE_TREES_BYTES, place_job, plan_agents, readable_groups
 from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND, class_numbers
 from swarm.grid import GridSpec
@@ -47,8 +47,6 @@ from swarm.wire.topics import PLACE_ROUTE, asker_of, is_own
 
 log = logging.getLogger(__name__)
 
-TREES_BYTES = 256 << 20
-"""Room for the trees that are kept, of all classes together, besides one in hand of each class."""
 SLICE_CELLS = 1 << 16
 """Cells that are grown before others have their turn: 1 to 4 ms."""
 _MOST_WAITING, _MOST_EACH = 1 << 17, 1 << 15
@@ -308,7 +306,9 @@ class PlacesService:
         if trees is None:
             cost_map = self._cost_map if name == GROUND else self._maps.of[name]
             costs = CostGrid(cost_map.grid, self._scenario.planner, cost_map.terrain.climb)
-            trees = self._classes[name] = _ClassTrees(cost_map, costs, TREES_BYTES // (1 + len(self._maps.of)))
+            trees = self._classes[name] = _ClassTrees(
+                cost_map, costs, PLACE_TREES_BYTES // (1 + len(self._maps.of))
+            )
             log.info("places of %s: trees for the class %s", self._job, name)
         return trees
 

@@ -182,9 +182,12 @@ class Swarm:
         request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)
         while True:
             waiting = self._session.ask(PLACE_ROUTE, request, timeout_s, asker=asker_of(OPERATOR, "client"))
-            reply: PlaceRouteReply = self._session.answers(waiting, timeout_s)[0]
-            if reply.status != "growing" or time.monotonic() >= until_s:
-                return Route.of(self.frame, reply.routes[0], reply)
+            try:
+                reply: PlaceRouteReply = self._session.answers(waiting, timeout_s)[0]
+                if reply.status != "growing" or time.monotonic() >= until_s:
+                    return Route.of(self.frame, reply.routes[0], reply)
+            except (ValueError, IndexError) as error:
+                raise BusError(f"the planner of places answers nonsense: {error}") from error
 
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... For the user of the swarm, or with certificates

@@ -62,6 +62,10 @@ def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
     ]
 
 
+PLACE_TREES_BYTES = 256 << 20
+"""Trees to places, of all classes, that one process keeps. Beside them one of each class is in hand."""
+
+
 def places_of(scenario: Scenario) -> list[str]:
     """The processes that plan between any two places: one for all groups which read the marks of the same groups,
     named after the first of them."""

@@ -30,6 +30,9 @@ walk = "external"
 name = "goal"
 count = 2
 walk = "external"
+
+[planner]
+places = true
 """
 ODOMETRY, POSE, PLAN = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "nav_msgs/srv/GetPlan"
 CERTIFICATE = "diagnostic_msgs/msg/DiagnosticStatus"

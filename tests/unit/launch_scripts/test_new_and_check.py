@@ -23,7 +23,7 @@ from launch_scripts.commands.scenario_commands import Choices, _asked
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.agents import plan_agents
+from swarm.config.agents import PLACE_TREES_BYTES, plan_agents
 from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
@@ -322,6 +322,15 @@ def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 1.7 cores busy, and there" in found.text
     assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
     assert list(machine.against(scenario, wanted, machine.Machine(4, 1 << 40, 1 << 50), Path())) == []
+
+
+def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_hand_of_each_class() -> None:
+    lone, with_places = (
+        machine.needs_of(parse_scenario(f'[[groups]]\n[[targets]]\n[[classes]]\nname = "mule"\n{more}'), 2048**2)
+        for more in ("", "[planner]\nplaces = true")
+    )
+    least = PLACE_TREES_BYTES + 2 * 20 * 2048**2
+    assert least < with_places.memory_bytes - lone.memory_bytes < least + (128 << 20)
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ def test_a_part_of_a_route_says_what_the_rest_costs() -> None:
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(places, "TREES_BYTES", 100_000)
+    monkeypatch.setattr(places, "PLACE_TREES_BYTES", 100_000)
     world = PlacesWorld(flat())
     chance = random.Random(1)
     asked = [

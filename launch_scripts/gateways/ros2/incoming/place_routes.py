@@ -79,18 +79,14 @@ class PlaceRoutes:
             answer(f"{MOST_WAITING} questions wait already")
 
     def to_place(self, goal: Place, start: Place, vehicle_class: str, answer: Answer) -> None:
-        """Finds the route to a place; the target that stands for it is given back with the answer."""
-        try:
-            lent = self.lend(goal)
-        except SwarmError as error:
-            answer(str(error))
-            return
+        """Finds the route to a place; no target is lent for it."""
 
-        def give_back(found: Route | str) -> None:
-            self.give_back(lent)
-            answer(found)
+        def find() -> None:
+            ends = (start.x_m, start.y_m), (goal.x_m, goal.y_m)
+            answer(self._swarm.route(*ends, vehicle_class=vehicle_class, timeout_s=PATIENCE_S))
 
-        self.to_target(lent, start, vehicle_class, give_back, self._swarm.frame.cell(goal.x_m, goal.y_m))
+        if not self._queue.give("a route to a place", find, answer):
+            answer(f"{MOST_WAITING} questions wait already")
 
     def close(self) -> None:
         """Answers what waits."""
