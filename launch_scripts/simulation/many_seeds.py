@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import random
 import re
 import signal
 import time
@@ -18,7 +19,7 @@ import msgspec
 
 from launch_scripts.parent_death import end_with_parent
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.laws import BrokenLaw, LawBook
+from launch_scripts.simulation.laws import SLOW_MS, BrokenLaw, LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import MIXED, world
 from shared_map.terrain.terrain import build_terrain
@@ -35,6 +36,9 @@ SECONDS = 30.0
 """Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""
 _STUTTER = 0.01
 """Share of calls within which processes are stopped, in every second seed."""
+_SLOW_SEEDS = (6, 7)
+"""Remainders by 8 of seeds with a slow link. One of the two also has processes stopped."""
+_SLOWEST_MS = 1000.0
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,6 +91,8 @@ def try_seed(
     plan = random_plan(scenario, seed, seconds)
     if not plan.hangs and seed % 2:  # a hang would end a stop early
         plan = replace(plan, stutter=_STUTTER)
+    if seed % 8 in _SLOW_SEEDS:
+        plan = replace(plan, delay_ms=random.Random(f"slow/{seed}").uniform(SLOW_MS, _SLOWEST_MS))
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     began_s = time.perf_counter()
     book = LawBook(simulation)
