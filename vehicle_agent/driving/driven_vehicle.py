@@ -130,7 +130,7 @@ class Vehicle:
         """Doubles with each unanswered request, until a route comes."""
         self._ask_due_ns = 0
         self._routed_ns = 0
-        """When it asked for a route last."""
+        """Time when it asked for a route last."""
 
     @property
     def cell(self) -> int:
