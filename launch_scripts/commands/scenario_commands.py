@@ -174,6 +174,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         "seconds": chosen.seconds,
         "terrain": terrain,
         "cost": cost if chosen.preset else {**cost, "max_slope_deg": 35.0},
+        "planner": {"places": True},
         "targets": [
             {
                 "name": "t" if (chosen.targets or 0) > 1 else "t0",
