@@ -129,7 +129,7 @@ class Vehicle:
         """Doubles with each unanswered request, until a route comes."""
         self._ask_due_ns = 0
         self._routed_ns = 0
-        """When it asked for a route last."""
+        """Time of its last question for a route."""
 
     @property
     def cell(self) -> int:
