@@ -112,17 +112,6 @@ def a_silent_guest_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Warden, "tick", leasing)
 
 
-def a_new_life_speaks_before_it_knows_where_it_stands(patch: pytest.MonkeyPatch) -> None:
-    begin = Guest.begin
-
-    def rash(self: Guest, chance: int):  # type: ignore[no-untyped-def]
-        actions = begin(self, chance)
-        self._host.holdings._entries.bodies.clear()
-        return actions
-
-    patch.setattr(Guest, "begin", rash)
-
-
 def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
 
@@ -172,7 +161,6 @@ def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPat
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     first_cells_are_entered_while_others_are_there,
     a_silent_guest_loses_its_cells,
-    a_new_life_speaks_before_it_knows_where_it_stands,
     a_first_cell_is_taken_from_a_table_that_is_about_to_free_it,
     a_robot_that_is_replaced_says_that_it_has_ended,
     a_robot_drives_on_though_it_is_replaced,

@@ -266,7 +266,7 @@ class Interplay:
         """A vehicle that has left by its agent's word stands on no cell."""
         if isinstance(node.service, AgentService):
             bodies = self.trial._cells.get(node.name, {})
-            gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._away)
+            gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._entries.away)
             for id in gone:
                 bodies.pop(id, None)
             self.removed |= gone

@@ -48,7 +48,7 @@ def test_processes_do_nothing_that_the_router_would_deny(monkeypatch: pytest.Mon
     scenario = msgspec.structs.replace(SMALL, targets=targets, vehicles=vehicles, standbys=standbys)
     done: set[tuple[str, str, str]] = set()
     for method, message in {
-        "publish_bytes": "put", "subscribe": "declare_subscriber", "serve": "declare_queryable", "ask": "query",
+        "publish": "put", "subscribe": "declare_subscriber", "serve": "declare_queryable", "ask": "query",
     }.items():  # fmt: skip
         note(monkeypatch, method, message, done)
     Simulation(scenario).run_until(6)
@@ -71,8 +71,7 @@ def note(monkeypatch: pytest.MonkeyPatch, method: str, message: str, done: set[t
     real = getattr(MemoryBus, method)
 
     def noted(bus: MemoryBus, topic: Topic, *args: Any, **kwargs: Any) -> None:
-        fields: Mapping[str, str | int] = args[-1] if message == "put" else kwargs
-        fields = {name: fields[name] for name in topic.fields if name in fields}
+        fields: Mapping[str, str | int] = {name: kwargs[name] for name in topic.fields if name in kwargs}
         done.add((bus.node, message, topic.expression("swarm", **fields)))
         real(bus, topic, *args, **kwargs)
 

@@ -68,6 +68,9 @@ class Held:
     def path(self, vehicle: str) -> list[int]:
         return self.cells
 
+    def may_enter(self, vehicle: str, cell: int) -> bool:
+        return True
+
     def moved(self, vehicle: str, cell: int) -> None:
         self.cells = self.cells[self.cells.index(cell) :]
 
