@@ -27,7 +27,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed
     assert (report["scenario"], report["vehicles"], report["targets"]) == ("demo", 100, 10)
-    assert (report["processes"], report["restarts"], report["first_uses"]) == (17, 0, 0)
+    assert (report["processes"], report["restarts"], report["first_uses"]) == (18, 0, 0)
     assert report["seconds"] == pytest.approx(15, abs=1.5)
     assert report["vehicles_routed"] == 100
     assert (report["collisions"], report["lethal_entries"], report["lost"]) == (0, 0, 0)
