@@ -17,6 +17,7 @@ from swarm.config.scenario import NetworkConfig
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import pack_column
+from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import RunInfo
@@ -63,7 +64,7 @@ def swarm_peer(
     info = RunInfo(
         run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
         cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=_WEST_M, north_m=_NORTH_M,
-        crs=_CRS,
+        crs=_CRS, wire_version=WIRE_VERSION,
     )  # fmt: skip
     with open_bus(network) as bus:
         bus.serve(RUN, inbox.post, role="keeper", id="0")
