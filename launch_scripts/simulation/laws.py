@@ -146,9 +146,7 @@ class LawBook:
         self._unmoved = {id: cell for each in spawns.values() for id, cell in each.items()}
         """Vehicle -> cell, of those that no process has placed yet."""
         self._cells: dict[str, dict[str, int]] = {}
-        """Node -> vehicle -> cell. A vehicle stands where it is when its process dies."""
-        self._last: dict[str, Node] = {}
-        """Agent -> the node on which its newest life began."""
+        """Node -> vehicle -> cell. A vehicle stays where it is when its process dies, until that starts again."""
         self._lives: dict[str, _Life] = {}
         self._waited: dict[str, tuple[int, float]] = {}
         """Vehicle -> its cell, and the seconds that count since it came there."""
@@ -161,9 +159,7 @@ class LawBook:
     # --- while it runs --------------------------------------------------------------------------------------
 
     def _booted(self, node: Node) -> None:
-        if self._last.get(node.spec.id, node) is not node:
-            self._cells.pop(node.name, None)  # its vehicles have been driven from elsewhere since
-        self._last[node.spec.id] = node
+        self._cells.pop(node.name, None)  # simulated vehicles are nowhere until the new life has places for them
         self._lives[node.name] = _Life()
 
     def _delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:

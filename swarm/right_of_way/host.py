@@ -84,7 +84,8 @@ class Host:
 
     def hear_left(self, left: Left) -> list[str]:
         """Another host's word to us. Returns the vehicles that have found their place."""
-        return self.holdings.hear_left(left) if left.host == self.name and self.holdings.life else []
+        heard = left.host == self.name and self.holdings.life and not self.holdings.replaced
+        return self.holdings.hear_left(left) if heard else []
 
     def have_left(self, vehicles: Iterable[str]) -> bool:
         """Returns True if these vehicles left in an earlier life: each plot which concerns us has answered this

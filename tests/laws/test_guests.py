@@ -144,7 +144,7 @@ def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
 
 def a_cell_that_was_shut_for_a_guest_is_anybodys(patch: pytest.MonkeyPatch) -> None:
     opened = Orders._open
-    patch.setattr(Orders, "_open", lambda self, host, life, bodies, but=(): opened(self, host, life, {}, but))
+    patch.setattr(Orders, "_open", lambda self, host, life, bodies: opened(self, host, life, {}))
 
 
 def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPatch) -> None:

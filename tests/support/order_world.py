@@ -260,8 +260,7 @@ class OrderWorld:
             if number > known:  # a table is skipped, so that two lives begin with different entries
                 seat.stamp = fresh
                 fresh = (fresh[0], fresh[1] + 1)
-            placed = set(life.entries.placed)
-            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, placed, fresh)
+            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, fresh)
 
     def drive(self, life: Life) -> None:
         entries, chance = life.entries, self.chance
@@ -285,9 +284,15 @@ class OrderWorld:
             self.counts["followed"] += follows
             self.counts["seams"] += plot_of(before.cell) != plot_of(cell)
             self.bodies[vehicle, entries.life] = cell
-            for (other, _), there in self.bodies.items():
-                if there == cell and other != vehicle:
+            for (other, number), there in self.bodies.items():
+                if there == cell and other != vehicle and self.is_there(other, number):
                     self.collisions.append((vehicle, other))
+
+    def is_there(self, vehicle: str, number: int) -> bool:
+        """Returns True if a body exists: a simulated one does once a life of its host has placed it."""
+        host = vehicle.rpartition("-")[0]
+        lives = [life.entries for life in self.lives if life.host == host and life.entries.life == number]
+        return host not in MADE_UP or any(vehicle in entries.placed for entries in lives)
 
     def disturb(self) -> None:
         """A member or a host dies or starts again; or a second life starts beside the first."""

@@ -6,7 +6,7 @@ their own host, or by proof that its life has ended.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agents import agent_of
@@ -43,6 +43,8 @@ class Orders:
         self.fenced: dict[tuple[str, int], dict[str, list[Number]]] = {}
         self.orders: dict[int, dict[Number, str]] = {}
         self._fences: set[Number] = set()
+        self.newest = 0
+        """The highest sequence of an entry with which a vehicle has begun."""
         for vehicle, entries in table.grants.items():
             self._set(vehicle, list(entries))
         for fence in table.fences:
@@ -115,7 +117,7 @@ class Orders:
         """The cells for which those in a cell's order wait."""
         for vehicle in self.order(cell).values():
             for number in self.entries(vehicle):
-                if number[0] != cell and len(self.orders[number[0]]) > 1 and any(self.before(number, vehicle)):
+                if number[0] != cell and len(self.order(number[0])) > 1 and any(self.before(number, vehicle)):
                     yield number[0]
 
     def granted(self, host: str) -> dict[str, list[Entry]]:
@@ -124,7 +126,7 @@ class Orders:
         return {vehicle: [self._entry(number, vehicle) for number in self.of[vehicle]] for vehicle in vehicles}
 
     def _entry(self, number: Number, vehicle: str) -> Entry:
-        if len(self.orders[number[0]]) == 1:
+        if len(self.order(number[0])) <= 1:  # none if a table of a stolen name lists an entry twice
             return Entry(number)
         before: list[Before] = [(other[1], other[2], of) for other, of in self.before(number, vehicle)]
         return Entry(number, before)
@@ -151,7 +153,6 @@ class Orders:
         knows: Stamp,
         dead: Sequence[int],
         bodies: Mapping[str, int],
-        placed: Collection[str],
         fresh: Stamp,
     ) -> bool:
         """A host states what its vehicles hold; what it omits of tables that it knows is over. Returns True if a
@@ -159,7 +160,6 @@ class Orders:
 
         dead    earlier lives of the host that have certainly ended
         bodies  vehicle without a place -> the cell on which its body is, or where it would enter
-        placed  vehicles which have a place
         fresh   stamp of entries that are added
         """
         known, heard = self.hosts.get(host, (0, 0))
@@ -175,8 +175,7 @@ class Orders:
             if vehicle not in self.of and vehicle not in bodies:
                 self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
         for each in dead:
-            begun = self.of.keys() - bodies.keys() - set(placed)
-            self._open(host, each, bodies, but=begun)
+            self._open(host, each, bodies)
         return begins or any(earlier)
 
     def _fence(self, host: str, life: int) -> None:
@@ -188,16 +187,12 @@ class Orders:
                 fence[vehicle] = [*fence.get(vehicle, ()), *entries]
                 self._fences.update(entries)
 
-    def _open(self, host: str, life: int, bodies: Mapping[str, int], but: Collection[str] = ()) -> None:
-        """A life has ended: its entries are over, except those on which bodies are, and those of vehicles which
-        are to begin from there and have no place yet."""
-        fence = self.fenced.pop((host, life), {})
-        kept = {vehicle: entries for vehicle, entries in fence.items() if vehicle in but}
-        if kept:
-            self.fenced[host, life] = kept
-        for vehicle, entries in fence.items():
-            if vehicle in kept:
-                continue
+    def _open(self, host: str, life: int, bodies: Mapping[str, int]) -> None:
+        """A life has ended: its entries are over, except those on which bodies are.
+
+        Those of vehicles that are to begin from there must not wait: two such vehicles would wait for each other.
+        """
+        for vehicle, entries in self.fenced.pop((host, life), {}).items():
             here = [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
             self._fences.difference_update(entries)
             for entry in entries:
@@ -211,7 +206,14 @@ class Orders:
         no other vehicle is to enter."""
         cells = [number[0] for number in entries]
         alone = (cell for cell in cells if set(self.order(cell).values()) <= {vehicle})
-        self._append(vehicle, next(alone, cells[-1]), fresh)
+        cell, (epoch, seq) = next(alone, cells[-1]), fresh
+        while not self._append(vehicle, cell, (epoch, seq)):  # another that begins there in the same table
+            seq += 1
+        self.newest = max(self.newest, seq)
+
+    def lives_of(self, host: str) -> set[int]:
+        """Returns the fenced lives of a host."""
+        return {life for name, life in self.fenced if name == host}
 
     def end(self, host: str, life: int) -> bool:
         """A life that was replaced states that it drives no more. Returns whether that opens cells."""

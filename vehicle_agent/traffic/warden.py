@@ -14,6 +14,7 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.right_of_way.host import LIVES_KEPT
 from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Number, Stamp, Stand, Standing, Table
@@ -138,6 +139,10 @@ class Warden:
         if is_far_ahead(standing.life, life):
             self.refused.append(f"{host} names a life that is implausibly far ahead: {standing.life}")
             return
+        fenced = self._orders.lives_of(host)
+        if standing.life != life and len(fenced) >= LIVES_KEPT and fenced.isdisjoint(standing.dead):
+            self.refused.append(f"{host} has {len(fenced)} lives here which are not known to have ended")
+            return
         if standing.life != life:
             known.told = None
             self.seq += 1  # two lives of one tick are given different entries
@@ -146,7 +151,6 @@ class Warden:
         stands = self._stands_of(standing)
         holds = {id: stand.holds for id, stand in stands.items()}
         bodies = {id: stand.cell for id, stand in stands.items() if _is_entering(stand)}
-        placed = {id for id, stand in stands.items() if stand.holds and stand.cell not in stand.wants}
         before = self._orders.by_host_count(host)
         self._granted |= self._orders.take_standing(
             host,
@@ -156,10 +160,10 @@ class Warden:
             standing.knows,
             standing.dead,
             bodies,
-            placed,
             self._next_stamp,
         )
         self._changed |= self._orders.by_host_count(host) != before
+        self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
