@@ -295,7 +295,10 @@ class PlacesService:
 
     def _go_on(self) -> None:
         """Gives the worker the next slice, if it has none."""
-        if self._at_work is None and (question := self._waiting.take()) is not None:
+        while self._at_work is None and (question := self._waiting.take()) is not None:
+            if question.event.expired:
+                question.event.end()
+                continue
             trees = self._trees(question.request.vehicle_class)
             trees.keep_up()
             self._at_work = question
