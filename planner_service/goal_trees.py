@@ -26,6 +26,8 @@ GoalStatus = Literal["ok", "unreachable", "lethal_goal", "lethal_start", "outsid
 
 MOST_CHANGES = 500
 """Changes near a tree beyond which it is dropped: another growth costs less than to look at them."""
+_MOST_ENTRIES = 2000
+"""Changes of the map since a tree was looked at, beyond which it is dropped: to sort them out takes 30 ms."""
 _LONGEST_LOG = 1 << 16
 """Cells in the log of changes: a tree that would need older ones is dropped."""
 _OBJECTS_BYTES = 1 << 10
@@ -151,6 +153,8 @@ class GoalTrees:
         if kept.seen < self._forgotten:
             return False
         fresh = self._log[kept.seen - self._forgotten :]
+        if len(fresh) > _MOST_ENTRIES:
+            return False
         kept.seen = self._forgotten + len(self._log)
         if kept.tree is not None and fresh:
             near = [_near(each, kept.tree.box, self.costs.stride) for each in fresh]

@@ -437,10 +437,12 @@ class Planner:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True
 
-    def _costs(self, request: CostRequest, now_ns: int) -> CostReply:
+    def _costs(self, request: CostRequest, now_ns: int) -> CostReply | Refusal:
         cells = self._cells(request)
-        self.counters.count("costs_served", len(cells))
         costs_s = self.tree.cost_to_go_at(cells)
+        if self.tree.ready and self.tree.may_reach(cells, costs_s):
+            return Refusal("the tree still grows towards some of these cells: ask again")
+        self.counters.count("costs_served", len(cells))
         if (search := self._under_way) is not None:
             on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
             costs_s = search.costs_s(costs_s, np.array(on_map, np.bool_))

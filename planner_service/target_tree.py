@@ -328,6 +328,13 @@ class TargetTree:
             costs[inside] = self._tree.cost_at(starts)
         return costs
 
+    def may_reach(self, cells: Any, costs_s: Floats) -> bool:
+        """Returns True if a growth that has stopped may still find a way for one of the cells without a cost."""
+        if not isinstance(self._tree, CostToGoTree) or self._tree.bound == np.inf:
+            return False
+        unknown = np.asarray(cells, np.int64).reshape(-1)[np.isinf(costs_s)]
+        return any(0 <= cell < self._grid.cells and self._costs.passable(cell) for cell in unknown.tolist())
+
     # --- how ----------------------------------------------------------------------------------------------------
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:

@@ -198,6 +198,7 @@ class Agent:
         if name == vehicle.target or (name is None and vehicle.goal is None):
             return
         vehicle.release()
+        self.goals.refused.pop(vehicle.id, None)
         self._driver.stop_soon(vehicle)
         if name is None:
             self.assignment.ask_soon(now_ns)
@@ -361,7 +362,7 @@ class Agent:
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
             if vehicle.in_reach and vehicle.goal is not None and vehicle.motion.at_rest:
-                self.goals.reached(vehicle.id, now_ns)
+                self.goals.reached(vehicle.id, vehicle.cell, now_ns)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)

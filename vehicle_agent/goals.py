@@ -73,6 +73,8 @@ class GoalQueues:
         self.shared: Mapping[int, int] = {}
         self.refused: dict[str, str] = {}
         self._steps = steps
+        self._arrived: dict[str, int] = {}
+        """Vehicle -> the cell on which it has reached a place last."""
         self._arrivals: dict[int, frozenset[int]] = {}
 
     def look_again(self) -> None:
@@ -92,11 +94,13 @@ class GoalQueues:
             self._arrivals[goal] = arrival_cells(goal, vehicles, self._steps)
         return cell in self._arrivals[goal]
 
-    def reached(self, vehicle: str, now_ns: int) -> bool:
-        """A vehicle is at rest at its place. Returns True if that is news."""
+    def reached(self, vehicle: str, cell: int, now_ns: int) -> bool:
+        """A vehicle is at rest at its place. Returns True if that is news: one that goes round has to move for it,
+        as places may lie so close that one cell counts for both."""
         goals = self.book.in_force(vehicle)
-        if goals is None or is_over(goals):
+        if goals is None or is_over(goals) or (goals.then == "repeat" and self._arrived.get(vehicle) == cell):
             return False
+        self._arrived[vehicle] = cell
         return bool(self.book.merge([replace(goals, done=goals.done + 1)], now_ns))
 
     def states(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -55,6 +55,10 @@ _BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
 """Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
 _HOLD_NS = NS_PER_S
 """A question waits so long at most for its growth; then it is answered as far as it is known."""
+_TWO_TREES = 10
+"""Bytes a cell of two whole trees with parents."""
+_KEEPS_UP_NS = NS_PER_S
+"""While a question goes on, its map is so old at most: else marks beside a goal would end no growth."""
 _CELL_NS = 25
 """Time that a simulation counts for a cell grown."""
 _STATUSES = {
@@ -90,10 +94,13 @@ class _ClassTrees:
         cost_map.take_dirty()
         costs.load(cost_map.pace_s_per_m)
         self.map_version = cost_map.version
-        self.trees = GoalTrees(costs, budget_bytes)
+        # Two whole trees fit at least: else two askers far away would drop each other's tree for ever.
+        self.trees = GoalTrees(costs, max(budget_bytes, _TWO_TREES * costs.size))
+        self.kept_up_ns = 0
 
-    def keep_up(self) -> None:
+    def keep_up(self, now_ns: int) -> None:
         """Takes the changes of the map. Not beside a growth."""
+        self.kept_up_ns = now_ns
         if self.cost_map.dirty:
             self.trees.changed(self._costs.apply(self.cost_map.pace_s_per_m, self.cost_map.take_dirty()))
         self.map_version = self.cost_map.version
@@ -103,16 +110,18 @@ class _ClassTrees:
         request, grown = question.request, 0
         if question.version != self.map_version:
             question.found, question.rests, question.version = [], [], self.map_version
-        while not question.done and grown < SLICE_CELLS:
+        most, walked = _most_steps(request), 0
+        while not question.done and grown + walked < SLICE_CELLS:
             start = request.cells[len(question.found)]
             answer = self.trees.ask(request.to, start, SLICE_CELLS - grown)
             grown += answer.grown_cells
             if answer.status == "growing":
                 break
+            rest, walked = 0.0, walked + answer.cells.size
+            if most < answer.cells.size - 1:
+                rest = self.trees.ask(request.to, int(answer.cells[most]), SLICE_CELLS).cost_s
+                answer = replace(answer, cells=answer.cells[: most + 1].copy())
             question.found.append(answer)
-            rest = 0.0
-            if 0 < request.max_cells < answer.cells.size - 1:
-                rest = self.trees.ask(request.to, int(answer.cells[request.max_cells]), SLICE_CELLS).cost_s
             question.rests.append(rest)
         return grown
 
@@ -124,7 +133,7 @@ class _ClassTrees:
             status = "lethal_goal"
         elif not 0 <= request.to < self._costs.grid.cells:
             status = "outside_goal"
-        known = _batch(found, request.cells, question.rests, request.max_cells, self._costs)
+        known = _batch(found, request.cells, question.rests, self._costs)
         return PlaceRouteReply(
             to_cell=request.to,
             incarnation=incarnation,
@@ -135,11 +144,16 @@ class _ClassTrees:
         )
 
 
-def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], most: int, costs: CostGrid) -> RouteBatch:
-    """The routes of some answers, cut after `most` steps if that is not 0."""
+def _most_steps(request: PlaceRouteRequest) -> int:
+    """Steps of each route: as many as are asked for, and fit into one answer."""
+    most = MOST_STEPS // max(len(request.cells), 1)
+    return min(request.max_cells or most, most)
+
+
+def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], costs: CostGrid) -> RouteBatch:
+    """The routes of some answers."""
     grid: GridSpec = costs.grid
-    most = min(most or MOST_STEPS, MOST_STEPS // max(len(found), 1))
-    codes = [directions_of(each.cells[: most + 1], grid.cols) for each in found]
+    codes = [directions_of(each.cells, grid.cols) for each in found]
     codes += [b""] * (len(cells) - len(found))
     unknown = len(cells) - len(found)
     lengths = [_length_m(each, costs) for each in codes]
@@ -197,6 +211,8 @@ class PlacesService:
         self._waiting: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
         self._at_work: _Question | None = None
         """The question of which the worker has a slice."""
+        self._going_on: set[int] = set()
+        """Identities of the questions that wait for their next slice."""
         self._leads = False
         self._now_ns = 0
         for name in ("place_routes", "place_cells_grown", "place_questions_refused"):
@@ -242,6 +258,9 @@ class PlacesService:
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
+        if self._at_work is not None:
+            self._refuse(self._at_work.event, "the process ends")
+            self._at_work = None
         while (question := self._waiting.take()) is not None:
             self._refuse(question.event, "the process ends")
         self._member.publish_stats(now_ns)
@@ -283,6 +302,7 @@ class PlacesService:
     def _wait(self, question: _Question, price: int) -> None:
         asker = question.event.asker
         for dropped in self._waiting.put(asker, question, price=price, rank=0 if is_own(asker) else 1):
+            self._going_on.discard(id(dropped))
             self._refuse(dropped.event, "too many questions wait here already: ask again in a second")
 
     def _price(self, request: PlaceRouteRequest) -> int:
@@ -297,10 +317,12 @@ class PlacesService:
         """Gives the worker the next slice, if it has none."""
         while self._at_work is None and (question := self._waiting.take()) is not None:
             if question.event.expired:
+                self._going_on.discard(id(question))
                 question.event.end()
                 continue
             trees = self._trees(question.request.vehicle_class)
-            trees.keep_up()
+            if not self._going_on or self._now_ns - trees.kept_up_ns >= _KEEPS_UP_NS:
+                trees.keep_up(self._now_ns)
             self._at_work = question
             self._worker.submit("places", partial(trees.work, question), self._post, SLICE_CELLS * _CELL_NS)
 
@@ -319,6 +341,7 @@ class PlacesService:
         question, self._at_work = self._at_work, None
         if question is None:
             return
+        self._going_on.discard(id(question))
         self.counters.count("place_cells_grown", grown)
         if question.done or now_ns - question.asked_ns >= _HOLD_NS:
             trees = self._trees(question.request.vehicle_class)
@@ -326,12 +349,16 @@ class PlacesService:
             question.event.end()
             self.counters.count("place_routes", len(question.found))
         else:
+            self._going_on.add(id(question))
             self._wait(question, self._price(question.request))
         self._go_on()
 
     def _obeys(self, order: Obey) -> bool:
         """A zone is obeyed once the map has it: the next question finds it in the trees."""
-        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
+        pending = any(each.cost_map.dirty for each in self._classes.values())
+        return order.subject is not None or (
+            not (pending and self._going_on) and self._sync.holds(order.author, order.sets, self._now_ns)
+        )
 
     def _refuse(self, event: Asked, reason: str) -> None:
         self.counters.count("place_questions_refused")

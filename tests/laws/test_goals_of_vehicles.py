@@ -66,7 +66,7 @@ class History:
     def reach(self) -> None:
         name = self.chance.choice(VEHICLES)
         goals, cell = self.agent.book.get(name), self.agent.cell(name)
-        if cell is not None and goals is not None and self.agent.reached(name, self.now_ns):
+        if cell is not None and goals is not None and self.agent.reached(name, cell, self.now_ns):
             self.visits.setdefault((name, goals.stamp_ns), []).append(goals.done)
 
     def start_again(self) -> None:
@@ -168,8 +168,8 @@ def test_each_state_of_a_vehicle_has_its_name_and_blocked_has_a_reason() -> None
     vehicle.state = VehicleState.FOLLOWING
     assert state() == ("underway", "")
     assert state(waits=True) == ("delayed", "")
-    assert queues.reached("a0-00", 4)
-    assert not queues.reached("a0-00", 5)
+    assert queues.reached("a0-00", 7, 4)
+    assert not queues.reached("a0-00", 7, 5)
     assert state() == ("completed", "")
     queues.book.merge([VehicleGoals(name="a0-00", stamp_ns=2, off=True)], 6)
     assert state() == ("canceled", "")

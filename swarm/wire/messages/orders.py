@@ -12,7 +12,6 @@ from swarm.places import read_place
 from swarm.wire.fields import (
     IDS,
     LARGE,
-    SMALL,
     Bounded,
     Cell,
     CellIndex,
@@ -332,7 +331,7 @@ class GoalStates(Message, frozen=True, kw_only=True, tag=schema_of("goal-states"
 
     agent: Id
     stamp_ns: StampNs
-    states: Annotated[list[GoalState], SMALL]
+    states: Annotated[list[GoalState], IDS]
 
     def relate(self) -> None:
         strange = next((each.name for each in self.states if not each.name.startswith(f"{self.agent}-")), None)

@@ -61,7 +61,7 @@ def test_what_new_writes_is_what_was_chosen_and_check_accepts_it(
     assert (scenario.cost.preset, scenario.cost.slope_rule) == ("hiker", "tobler")
     code, out, err = swarm("check my.toml")
     assert (code, err) == (0, "")
-    assert out.startswith("my.toml can run, no warnings: vehicles 7, targets 2, processes 7")
+    assert out.startswith("my.toml can run, no warnings: vehicles 7, targets 2, processes 8")
 
 
 def test_new_shares_many_vehicles_out_over_few_agents(tmp_path: Path, swarm: Swarm) -> None:

@@ -111,6 +111,38 @@ def test_a_part_of_a_route_says_what_the_rest_costs() -> None:
     assert part.cost_s == whole.cost_s
 
 
+def test_routes_that_do_not_fit_into_an_answer_say_what_the_rest_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "MOST_STEPS", 20)
+    pace = rough(3)
+    world = PlacesWorld(pace)
+    to = GRID.cell(20, 2)
+    best = optimum_s(pace, to)
+    starts = [GRID.cell(20, 45), GRID.cell(20, 45), GRID.cell(20, 3), GRID.cell(20, 2)]
+    for start, route in zip(starts, world.answer(to, *starts).routes, strict=True):
+        assert len(route.directions) <= 5
+        end = walk(GRID, start, route.directions)[-1]
+        assert route.remaining_s == pytest.approx(best[end], rel=1e-5)
+        assert route.cost_s == pytest.approx(best[start], rel=1e-5)
+
+
+def test_marks_beside_a_goal_do_not_keep_a_far_asker_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "SLICE_CELLS", 20)
+    monkeypatch.setattr(places, "_CELL_NS", 200_000)  # 0.4 s for the whole map
+    world = PlacesWorld(flat())
+    writer = world.writer("all.a0.1")
+    to, beside = GRID.cell(2, 2), np.array([GRID.cell(3, 3)], np.uint32)
+    heard = world.ask(to, GRID.cell(30, COLS - 2), asker="agent.a0")
+    for turn in range(40):
+        if heard:
+            break
+        kinds, paces = np.array([MarkKind.PACE], np.uint8), np.array([0.3 + 0.01 * (turn % 2)], np.float32)
+        writer.sync.publish(writer.replica.write(beside, kinds, paces, world.now_ns))
+        world.run(0.1)
+    assert isinstance(heard[0], Replied)
+    assert isinstance(heard[0].message, PlaceRouteReply)
+    assert heard[0].message.status == "ok"
+
+
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
