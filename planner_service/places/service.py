@@ -154,8 +154,8 @@ def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], costs:
     """The routes of some answers."""
     grid: GridSpec = costs.grid
     codes = [directions_of(each.cells, grid.cols) for each in found]
-    codes += [b""] * (len(cells) - len(found))
     unknown = len(cells) - len(found)
+    codes += [b""] * unknown
     lengths = [_length_m(each, costs) for each in codes]
 
     def column(values: list[float], rest: float) -> NDArray[np.float64]:
@@ -174,7 +174,7 @@ def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], costs:
 
 
 def _length_m(codes: bytes, costs: CostGrid) -> float:
-    diagonal = sum(code & 1 for code in codes)
+    diagonal = np.count_nonzero(np.frombuffer(codes, np.uint8) & 1)
     return float((len(codes) - diagonal + diagonal * costs.diagonal) * costs.grid.resolution_m)
 
 

@@ -17,7 +17,7 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
    have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
    the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, at the end of the
-   order of a cell which the earlier life held; the others are over once it has a place there.
+   order of a cell which the earlier life held; all others are over with the proof.
 """
 
 from __future__ import annotations
