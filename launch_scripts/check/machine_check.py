@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from launch_scripts.check.findings import Finding, Level, failure, warning
 from launch_scripts.process_table import processes_of
-from swarm.config.agents import PLACE_TREES_BYTES, places_of, plan_agents
+from swarm.config.agents import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import StoreError, SwarmError
@@ -99,8 +99,9 @@ def needs_of(scenario: Scenario, cells: int) -> Needs:
     memory = (
         processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES)
     )
-    in_hand = (1 + len(scenario.classes)) * cells * _TREE_CELL_BYTES
-    memory += len(places_of(scenario)) * (PLACE_TREES_BYTES + in_hand)
+    classes = 1 + len(scenario.classes)
+    kept = place_trees_bytes(PLACE_TREES_BYTES, classes, cells)
+    memory += len(places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
     recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
     cores = moving + trees * _PLANNER_CORES + _OTHERS_CORES
     return Needs(processes, agents, cores, memory, cells * _CELL_BYTES + recording, recording)

@@ -30,7 +30,7 @@ from shared_map.vehicle_class_grounds import class_terrains
 from shared_map.vehicle_class_maps import ClassMaps
 from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
-from swarm.config.agents import PLACE_TREES_BYTES, place_job, plan_agents, readable_groups
+from swarm.config.agents import PLACE_TREES_BYTES, place_job, place_trees_bytes, plan_agents, readable_groups
 from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND, class_numbers
 from swarm.grid import GridSpec
@@ -55,8 +55,6 @@ _BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
 """Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
 _HOLD_NS = NS_PER_S
 """A question waits so long at most for its growth; then it is answered as far as it is known."""
-_TWO_TREES = 10
-"""Bytes a cell of two whole trees with parents."""
 _KEEPS_UP_NS = NS_PER_S
 """While a question goes on, its map is so old at most: else marks beside a goal would end no growth."""
 _CELL_NS = 25
@@ -94,8 +92,7 @@ class _ClassTrees:
         cost_map.take_dirty()
         costs.load(cost_map.pace_s_per_m)
         self.map_version = cost_map.version
-        # Two whole trees fit at least: else two askers far away would drop each other's tree for ever.
-        self.trees = GoalTrees(costs, max(budget_bytes, _TWO_TREES * costs.size))
+        self.trees = GoalTrees(costs, budget_bytes)
         self.kept_up_ns = 0
 
     def keep_up(self, now_ns: int) -> None:
@@ -331,9 +328,8 @@ class PlacesService:
         if trees is None:
             cost_map = self._cost_map if name == GROUND else self._maps.of[name]
             costs = CostGrid(cost_map.grid, self._scenario.planner, cost_map.terrain.climb)
-            trees = self._classes[name] = _ClassTrees(
-                cost_map, costs, PLACE_TREES_BYTES // (1 + len(self._maps.of))
-            )
+            budget = place_trees_bytes(PLACE_TREES_BYTES, 1 + len(self._maps.of), costs.size)
+            trees = self._classes[name] = _ClassTrees(cost_map, costs, budget)
             log.info("places of %s: trees for the class %s", self._job, name)
         return trees
 

@@ -66,6 +66,12 @@ PLACE_TREES_BYTES = 256 << 20
 """Trees to places, of all classes, that one process keeps. Beside them one of each class is in hand."""
 
 
+def place_trees_bytes(budget_bytes: int, classes: int, cells: int) -> int:
+    """Bytes of trees to places that are kept for each of some classes: its share, and two whole trees at least, as
+    two askers far away would else drop each other's tree for ever. One takes 5 bytes a cell, with its parents."""
+    return max(budget_bytes // classes, 2 * 5 * cells)
+
+
 def places_of(scenario: Scenario) -> list[str]:
     """The processes that plan between any two places: one for all groups which read the marks of the same groups,
     named after the first of them."""
