@@ -179,6 +179,7 @@ class Server(socketserver.ThreadingTCPServer):
             return Audience(sum(each.until_s == math.inf for each in self._open.values()), self._kept)
 
     def process_request(self, request: Any, client_address: Any) -> None:
+        request.settimeout(self.lasts_s / 2)
         with self._lock:
             if len(self._open) >= MOST_CONNECTIONS and (slowest := self._slowest()) is not None:
                 del self._open[slowest]
@@ -221,12 +222,11 @@ def _cut(connection: socket.socket) -> None:
 
 def _waiting(connection: socket.socket) -> bytes:
     """The bytes that a connection has sent and its thread has not read."""
-    ready = select.poll()
-    try:
-        ready.register(connection, select.POLLIN)
-        return connection.recv(_MOST_PEEKED, socket.MSG_PEEK) if ready.poll(0) else b""
-    except (OSError, ValueError):  # it has been closed meanwhile
-        return b""
+    # The socket itself would wait until its timeout where its thread takes the bytes first, and all others with it.
+    with contextlib.suppress(OSError), connection.dup() as copy:  # it may have been closed meanwhile
+        copy.setblocking(False)
+        return copy.recv(_MOST_PEEKED, socket.MSG_PEEK)
+    return b""
 
 
 class _Visit(BaseHTTPRequestHandler):
@@ -234,10 +234,6 @@ class _Visit(BaseHTTPRequestHandler):
 
     server: Server
     raw_requestline: bytes
-
-    def setup(self) -> None:
-        super().setup()
-        self.connection.settimeout(self.server.lasts_s / 2)
 
     def parse_request(self) -> bool:
         """Returns True if a method is to answer: an HTTP/2 request is read no further, a foreign one gets no
