@@ -223,7 +223,7 @@ def test_slow_connections_are_cut_before_old_ones_and_readers_before_probes(asks
         assert go_on.wait(60)
         return Reply(200, "text/plain", b"all of it")
 
-    # No connection is cut for its age, and no wait for one ends in time to hide itself, however busy the machine is.
+    # No connection is cut for its age, and a wait for one is too long to be overlooked.
     server = Server("health port", 0, {"/pages": page, "/healthz": page}, lasts_s=60.0)
     with contextlib.ExitStack() as held:
         early = held.enter_context(socket.create_connection(place(server), 10))
