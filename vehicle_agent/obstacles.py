@@ -385,8 +385,8 @@ class TargetObstacles:
             range_m = scenario.vehicles.capture_range_m
             if range_m < needed_m:
                 raise ConfigError(
-                    f"targets: {id}: with obstacle_radius_m = {radius_m:g} no vehicle comes near enough to capture it: "
-                    f"vehicles.capture_range_m is {range_m:g}, expected at least {needed_m:g}"
+                    f"targets: {id}: with obstacle_radius_m = {radius_m:g} no vehicle comes near enough to capture "
+                    f"it: vehicles.capture_range_m is {range_m:g}, expected at least {needed_m:g}"
                 )
 
     def obstacles_of(self, pose: TargetPose, now_ns: int) -> list[Obstacle]:

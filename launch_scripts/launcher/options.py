@@ -190,9 +190,6 @@ def new_run_id() -> str:
 _HIGHEST = 1 << 61
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
-_LATER_KEYS = (("map", "shard_regions"), ("planner", "places"))
-"""Sections and keys that the version before does not know: at their default they change no id, so that parts of
-both versions agree on one."""
 
 
 def common_run_id(scenario: Scenario) -> str:
@@ -200,10 +197,7 @@ def common_run_id(scenario: Scenario) -> str:
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )
-    settings, defaults = (msgspec.to_builtins(each, order="deterministic") for each in (same, Scenario()))
-    for section, key in _LATER_KEYS:
-        if settings[section][key] == defaults[section][key]:
-            del settings[section][key]
+    settings = msgspec.to_builtins(same, order="deterministic")
     digest = hashlib.blake2b(msgspec.json.encode(settings), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"
 

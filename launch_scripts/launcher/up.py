@@ -284,7 +284,7 @@ class _Run:
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
         incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
-        if self._known is not None and self._take_over is None:  # else the lives before are its own, too
+        if self._known is not None and self._take_over is None:  # else those before are its own, too
             self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,

@@ -133,8 +133,8 @@ def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int
 
 
 _TOTALS = (
-    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests", "routes_served",
-    "marks", "payloads_dropped",
+    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests",
+    "routes_served", "marks", "payloads_dropped",
 )  # fmt: skip
 """Fields of a `RunState` which are counts of that name, summed over all processes."""
 

@@ -28,7 +28,7 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
 
 
 _MOST_GENERATIONS = 1 << 13
-"""Lives of processes that are counted: names may be made up by strangers."""
+"""Generations of processes that are counted: names may be made up by strangers."""
 
 
 class Counts:
@@ -37,7 +37,7 @@ class Counts:
     def __init__(self) -> None:
         self._stats: dict[tuple[str, str, int], Stats] = {}
         self._counting: list[Stats] | None = None
-        """Lives that are summed; None since the last that was new."""
+        """Generations that are summed; None since the last that was new."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}

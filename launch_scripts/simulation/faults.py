@@ -235,8 +235,8 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     """Draws a plan for a run of a scenario: everything at once in the first three fifths, nothing in the rest.
 
     Returns random faults: crashes of any process; partitions, unnoticed, noticed and one-way; hangs; clock offsets
-    and steps; second lives of agents; messages lost, late, repeated and out of order. A seed may leave any of them
-    out, so that a failure shows what it needs.
+    and steps; second generations of agents; messages lost, late, repeated and out of order. A seed may leave any
+    of them out, so that a failure shows what it needs.
 
     Agents with at most one other in their layer, on the ground or in the air, have no second generation elsewhere:
     a shard of theirs has one member, and it is unknown which of its files is the first.

@@ -149,7 +149,7 @@ class Node:
         simulation.log.event(self._clock.now_ns(), "boot", self.name)
         self._offset_ns = self.skew_ns
         self._waiting = None
-        # Lives are counted as by the launcher: a restart is the later one even if the clock was set back meanwhile.
+        # Counted as by the launcher: a restart is the later generation even if the clock was set back meanwhile.
         self._generation = max(self.now_ns(), self._generation + 1)
         namespace = simulation.scenario.network.namespace
         bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)

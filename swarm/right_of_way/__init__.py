@@ -2,7 +2,7 @@
 restart.
 
 The map is cut into *shards* (`lock_regions`): lock regions. Three agents are the *members* of a shard, and one of
-them is its *leader*: the leader, by epoch and majority. A *host* is a process with vehicles in a shard or at its
+them is its *leader*, by epoch and majority. A *host* is a process with vehicles in a shard or at its
 border. A *generation* is one incarnation of a host. The leader keeps an order of *entries* for each cell
 (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry is never revoked and
 never runs out: it is over by the word of its host alone. Only authority is leased.
@@ -36,7 +36,7 @@ Duties of a leader:
 
 Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
 
-`Standing`      Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
+`HostState`     Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
                 what that added, the host holds no more than it lists. `dead` are generations that are proved to
                 have ended, by which their entries are over.
@@ -58,5 +58,5 @@ An *external vehicle* (`ExternalVehicle`) is a host that is not in the scenario.
 joins and leaves changes no majority. It enters from nowhere: a host state asks for its first cell and holds
 nothing. It leaves by a host state without the vehicle. The cells of a dead external vehicle stay shut until its
 next generation proves, by the file which that has locked, that the process has ended, or until an operator removes
-it (`Removal`): a generation that names all lives as ended, itself among them.
+it (`Removal`): a generation that names all generations as ended, itself among them.
 """

@@ -61,7 +61,7 @@ class ExternalService:
         warn: Callable[[str], None],
     ) -> None:
         try:
-            check_id("guest", f"{name}-00")
+            check_id("external vehicle", f"{name}-00")
         except ValueError as error:
             raise ConfigError(str(error)) from error
         self.name = name
@@ -143,9 +143,7 @@ class ExternalService:
             self._ask(now_ns)
         if self.external is None and now_ns - self._began_ns > _NOBODY_NS:
             self._warn_once(
-                (
-                    f"no agent answers {self.name}: an external vehicle needs one that drives in this run, and a name of its own",
-                )
+                (f"no agent answers {self.name}: it needs one that drives in this run, and a name of its own",)
             )
         self.tell(now_ns)
         if self.external is not None:

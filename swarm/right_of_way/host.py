@@ -1,5 +1,5 @@
 """One host of vehicles in right of way: its generations, and the cells that its vehicles hold
-(docs/design/right-of-way.md, Lives)."""
+(docs/design/right-of-way.md, Generations)."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ class Host:
         return all(len(self._told_by.intersection(of)) > len(of) - self.shards.majority for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
-        """Begins a new generation, once those who could be asked have answered. Returns the lives to keep on file;
+        """Begins a new generation, once those who could be asked have answered. Returns those to keep on file;
         nothing may be said before they are.
 
-        dead    our lives that are on the file which this process has locked: they have ended
+        dead    our generations that are on the file which this process has locked: they have ended
         chance  a random number
         """
         generation = first_generation(max(self._known_generation, *dead, 0), chance)

@@ -1,4 +1,4 @@
-"""Incarnations of hosts, here called lives: their numbers, their file, and the bounds on which all agree."""
+"""Generations of hosts, each a start of a process: their numbers, their file, and the bounds on which all agree."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _GENERATION = struct.Struct("<Q")
 
 
 class MemoryGenerations:
-    """The lives of an external vehicle that have begun here, the oldest first: by them a new generation proves that
+    """The generations of an external vehicle that have begun here, the oldest first: by them a new one proves that
     those before it have ended.
 
     These survive a simulated process, not this one. Cells granted to a forgotten generation stay shut until an
@@ -91,7 +91,7 @@ def _encoded(generations: Sequence[int]) -> bytes:
 
 
 def _older(data: bytes) -> list[bytes]:
-    """The lives in a file from before journals: one number a line."""
+    """The generations in a file from before journals: one number a line."""
     generations = [int(line) for line in data.decode("ascii").splitlines()]
     if not generations or not all(0 < generation < 1 << 63 for generation in generations):
         raise ValueError(repr(data[:40]))

@@ -95,7 +95,7 @@ class Shards:
         """Returns True if no other layout can have seats, given that these agents use this one.
 
         Three agents make a seat in a shard of one region, independent of the others. Larger shards therefore need
-        so many agents that fewer than three are left, or all agents if one makes a seat by itself.
+        enough agents that fewer than three are left, or all agents if one makes a seat by itself.
         """
         return self.side <= REGION_CELLS or len(set(self.agents).difference(agents)) <= self.spare
 

@@ -27,7 +27,7 @@ SETTLED_NS = 2 * NS_PER_S
 """A better process takes over from a ready leader once it has been there and ready for so long. A process that was
 just started has the whole map by then, and one that keeps stalling never comes so far."""
 _MOST_OTHERS = 64
-"""Lives of other candidates that are remembered."""
+"""Generations of other candidates that are remembered."""
 
 _Order = tuple[bool, int, int]
 """The lower, the better: not ready, rank, older generation."""

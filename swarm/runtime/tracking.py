@@ -4,7 +4,7 @@ Every receiver of poses decides by this rule alone, from the poses that it has h
 
 1. A tracker lives from the arrival of a pose until the lease in it has passed. A pose with a lease of 0 hands the
    target over: its tracker lives no longer.
-2. Of the lives of one tracker, which have one name, the latest incarnation that lives counts.
+2. Of the generations of one tracker, which have one name, the latest incarnation that lives counts.
 3. Of the living trackers, the one which has tracked the target for the longest time owns it. Trackers which began
    within `SAME_NS` of each other are ordered by name.
 
@@ -86,7 +86,7 @@ class Tracking:
         self._until_ns = 0
         """Time when the last lease ends."""
         self._generations: dict[tuple[str | None, int], _Generation] = {}
-        """Includes ended lives, so that late poses are recognised."""
+        """Includes ended generations, so that late poses are recognised."""
 
     def lost(self, now_ns: int) -> bool:
         """True if no tracker lives: `pose` is the last known position."""

@@ -240,7 +240,8 @@ SHARED_COSTS = Topic(
 HOST_STATE = Topic(
     "host_state", "host_state/{shard}/{member}/{agent}", traffic.HostState,
     "where a host's vehicles are in a shard and where they would go; for its leader, or all of its members where "
-    "none is heard; each counts, as two generations of a host must not hide each other's words", "on change, else 5 Hz",
+    "none is heard; each counts, as two generations of a host must not hide each other's words",
+    "on change, else 5 Hz",
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
@@ -267,14 +268,15 @@ LEFT = Topic(
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
+    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another",
     "per table by one member, 5 Hz by the other; 5 Hz by the leader, instead of a table that both have on file",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", traffic.Known,
-    "what an agent has on file about another, or an external vehicle, for a new generation of that", "asked at a start",
+    "what an agent has on file about another, or an external vehicle, for its next generation",
+    "asked at a start",
     access(serve="agent:agent", ask="agent rover"),
     request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
     ask_bytes=_SHORT, answer_bytes=_LONG,
@@ -369,7 +371,7 @@ BELIEVED = Topic(
     put_bytes=_USUAL // 4,
 )  # fmt: skip
 LEAD = Topic(
-    "lead", "lead/{role}/{id}", processes.Heartbeat, "which of the processes with one job are ready, and which leads",
+    "lead", "lead/{role}/{id}", processes.Heartbeat, "which processes of one job are ready, and which leads",
     "10 Hz, where there are standbys",
     access(put="planner:role,id places:role,id targets:role,id", hear="planner places targets monitor"),
     priority=Priority.INTERACTIVE,
@@ -434,8 +436,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, LEFT, STORED,
-    KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, OBSTACLE, ROUTE, COST, PLACE_ROUTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, LEFT,
+    STORED, KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, OBSTACLE, ROUTE, COST, PLACE_ROUTE,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip

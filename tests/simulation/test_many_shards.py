@@ -35,7 +35,7 @@ def test_nobody_meets_where_shards_are_larger_than_regions(seed):
     wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, shard_regions=2))
     simulation = Simulation(seeded(seed, wide), faults=random_plan(wide, seed, SECONDS))
     laws = LawBook(simulation)
-    messages = {"standing": 0, "table": 0}
+    messages = {"host_state": 0, "table": 0}
     simulation.network.trace = lambda _, source, destination, topic, payload: messages.update(
         {topic: messages.get(topic, 0) + 1}
     )

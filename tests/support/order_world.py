@@ -1,6 +1,6 @@
 """A world in which the cores of right of way meet everything that may happen: two shards with three members each,
-hosts with known and with made-up bodies, second lives beside the first, and a network that loses, repeats, delays
-and reorders. No time passes: any party acts at any moment."""
+hosts with known and with made-up bodies, second generations beside the first, and a network that loses, repeats,
+delays and reorders. No time passes: any party acts at any moment."""
 
 from __future__ import annotations
 

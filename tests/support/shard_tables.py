@@ -67,8 +67,8 @@ def granted_of(table: Table, host: str = "a0") -> Granted:
         if vehicle.startswith(host)
     }
     return Granted(
-        shard=table.shard, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, generation=generation, heard=heard,
-        grants=grants,
+        shard=table.shard, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, generation=generation,
+        heard=heard, grants=grants,
     )  # fmt: skip
 
 

@@ -79,7 +79,8 @@ _NAMED: tuple[Message, ...] = (
         vehicles=[Stand("a0-00", 4, 5, [(4, 3, 16), (5, 3, 16)], [6], [], 0, 1200)],
     ),
     Table(
-        shard=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)}, grants={"a0-00": [(4, 3, 16), (5, 3, 16)]},
+        shard=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)},
+        grants={"a0-00": [(4, 3, 16), (5, 3, 16)]},
         fences=[Fence("a2", 1 << 32, {"a2-00": [(9, 1, 1)]})], pushed={"a0-00": 900},
     ),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),

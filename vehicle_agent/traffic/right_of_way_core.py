@@ -80,8 +80,8 @@ class RightOfWay:
             own = replace(own, shard_cells=shards.side)
         elif own.shard_cells != shards.side:
             raise StoreError(
-                f"agent {agent} has on file what it promised of shards of {own.shard_cells} cells, the scenario has "
-                f"{shards.side}: set map.shard_regions to {own.shard_cells // REGION_CELLS}, or begin another run"
+                f"agent {agent} has on file promises of shards of {own.shard_cells} cells, the scenario has "
+                f"{shards.side}: set map.shard_regions to {own.shard_cells // REGION_CELLS}, or start another run"
             )
         self.own = own
         self._is_external = agent not in spawns

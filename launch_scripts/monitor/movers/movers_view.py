@@ -90,7 +90,7 @@ class MoversView:
         self._crew: frozenset[tuple[str, str]] = frozenset()
         """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
         self._fleets_new = False
-        self._limit = RateLimit({"pins": 0.2, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
+        self._limit = RateLimit({"pins": 0.2, "trails": 0.5, "obstacles": 0.2, "beliefs": 0.5})
 
     def begin(self) -> None:
         """Logs styles, and starts all drawings from scratch."""
@@ -212,16 +212,17 @@ class MoversView:
 
     def _draw_obstacles(self, obstacles: Sequence[Obstacle], now_ns: int) -> None:
         """Draws discs as large as the obstacles, if something about them is new."""
-        if not self._limit.due("bodies", now_ns):
+        if not self._limit.due("obstacles", now_ns):
             return
         centres, radii_m = self._discs(obstacles, [each.radius_m for each in obstacles], 0.2)
         sizes = np.stack([radii_m, radii_m, 0.35 * radii_m], axis=1)
-        if self._pen.news("world/bodies", centres=centres, sizes=sizes):
+        if self._pen.news("world/obstacles", centres=centres, sizes=sizes):
             discs = rr.Ellipsoids3D(
                 centers=centres, half_sizes=sizes, colors=[styles.OBSTACLE_COLOUR], fill_mode="solid",
-                labels=[f"{each.id} of {each.group}" for each in obstacles], show_labels=len(obstacles) <= MOST_LABELS,
+                labels=[f"{each.id} of {each.group}" for each in obstacles],
+                show_labels=len(obstacles) <= MOST_LABELS,
             )  # fmt: skip
-            self._pen.log("world/bodies", discs)
+            self._pen.log("world/obstacles", discs)
 
     def _draw_beliefs(self, now_ns: int) -> None:
         """Draws where targets are believed to be; one without cells is no longer searched."""

@@ -83,11 +83,11 @@ class ObstacleHit:
     def sentence(self, began_ns: int) -> str:
         """Returns the finding and the reports which prove it."""
         if self.by_vehicle:
-            found = f"{self.vehicle} drove into obstacle {self.obstacle}, which had closed the cell for {self.said_s:.1f} s"
+            found = f"{self.vehicle} drove into obstacle {self.obstacle}, known for {self.said_s:.1f} s"
         elif self.said_s < 0.0:
             found = f"obstacle {self.obstacle} drove into {self.vehicle}, which was there first"
         else:
-            found = f"obstacle {self.obstacle} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
+            found = f"obstacle {self.obstacle} met {self.vehicle} {self.said_s:.2f} s after its first report"
         return found + _proven(self.evidence, began_ns)
 
 

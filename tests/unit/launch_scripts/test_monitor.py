@@ -200,7 +200,7 @@ DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]
     "a sighting ends": ([(NS_PER_S // 2, SEEN)], "targets/sighted", "strips", [0, 1, 0]),
     "an obstacle moves, and its lease ends": (
         [(NS_PER_S // 2, OBSTACLE), (NS_PER_S, msgspec.structs.replace(OBSTACLE, seq=2, x_m=130.0))],
-        "bodies", "centers", [0, 1, 1, 0],
+        "obstacles", "centers", [0, 1, 1, 0],
     ),
     "a belief ends, and its planner is silent after another": (
         [

@@ -210,7 +210,7 @@ def test_more_shards_than_agents_have_use_for_are_a_warning_with_what_to_set() -
         " 10 times a second; set it to 4, for larger ones"
     )
     assert list(shards(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have no third
-    assert list(shards(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
+    assert list(shards(parse_scenario(f"{text}[map]\nshard_regions = 4\n"), grid)) == []
     assert list(shards(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 
 

@@ -18,12 +18,11 @@ from support.effort import few
 
 from launch_scripts.launcher import takeover
 from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.launcher.options import UpOptions, common_run_id
+from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.process_table import ProcessSpec
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
@@ -247,9 +246,3 @@ def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_
     after.turned(observed, 0, [])
     assert after.url == before.url
     after.close()
-
-
-def test_parts_of_both_versions_agree_on_the_id_of_a_run_whose_scenario_has_no_key_that_is_new() -> None:
-    plain = 'name = "plain"\n[[groups]]\nvehicles = 3\n'
-    assert common_run_id(parse_scenario(plain)) == "plain-b1506df3"  # as the version before says
-    assert common_run_id(parse_scenario(f"{plain}[map]\nplot_regions = 2\n")) != "plain-b1506df3"

@@ -15,7 +15,7 @@ from swarm.right_of_way.incarnations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Fence, Granted, HostState, Known, Stand, Table
-from vehicle_agent.traffic import leader as leaders
+from vehicle_agent.traffic import shard_leader as leaders
 from vehicle_agent.traffic.shard_leader import Leader
 
 GRID = GridSpec(64, 64, 1.0)
@@ -152,9 +152,7 @@ def test_a_shard_knows_so_many_external_vehicles_and_says_whom_it_refuses(monkey
     assert len(leader.refused) == 1
 
 
-def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_its_next_generation_enters_again() -> (
-    None
-):
+def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_the_next_enters() -> None:
     external, leader = entered()
     leader._orders.fenced["rover", 77] = {"rover-00": [(90, 1, 1), (91, 1, 1)]}
     generations = [77, leader._orders.hosts["rover"][0]]
@@ -209,9 +207,7 @@ def test_a_replaced_external_vehicle_says_nothing_and_takes_nothing() -> None:
     assert external.cells == ()
 
 
-def test_what_was_shut_for_an_external_vehicle_is_opened_only_by_a_generation_that_counts_and_is_its_own_first() -> (
-    None
-):
+def test_cells_shut_for_an_external_vehicle_are_opened_only_by_a_generation_that_counts() -> None:
     held = {"rover-00": [(70, 1, 1), (71, 1, 1)]}
     leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, held)])
     older = entering("rover", 70, generation=1 << 33)

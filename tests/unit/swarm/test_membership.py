@@ -75,7 +75,7 @@ def test_members_of_one_run_get_along(members):
         ),
         (
             {"shard_cells": 1024},
-            "planner t1 has shards of right of way of 1024 cells a side, but planner t0 has 256: map.shard_regions ",
+            "planner t1 has shards of right of way of 1024 cells a side, but planner t0 has 256: map.shard",
         ),
         (
             {"classes": ["truck", "walker"]},

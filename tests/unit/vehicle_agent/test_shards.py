@@ -96,7 +96,7 @@ def test_promises_of_shards_of_another_size_are_refused_with_what_to_do(used: di
 
 
 def test_every_process_says_how_large_shards_are() -> None:
-    scenario = parse_scenario("[[targets]]\n[[groups]]\n[map]\nplot_regions = 3\n")
+    scenario = parse_scenario("[[targets]]\n[[groups]]\n[map]\nshard_regions = 3\n")
     info = RoleSetup(scenario, "r", "planner", "t0", 1, 0).info(GRID, "digest")
     assert info.shard_cells == 3 * REGION_CELLS
 

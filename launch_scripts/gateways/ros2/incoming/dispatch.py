@@ -74,7 +74,7 @@ class Incoming:
         self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
         """Names in ROS of vehicles that agents of the swarm have. A vehicle published by another gateway looks like
-        a robot, and would be a body at the position of the vehicle itself."""
+        a robot, and would be an obstacle at the position of the vehicle itself."""
         self._taken_due_ns = 0
         self._sendable: set[str] = set()
         """Names in ROS of vehicles whose goals are taken from there."""
