@@ -263,9 +263,9 @@ class RightOfWaySync:
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
         """A claim is answered to the member whose epoch it is, under its own name."""
-        if not asked.fields["plot"].isdecimal() or len(asked.fields["plot"]) > _MOST_DIGITS:
+        if not asked.fields["shard"].isdecimal() or len(asked.fields["shard"]) > _MOST_DIGITS:
             return
-        shard, shards = int(asked.fields["plot"]), self.core.shards
+        shard, shards = int(asked.fields["shard"]), self.core.shards
         if shard in shards.all and asked.fields["member"] == shards.leader(shard, epoch):
             self._answer(asked, self.core.hear_claim(shard, epoch, own_ns))
 
@@ -316,7 +316,7 @@ class RightOfWaySync:
                     for member in members:
                         tag = f"promise-{shard}-{epoch}"
                         claim = Claim(epoch=epoch)
-                        seats: dict[str, str | int] = {"plot": shard, "member": self._id, "agent": member}
+                        seats: dict[str, str | int] = {"shard": shard, "member": self._id, "agent": member}
                         self._bus.ask(TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:

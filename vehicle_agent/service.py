@@ -417,7 +417,7 @@ class AgentService:
         self.counters.counts["obstacles_refused"] = obstacles.refused
         self.counters.counts["detours"] = self.agent.detours.found
         for text in obstacles.complaints:
-            self._warn("body", text)
+            self._warn("obstacle", text)
         obstacles.complaints.clear()
         shut_in = self.agent.shut_in
         for id in sorted(shut_in - self._shut_in):

@@ -29,7 +29,7 @@ RunArgument = Annotated[
         metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
     ),
 ]
-_ROW = "{:<22} {:>4} {:>9} {:>9} {:>9}  {}"
+_ROW = "{:<20} {:>10} {:>8} {:>8} {:>8}  {}"
 _SHOWN = 300
 """Characters of an output."""
 
@@ -210,7 +210,7 @@ def replay(
     if not as_json:
         for package, (then, now) in others.items():
             typer.echo(f"recorded with {package} {then}, replayed with {now}")
-        typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
+        typer.echo(_ROW.format("process", "generation", "events", "outputs", "seconds", "result"))
     rows: list[Replayed] = []
     for row in replay_run(folder, process, until_s):
         rows.append(row)
@@ -259,7 +259,7 @@ def _fields(row: Replayed) -> dict[str, Any]:
     recorded = row.recorded
     return {
         "process": recorded.process,
-        "life": recorded.generation,
+        "generation": recorded.generation,
         "incarnation": recorded.head.incarnation,
         "bytes": recorded.path.stat().st_size,
         "same": row.same,

@@ -205,7 +205,7 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (TargetPose, {"target": "*"}, "target"),
         (Table, {"grants": {"v": []}}, "length >= 1"),
         (Table, {"grants": {"a b": [[1, 1, 1]]}}, "grants"),
-        (HostState, {"life": (1 << 64) - 1}, "life"),
+        (HostState, {"generation": (1 << 64) - 1}, "generation"),
         (HostState, {"vehicles": [["v", 1, 1, [[1, 1, 1]], [], [2] * 9, 9, 0]]}, "length <= 8"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),
         (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),

@@ -83,7 +83,7 @@ class OrderWorld:
         self.proves_too_much = False
         self.net: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
         self.collisions: list[tuple[str, str]] = []
-        self.counts = dict.fromkeys(("moves", "followed", "seams", "takeovers", "lives", "given_back"), 0)
+        self.counts = dict.fromkeys(("moves", "followed", "seams", "takeovers", "generations", "given_back"), 0)
         cells = self.chance.sample(range(SIDE * SIDE), EACH * (len(HOSTS) - 1))
         self.generations: list[Generation] = []
         self.bodies: dict[tuple[str, int], int] = {}
@@ -217,7 +217,7 @@ class OrderWorld:
             if key[0] in bodies:
                 self.bodies[key[0], number] = cell
         self.generations.append(Generation(host, entries, dead))
-        self.counts["lives"] += 1
+        self.counts["generations"] += 1
 
     def hear_granted(
         self, generation: Generation, shard: int, stamp: Stamp, known: int, grants: dict[str, list[Entry]]

@@ -167,7 +167,7 @@ def test_one_that_hears_a_topic_may_serve_it_too(world: World):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
     table = Table(shard=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
     b.subscribe(TABLE, heard)
-    b.serve(TABLE, answering((table, {"plot": 0, "member": "a1", "agent": "a0"})))
+    b.serve(TABLE, answering((table, {"shard": 0, "member": "a1", "agent": "a0"})))
     world.settle()
     a.publish(TABLE, table, shard=0, member="a1", agent="a0")
     world.until(lambda: heard)

@@ -47,7 +47,7 @@ def standing(
 ) -> HostState:
     cells = [number[0] for number in holds]
     stand = Stand(f"{host}-00", cells[0], cells[-1], holds, [], [], 0, 0)
-    fields = {"life": 1, "vehicles": [stand], **more}
+    fields = {"generation": 1, "vehicles": [stand], **more}
     return HostState(shard=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
 
 

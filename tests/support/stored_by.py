@@ -57,7 +57,7 @@ def read(folder: Path) -> str:
     promises = FilePromiseStore(folder / "promises-a0")
     [(shard, (promised, table))] = promises.saved.items()
     kept += [promises.own, table]
-    return "\n".join([f'{{"plot": {shard}, "promised": {promised}}}', *(encode(each).decode() for each in kept)])
+    return "\n".join([f'{{"shard": {shard}, "promised": {promised}}}', *(encode(each).decode() for each in kept)])
 
 
 if __name__ == "__main__":

@@ -22,12 +22,15 @@ from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
+_ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
+"""Names of fields in files, which stay as they were."""
 
-class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
+
+class OwnRecord(msgspec.Struct, frozen=True, kw_only=True, rename=_ON_DISK):
     """An agent's record about itself and the others' files.
 
     disk         names this file: a number drawn when it was made
-    generations  the agent's lives that have run on it, the last ones
+    generations  the agent's generations that have run on it, the last ones
     noted        agent -> its file, the first that we received
     noted_by     the agents that have noted ours
     shard_cells  side of the shards of which this file holds promises, if it holds any

@@ -128,7 +128,7 @@ def test_the_legend_explains_every_state_and_kind_once(groups: list[str]) -> Non
     meanings = [look.meaning for look in legend]
     assert len(meanings) == len(set(meanings)) <= 15
     said = " ".join(meanings)
-    words = ("arrived", "waits", "stranded", "lost", "target", "seen", "body", "route", "alarm")
+    words = ("arrived", "waits", "stranded", "lost", "target", "seen", "obstacle", "route", "alarm")
     assert not [word for word in words if word not in said]
 
 

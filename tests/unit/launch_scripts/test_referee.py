@@ -189,7 +189,7 @@ def on(from_ms: int, until_ms: int, col: int) -> list[tuple[int, Fleet]]:
 def test_a_vehicle_that_enters_a_cell_which_an_obstacle_has_closed_for_two_ticks_is_at_fault() -> None:
     (hit,) = judged_hits(*standing(0, 2000, 5.5), *on(50, 1000, 4), *on(1050, 2000, 5))
     assert hit.by_vehicle
-    assert hit.sentence(0).startswith("a drove into obstacle r1, which had closed the cell for 1.1 s")
+    assert hit.sentence(0).startswith("a drove into obstacle r1, known for 1.1 s")
 
 
 def test_an_obstacle_that_drives_into_a_vehicle_is_at_fault() -> None:
@@ -201,7 +201,7 @@ def test_an_obstacle_that_drives_into_a_vehicle_is_at_fault() -> None:
 def test_a_vehicle_that_enters_where_an_obstacle_has_just_come_had_no_time() -> None:
     (hit,) = judged_hits(*on(50, 1000, 4), *on(1050, 2000, 5), *standing(900, 2000, 5.5))
     assert not hit.by_vehicle
-    assert hit.sentence(0).startswith("obstacle r1 met a, 0.15 s after its first report of the cell")
+    assert hit.sentence(0).startswith("obstacle r1 met a 0.15 s after its first report")
 
 
 def test_a_vehicle_that_crosses_the_way_on_which_an_obstacle_comes_is_at_fault() -> None:

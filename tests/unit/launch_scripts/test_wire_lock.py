@@ -74,7 +74,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "a part is written in another way": (
         lambda now: now["messages"]["host-state"]["layouts"].update(Stand="map"),
-        'Stand was "list" and is "map": standing',
+        'Stand was "list" and is "map": host-state',
     ),
     "what is added later is refused from now on": (
         lambda now: now["messages"]["fleet"]["layouts"].update(Fleet="map, no other fields"), "Fleet was",

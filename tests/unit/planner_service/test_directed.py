@@ -158,7 +158,9 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     def grant(seq: int, cells: list[int]) -> None:
         """Acts as the leader of the only shard, which has no other host to consider."""
         leader, grants = shards.leader(0, 1), grants_of(holdings, seq, {"a0-00": cells})
-        granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+        granted = Granted(
+            shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants
+        )
         agent.place(holdings.hear_granted(granted, seq))
 
     grant(1, [start])

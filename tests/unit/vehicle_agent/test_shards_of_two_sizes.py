@@ -127,7 +127,7 @@ def test_an_agent_with_a_wrong_size_that_nobody_built_on_may_start_again_with_th
 def test_what_was_promised_before_a_generation_began_counts() -> None:
     spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1"))}
     table = Table(shard=0, agent="a0", epoch=3, seq=1, hosts={}, grants={})
-    with pytest.raises(StoreError, match="plots"):
+    with pytest.raises(StoreError, match="shards"):
         RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {0: (3, table)})
 
 
