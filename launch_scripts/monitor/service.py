@@ -189,12 +189,9 @@ class MonitorService:
             self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
     def _watch_recording(self, now_ns: int) -> None:
-        if self._recording is None:
-            return
-        sentence, begun = self._recording.check(now_ns)
-        if begun:
+        if self._recording is not None and (path := self._recording.check(now_ns)) is not None:
             self._begin_drawing()
-        if sentence is not None:
+            sentence = f"the recording had ended, and goes on in {path}"
             log.warning("%s", sentence)
             self._member.note(now_ns, "recording", sentence)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 import re
 import tracemalloc
 
@@ -141,6 +142,18 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     assert recorder.report()["marks"] == late.report()["marks"] == 9
     hear(recorder, other)  # one that was started by hand knows of no other life
     assert recorder.report()["marks"] == 109
+
+
+def test_lives_whose_counts_a_later_one_carries_on_are_forgotten_in_whatever_order_they_come() -> None:
+    """An agent is killed every second of an hour: its observer keeps one life of it, and no count is lost."""
+    recorder = Recorder(scenario(), GRID)
+    lives = [
+        msgspec.structs.replace(stats("agent", "a0", n, n, {"marks": n}), since=int(n > 1)) for n in range(1, 3601)
+    ]
+    late = random.Random(1).sample(lives[:-1], 100)
+    hear(recorder, *lives, *late)
+    assert recorder.observed.total("marks") == 3600
+    assert sum(map(len, recorder.observed._lives.values())) == 1
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
