@@ -226,7 +226,7 @@ class MonitorService:
             self._pen.flush()
 
     def _draw_plots(self, now_ns: int) -> None:
-        sample = self.figures.samples.last
+        sample = self.figures.sample
         if sample is not None and sample.time_s != self._last_sample_s:
             self._last_sample_s = sample.time_s
             self._panel.plots(sample)

@@ -133,8 +133,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
         assert set(parts) == {"positions", "colors", sentence}
         assert len(parts[sentence][-1]) == len(parts["positions"][-1])
     assert any(
-        ": on its way, route " in line
-        for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
     )
 
 

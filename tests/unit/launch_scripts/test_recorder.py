@@ -17,7 +17,7 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
-from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.recorder import Recorder, RunFigures
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
@@ -144,16 +144,27 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     assert recorder.report()["marks"] == 109
 
 
-def test_lives_whose_counts_a_later_one_carries_on_are_forgotten_in_whatever_order_they_come() -> None:
-    """An agent is killed every second of an hour: its observer keeps one life of it, and no count is lost."""
-    recorder = Recorder(scenario(), GRID)
-    lives = [
-        msgspec.structs.replace(stats("agent", "a0", n, n, {"marks": n}), since=int(n > 1)) for n in range(1, 3601)
-    ]
-    late = random.Random(1).sample(lives[:-1], 100)
-    hear(recorder, *lives, *late)
-    assert recorder.observed.total("marks") == 3600
-    assert sum(map(len, recorder.observed._lives.values())) == 1
+def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
+    """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
+    figures = RunFigures(scenario(), GRID, 0)
+
+    def live(from_s: int, until_s: int) -> int:
+        lives = [
+            msgspec.structs.replace(stats("agent", "a0", 2 + n, n, {"marks": n}, x=[n + 1.0]), since=2)
+            for n in range(from_s, until_s)
+        ]
+        for n, life in zip(range(from_s, until_s), lives, strict=True):
+            late = random.Random(n).choice(lives[: n - from_s + 1])
+            for message in (life, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+                figures.heard(message, n * NS_PER_S)
+            figures.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            figures.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert figures.observed.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(figures.observed).items() if name != "book"}
+        return len(pickle.dumps([kept, figures.sample]))
+
+    minute = live(1, 60)
+    assert live(60, 3600) < 1.1 * minute
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
