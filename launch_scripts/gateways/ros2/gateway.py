@@ -226,7 +226,7 @@ class Gateway:
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
-            self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
+            self._feed.merge(view.take_mark_sets(), swarm_now_ns)
             changed = self._feed.take_changes()
             if "markers" in self._rows:
                 self._fresh += changed
