@@ -35,7 +35,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
     packed_transforms,
     ros_name,
 )
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.client.own_marks import OwnMarks
@@ -73,9 +73,8 @@ def vehicle(
     return SeenVehicle(id, "all", x_m, y_m, heading_rad, "following", "t0")
 
 
-def gateway(text: str = "", fixes: bool = True) -> Gateway:
-    feed = MapFeed(GRID, None)
-    return Gateway(parse_settings(text), TYPES, RosMap(GRID), feed, (lambda x, y: (48.0, 9.0)) if fixes else None)
+def gateway(text: str = "", types: RosTypes = TYPES) -> Gateway:
+    return Gateway(parse_settings(text), types, RosMap(GRID), MapFeed(GRID, None), lambda x, y: (48.0, 9.0))
 
 
 def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = None) -> list[Any]:
@@ -161,6 +160,23 @@ def test_a_clock_that_leaps_changes_stamps_and_nothing_else(moments: list[Any], 
 
 def without_message(action: Any) -> Any:
     return action.channel if isinstance(action, Put) else action
+
+
+@pytest.mark.parametrize("distribution", Distribution)
+def test_every_message_is_read_as_it_was_made_by_each_distribution(distribution: Distribution) -> None:
+    core, marks = gateway(types=types_of(distribution)), OwnMarks("all.a.1", "all", GRID)
+    target = SeenTarget("t0", 300_010.0, 5_199_610.0, 0, None, False)
+    route = {"a": [(300_000.0, 5_199_900.0), (300_100.0, 5_199_990.0)]}
+    actions = told(core, World({"a": vehicle("a")}, {"t0": target}, route), 0.0)
+    sets = marks.state([0], MarkKind.LETHAL, 0.0, BEGAN_NS) + marks.state([71], MarkKind.PACE, 0.2, BEGAN_NS)
+    actions += told(core, World({"a": vehicle("a")}, sets=sets), 1.0)
+    made = [each for each in actions if isinstance(each, Put)]
+    assert {each.channel.row for each in made} == set(ROWS)
+    for each in made:
+        name, types = ROWS[each.channel.row].type_name, types_of(distribution)
+        content = types.pack(each.message, name)
+        assert types.pack(types.unpack(content, name), name) == content
+        assert types.definition_of(name)
 
 
 def test_updates_of_the_map_keep_their_rate_and_lose_nothing() -> None:
@@ -289,17 +305,6 @@ def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool)
                 heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
         assert heard is not None
         assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
-
-
-def test_without_the_terrain_the_map_holds_marks_alone() -> None:
-    marks = OwnMarks("all.a.1", "all", GRID)
-    world = World(
-        sets=marks.state([0], MarkKind.LETHAL, 0.0, BEGAN_NS) + marks.state([71], MarkKind.PACE, 0.2, BEGAN_NS)
-    )
-    (grid,) = puts(told(gateway(), world, 0.0), "map")
-    cells = grid.data.reshape(GRID.rows, GRID.cols)
-    assert (cells[-1, 0], cells[-2, 1]) == (100, 50), "row 0 is in the south"
-    assert Counter(cells.reshape(-1).tolist())[-1] == GRID.cells - 2
 
 
 def test_zones_and_marks_are_drawn_until_they_are_gone() -> None:
