@@ -237,11 +237,6 @@ class Sinks:
             self.rec.set_sinks(*live, default_blueprint=blueprint)
 
     @property
-    def stream_url(self) -> str | None:
-        """Address for a native viewer."""
-        return None if self.gate is None else f"rerun+{self.gate.url}/proxy"
-
-    @property
     def web_port(self) -> int:
         """Port of the live view's page on this machine; 0 without one."""
         return 0 if self.page is None else self.page.server.port
