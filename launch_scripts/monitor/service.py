@@ -1,7 +1,7 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
 It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
-process waits for it. It loads rerun, so it is imported while the monitor takes part in its run already.
+process waits for it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable
-from functools import partial
 
 from PIL import Image
 
@@ -74,7 +73,6 @@ class MonitorService:
     web_port   port of the live view's page on this machine; 0: it has none
     recording  watches the file of the recording, if there is one
     audience   viewers of the stream; if not given, there is always one
-    member     one that has joined already; None: one that joins when the service starts
     """
 
     def __init__(
@@ -88,7 +86,6 @@ class MonitorService:
         web_port: int = 0,
         recording: RecordingWatch | None = None,
         audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
-        member: Member | None = None,
     ) -> None:
         scenario = setup.scenario
         self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
@@ -98,8 +95,7 @@ class MonitorService:
         """The newest figures in lines, for the start page. Read by other threads, too."""
         self._setup, self._bus, self._post, self._pen = setup, bus, post, scene.pen
         self._recording, self._audience = recording, audience
-        self._joins = member is None
-        self._member = member or Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
         self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain, learning=scenario.map.learning)
@@ -125,8 +121,7 @@ class MonitorService:
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
-        if self._joins:
-            self._member.join()
+        self._member.join()
         self._observer.keep_samples()
         self._observer.ask_gone()
         self.figures.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
@@ -194,12 +189,9 @@ class MonitorService:
             self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
     def _watch_recording(self, now_ns: int) -> None:
-        if self._recording is None:
-            return
-        sentence, begun = self._recording.check(now_ns)
-        if begun:
+        if self._recording is not None and (path := self._recording.check(now_ns)) is not None:
             self._begin_drawing()
-        if sentence is not None:
+            sentence = f"the recording had ended, and goes on in {path}"
             log.warning("%s", sentence)
             self._member.note(now_ns, "recording", sentence)
 
@@ -234,7 +226,7 @@ class MonitorService:
             self._pen.flush()
 
     def _draw_plots(self, now_ns: int) -> None:
-        sample = self.figures.samples.last
+        sample = self.figures.sample
         if sample is not None and sample.time_s != self._last_sample_s:
             self._last_sample_s = sample.time_s
             self._panel.plots(sample)
@@ -252,10 +244,8 @@ def load_view(
     post: Post,
     closing: contextlib.ExitStack,
     page: LivePage | None = None,
-) -> Callable[[Member], MonitorService]:
-    """Prepares drawing, opens the recording and the live view's ports, and returns the factory of the service.
-
-    Called on a thread of its own, so what it returns is called by the thread that owns the service.
+) -> MonitorService:
+    """Prepares drawing, opens the recording and the live view's ports, and makes the service.
 
     closing  closes what it opens
     page     of the live view, which is served already
@@ -278,14 +268,12 @@ def load_view(
     scene = Scene(Pen(sinks.streams, mesh), layers, truth, scenario_areas(scenario, terrain.grid))
     watch = None if path is None else RecordingWatch(path, sinks.begin_file)
 
-    def make(member: Member) -> MonitorService:
-        served = partial(MonitorService, web_port=sinks.web_port, audience=sinks.audience)
-        service = served(setup, terrain, bus, post, scene, recording=watch, member=member)
-        give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
-        life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
-        told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
-        if sinks.page is not None:
-            sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
-        return service
-
-    return make
+    service = MonitorService(
+        setup, terrain, bus, post, scene, web_port=sinks.web_port, recording=watch, audience=sinks.audience
+    )
+    give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
+    life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
+    told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
+    if sinks.page is not None:
+        sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
+    return service

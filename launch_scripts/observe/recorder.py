@@ -1,7 +1,7 @@
 """The recorder of a run: takes messages, returns numbers. Launcher and simulation share it.
 
-`RunFigures` keeps the figures of a run at successive instants, which is all that the live view needs. `Recorder`
-keeps tracks, routes, captures and notes, too, and makes the report. Pure: time is an argument, and the owner of a
+`RunFigures` keeps the newest figures of a run, which is all that the live view needs. `Recorder` keeps samples of
+them, tracks, routes, captures and notes, too, and makes the report. Pure: time is an argument, and the owner of a
 bus passes it messages on `HEARD` or `RECORDED`.
 """
 
@@ -41,14 +41,15 @@ _SHOWN_NS = 5 * NS_PER_S // 4
 
 
 class RunFigures:
-    """Samples of a run, in memory which does not grow with the rate of messages."""
+    """The figures of a run now, in memory which grows with neither the rate of messages nor the run's length."""
 
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
         """started_ns  when the run began; None: with the first message"""
         self.scenario = scenario
         self.grid = grid
         self.observed = LatestState(plan_of(scenario, started_ns), grid)
-        self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
+        self.sample: Sample | None = None
+        """The newest."""
         self._sample_due_ns = 0
         self._sampled: tuple[int, RunState] | None = None
         """Time when the last sample was taken or shown, and of which state."""
@@ -87,7 +88,7 @@ class RunFigures:
         self._sample_due_ns = now_ns + _SAMPLE_NS
         state = self.summary(now_ns)
         self._sampled = now_ns, state
-        self.samples.add(self._sample(state))
+        self.sample = self._sample(state)
 
     def _sample(self, state: RunState) -> Sample:
         return Sample(
@@ -134,6 +135,7 @@ class Recorder(RunFigures):
         super().__init__(scenario, grid, started_ns)
         self.ready_ns: int | None = None
         """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
+        self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Positions and times of captures; `Observed` counts them."""
         self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + _OF_ROUTE_BYTES)
@@ -194,6 +196,11 @@ class Recorder(RunFigures):
         pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
         places = [self.observed.place_m(pose) for _, pose in poses]
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
+
+    def _add_sample(self, now_ns: int) -> None:
+        super()._add_sample(now_ns)
+        if self.sample is not None:
+            self.samples.add(self.sample)
 
     def _sample(self, state: RunState) -> Sample:
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()

@@ -130,7 +130,8 @@ class Alarm:
         row, col = self.place(grid) or (None, None)
         return {
             "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
-            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "target": self.target,
+            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "cell": self.cell,
+            "target": self.target,
         }  # fmt: skip
 
 

@@ -52,26 +52,11 @@ class Channel(Struct, frozen=True):
     topic: str
 
 
-class Declare(Struct, frozen=True):
-    """Put topics up: a publisher with its token each."""
-
-    channels: tuple[Channel, ...]
-
-
-class Remove(Struct, frozen=True):
-    """Take topics down."""
-
-    channels: tuple[Channel, ...]
-
-
 class Put(Struct, frozen=True):
     """Put a message; bytes are CDR already."""
 
     channel: Channel
     message: Any
-
-
-Action = Declare | Remove | Put
 
 
 @dataclass(frozen=True)
@@ -181,8 +166,9 @@ class Gateway:
         """Windows that have changed since the map or its updates were put last."""
         self._due_ns = dict.fromkeys(self._rows, 0)
         """Due time of each row, by the clock that never leaps."""
-        always = tuple(self._channel(row.name) for row in self._rows.values() if row.per is None)
-        self._first: list[Action] = [Declare(always)]
+        self._always = frozenset(self._channels_per(None))
+        self.channels = self._always
+        """The topics that are to be up, each a publisher with its token."""
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
             "tf": self._tell_transforms, "odom": self._tell_odometry, "pose": self._tell_poses,
@@ -208,8 +194,8 @@ class Gateway:
         view: Observer,
         health: Health,
         robots: Collection[str] = (),
-    ) -> list[Action]:
-        """Returns due actions, in order.
+    ) -> list[Put]:
+        """Returns due messages, in order; each is for one of `channels`.
 
         now_ns        by a clock that never leaps, by which all rates are kept
         stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
@@ -221,49 +207,46 @@ class Gateway:
             return []
         vehicles = {id: each for id, each in view.vehicles.items() if id not in robots}
         now = _Now(now_ns, stamp_ns, vehicles, view.targets, health)
-        actions, self._first = [*self._first, *self._follow(now)], []
+        self._follow(now)
         for id, points_m in view.take_routes().items():
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
-            self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
+            self._feed.merge(view.take_mark_sets(), swarm_now_ns)
             changed = self._feed.take_changes()
             if "markers" in self._rows:
                 self._fresh += changed
             if "map_updates" in self._rows:
                 self._changed = merged(changed, self._changed)
+        puts: list[Put] = []
         for name, tell in self._tellers.items():
             if name in due:
                 self._due_ns[name] = _next_ns(self._rows[name], now_ns)
-                actions += [Put(self._channel(name, of), message) for of, message in tell(now)]
-        return actions
+                puts += [Put(self._channel(name, of), message) for of, message in tell(now)]
+        return puts
 
     # --- who is there ---------------------------------------------------------------------------------------------
 
-    def _follow(self, now: _Now) -> list[Action]:
-        """Updates positions. Topics of vehicles that are new are declared, of those that have left taken down. A
-        target of a scenario stays."""
+    def _follow(self, now: _Now) -> None:
+        """Updates positions. Topics of new vehicles come up, those of vehicles that have left go. A target of a
+        scenario stays."""
         gone = [name for name, moving in self._vehicles.items() if moving.id not in now.vehicles]
-        actions: list[Action] = [Remove(self._channels(VEHICLE, name)) for name in gone]
         for name in gone:
             del self._vehicles[name]
-        taken = [self._take(id, seen, now.now_ns) for id, seen in now.vehicles.items()]
-        came = [name for name in taken if name is not None]
+        came = [id for id, seen in now.vehicles.items() if self._take(id, seen, now.now_ns)]
         if came or gone:
             self._transforms, self._crew_changed = {}, True
-        actions += [Declare(self._channels(VEHICLE, name)) for name in came]
+        targets = len(self._targets)
         for id in now.targets:
-            name = ros_name(id)
-            if name not in self._targets:
-                self._targets[name] = id
-                actions.append(Declare(self._channels(TARGET, name)))
-            elif self._targets[name] != id:
-                self._refuse(f"target {id}", f"{self._targets[name]} is called {name}, too")
-        return actions
+            if self._targets.setdefault(ros_name(id), id) != id:
+                self._refuse(f"target {id}", f"{self._targets[ros_name(id)]} is called {ros_name(id)}, too")
+        if came or gone or len(self._targets) > targets:
+            of_each = ((VEHICLE, self._vehicles), (TARGET, self._targets))
+            own = (self._channels_per(per, name) for per, names in of_each for name in names)
+            self.channels = self._always.union(*own)
 
-    def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
-        """Returns the name of a vehicle that is published from now on; None for a known one, or one that is not
-        published."""
+    def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> bool:
+        """Returns True for a vehicle that is published from now on."""
         name = ros_name(id)
         moving = self._vehicles.get(name)
         if moving is not None and moving.id == id:
@@ -277,16 +260,16 @@ class Gateway:
         else:
             frames = ("odom", "base_link") if self._bare else ros_messages.frames_of(name)
             self._vehicles[name] = Moving(id, frames, seen, now_ns, self._messages)
-            return name
-        return None
+            return True
+        return False
 
     def _refuse(self, who: str, why: str) -> None:
         if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
             self._problems.append(f"{who} is not published to ROS: {why}")
 
-    def _channels(self, per: str, name: str) -> tuple[Channel, ...]:
-        return tuple(self._channel(row.name, name) for row in self._rows.values() if row.per == per)
+    def _channels_per(self, per: str | None, name: str | None = None) -> list[Channel]:
+        return [self._channel(row.name, name) for row in self._rows.values() if row.per == per]
 
     def _channel(self, row: str, name: str | None = None) -> Channel:
         return Channel(row, self._rows[row].topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))

@@ -37,7 +37,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
-from swarm.errors import BusError, StoreError
+from swarm.errors import BusError
 from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.orders import GoalState, GoalStates
@@ -133,8 +133,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
         assert set(parts) == {"positions", "colors", sentence}
         assert len(parts[sentence][-1]) == len(parts["positions"][-1])
     assert any(
-        ": on its way, route " in line
-        for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
     )
 
 
@@ -235,11 +234,6 @@ def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(
 
 def test_no_recording_replaces_another(tmp_path: Path) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
-
-
-def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"cannot write .*run\.rrd: No such file or directory"):
-        new_recording_path(tmp_path / "nowhere")
 
 
 def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
@@ -373,24 +367,21 @@ path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
 mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
 sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
 watch = RecordingWatch(path, sinks.begin_file)
-for second in range(80):
-    if second == 68:
+for second in range(20):
+    if second == 8:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     for stream in sinks.streams:
         stream.set_time("tick", sequence=second)
         stream.log("a", rr.Scalars(second))
-    sentence, begun = watch.check(second * 10**9)
-    if sentence:
-        print(second, begun, sentence, flush=True)
+    if begun := watch.check(second * 10**9):
+        print(second, begun, flush=True)
 sinks.close()
 """
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
     ).stdout.splitlines()
-    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
-    begun = f"True the recording goes on in {tmp_path / 'run-2.rrd'}"
-    assert told == [f"5 False {ended}", f"65 False {ended}", f"76 {begun}"]
-    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 3
+    assert told == [f"15 {tmp_path / 'run-2.rrd'}"], "tried at 5 s, when it has not grown for long, and 10 s later"
+    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 4
 
 
 def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
@@ -398,8 +389,8 @@ def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
 ) -> None:
     rig = Rig(scenario, terrain, tmp_path / "run.rrd")
     watch = RecordingWatch(tmp_path / "run.rrd", rig.sinks.begin_file)
-    told = iter([(None, False), ("it goes on", True)])
-    watch.check = lambda now_ns: next(told, (None, False))  # type: ignore[method-assign]
+    told = iter([None, tmp_path / "run-2.rrd"])
+    watch.check = lambda now_ns: next(told, None)  # type: ignore[method-assign]
     rig.service._recording = watch
     rig.run(0.15)
     rig.sinks.begin_file(tmp_path / "run-2.rrd")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 import re
 import tracemalloc
 
@@ -16,7 +17,7 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
-from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.recorder import Recorder, RunFigures
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
@@ -141,6 +142,29 @@ def test_a_generation_that_carries_on_what_earlier_ones_counted_is_not_added_to_
     assert recorder.report()["marks"] == late.report()["marks"] == 9
     hear(recorder, other)  # one that was started by hand knows of no other generation
     assert recorder.report()["marks"] == 109
+
+
+def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
+    """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
+    figures = RunFigures(scenario(), GRID, 0)
+
+    def live(from_s: int, until_s: int) -> int:
+        generations = [
+            msgspec.structs.replace(stats("agent", "a0", 2 + n, n, {"marks": n}, x=[n + 1.0]), since=2)
+            for n in range(from_s, until_s)
+        ]
+        for n, generation in zip(range(from_s, until_s), generations, strict=True):
+            late = random.Random(n).choice(generations[: n - from_s + 1])
+            for message in (generation, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+                figures.heard(message, n * NS_PER_S)
+            figures.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            figures.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert figures.observed.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(figures.observed).items() if name != "book"}
+        return len(pickle.dumps([kept, figures.sample]))
+
+    minute = live(1, 60)
+    assert live(60, 3600) < 1.1 * minute
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:

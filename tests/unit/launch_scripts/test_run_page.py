@@ -137,22 +137,6 @@ def test_the_page_is_written_again_from_the_folder_alone(run: Path, tmp_path: Pa
         assert (code > 0, told.count("\n"), sentence in told) == (True, 1, True)
 
 
-def test_a_comparison_says_first_what_makes_runs_unlike(run: Path, tmp_path: Path, swarm: Swarm) -> None:
-    for name, changes in (("r1", {}), ("r2", {"seed": 9}), ("r3", {"terrain": {"digest": "0" * 16}})):
-        (tmp_path / name).mkdir()
-        report = json.loads((run / "report.json").read_text()) | changes
-        (tmp_path / name / "report.json").write_text(json.dumps(report))
-        shutil.copy(run / "scenario.toml", tmp_path / name)
-    code, told, _ = swarm("runs compare r1 r2 r3 --runs", tmp_path)
-    assert code == 0
-    assert "The terrains differ" in told
-    assert "The seeds differ (3, 9, 3)" in told
-    (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
-    code, told, _ = swarm("runs compare r1 r2 --runs", tmp_path)
-    assert (code, "\x1b" in told) == (0, False)
-    assert json.loads(swarm("runs compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []
-
-
 # --- `swarm runs export --format mcap` ----------------------------------------------------------------------------
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
