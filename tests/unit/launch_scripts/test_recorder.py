@@ -17,7 +17,8 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
-from launch_scripts.observe.recorder import Recorder, RunFigures
+from launch_scripts.observe.latest_messages import LatestState, plan_of
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
@@ -146,7 +147,7 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
 
 def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
     """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
-    figures = RunFigures(scenario(), GRID, 0)
+    latest = LatestState(plan_of(scenario(), 0), GRID)
 
     def live(from_s: int, until_s: int) -> int:
         lives = [
@@ -156,12 +157,12 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
         for n, life in zip(range(from_s, until_s), lives, strict=True):
             late = random.Random(n).choice(lives[: n - from_s + 1])
             for message in (life, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
-                figures.heard(message, n * NS_PER_S)
-            figures.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
-            figures.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
-        assert figures.observed.total("marks") == until_s - 1
-        kept = {name: each for name, each in vars(figures.observed).items() if name != "book"}
-        return len(pickle.dumps([kept, figures.sample]))
+                latest.heard(message, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert latest.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(latest).items() if name != "book"}
+        return len(pickle.dumps(kept))
 
     minute = live(1, 60)
     assert live(60, 3600) < 1.1 * minute
