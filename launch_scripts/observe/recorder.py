@@ -35,10 +35,6 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
-_SHOWN_NS = 5 * NS_PER_S // 4
-"""Largest age of shown values: a sample is taken with the first message after its second."""
-
-
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000
@@ -71,8 +67,6 @@ class Recorder:
         self.observed = LatestState(plan_of(scenario, started_ns), grid)
         self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
         self._sample_due_ns = 0
-        self._sampled: tuple[int, RunState] | None = None
-        """Time when the last sample was taken or shown, and of which state."""
         self.ready_ns: int | None = None
         """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
@@ -114,13 +108,6 @@ class Recorder:
         """Returns the state of the run at a time."""
         return state_of(self.observed, now_ns)
 
-    def shown(self, now_ns: int) -> RunState:
-        """Returns the state for displays: that of the last sample, so that it is made once a second for all. It is
-        made again if the swarm has been silent since, as that is news, too."""
-        if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
-            self._sampled = now_ns, self.summary(now_ns)
-        return self._sampled[1]
-
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
@@ -161,7 +148,6 @@ class Recorder:
     def _add_sample(self, now_ns: int) -> None:
         self._sample_due_ns = now_ns + _SAMPLE_NS
         state = self.summary(now_ns)
-        self._sampled = now_ns, state
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
         self.samples.add(
             Sample(

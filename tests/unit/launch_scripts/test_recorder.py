@@ -19,7 +19,6 @@ from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -443,26 +442,3 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
     hear(recorder, ended, at_s=later_s + 1)
     assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
-
-
-def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(
-    recorder: Recorder,
-) -> None:
-    made: list[int] = []
-    summary = recorder.summary
-
-    def counted(now_ns: int) -> RunState:
-        made.append(now_ns)
-        return summary(now_ns)
-
-    recorder.summary = counted  # type: ignore[method-assign]
-    for tick in range(100):
-        now_ns = tick * NS_PER_S // 10
-        recorder.heard(status("t0", None), now_ns)
-        shown = [recorder.shown(now_ns) for _ in range(3)]
-        assert shown[0] is shown[1] is shown[2]
-        assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0
-    assert len(made) == 10
-    for second in range(12, 20, 2):  # the swarm has fallen silent
-        assert recorder.shown(second * NS_PER_S).elapsed_s == second
-    assert len(made) == 14
