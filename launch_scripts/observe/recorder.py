@@ -35,6 +35,8 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
+_POINTS = 120
+"""Instants in a report: a plot of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000
@@ -206,10 +208,10 @@ class Recorder:
         numbers = {name: _rounded(value) for name, value in fields.items()}
         return {"verdict": verdict(numbers, failures), **numbers}
 
-    def series(self, points: int = 120) -> dict[str, list[Any]]:
-        """The run over time, at about `points` instants at most: lists with one value per `t_s`."""
+    def series(self) -> dict[str, list[Any]]:
+        """The run over time, at about `_POINTS` instants at most: lists with one value per `t_s`."""
         samples = self.samples.all()
-        samples = samples[:: max(1, -(-len(samples) // points))]
+        samples = samples[:: max(1, -(-len(samples) // _POINTS))]
         names = ("captures", "marks", "messages_per_s")
         gaps = history.certified_gaps(samples)
         fields: dict[str, list[Any]] = {
