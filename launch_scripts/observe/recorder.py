@@ -191,7 +191,7 @@ class Recorder:
             "vehicles": self.scenario.vehicle_count,
             "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
             "targets": len(self.scenario.target_ids),
-            "processes": state.expected,
+            "processes": state.well[1],
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),
