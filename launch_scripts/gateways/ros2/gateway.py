@@ -281,7 +281,7 @@ class Gateway:
     # --- vehicles -------------------------------------------------------------------------------------------------
 
     def _tell_each(self, message: Callable[[Moving, int], Any]) -> Callable[[_Now], _Told]:
-        """What every vehicle has, made of it and the stamp."""
+        """Makes the teller of a topic that every vehicle has, from its message at a stamp."""
         return lambda now: ((name, message(each, now.stamp_ns)) for name, each in self._vehicles.items())
 
     def _tell_plans(self, now: _Now) -> _Told:
