@@ -24,8 +24,9 @@ from launch_scripts.monitor.live_layout import (
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.recorder import RunFigures
+from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
+from launch_scripts.observe.run_state import state_of
 from launch_scripts.web.live_page import LivePage
 from launch_scripts.web.server import Audience
 from shared_map.array_files import give_back_memory
@@ -88,7 +89,7 @@ class MonitorService:
         audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
     ) -> None:
         scenario = setup.scenario
-        self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
+        self.observed = LatestState(plan_of(scenario, setup.started_ns), terrain.grid)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
         self.said: list[str] = []
@@ -102,9 +103,9 @@ class MonitorService:
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._panel = FiguresPanel(scene.pen, scenario.target_ids)
-        self._movers = MoversView(scene.pen, scenario, self.figures, self.counters, replica.filter)
+        self._movers = MoversView(scene.pen, scenario, self.observed, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
-        self._observer = RunObserver(bus, post, self.figures, _READ)
+        self._observer = RunObserver(bus, post, self.observed, _READ)
         self._watched = False
         self._drawn_for = 0
         """Number of viewers that had ever connected at the last complete redraw."""
@@ -113,7 +114,6 @@ class MonitorService:
         """Ticks so far, and those in which something was drawn."""
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._last_sample_s = -1.0
         self._member.needs("the shared map", lambda: self._sync.joined)
 
     def lacks(self) -> list[str]:
@@ -124,7 +124,7 @@ class MonitorService:
         self._member.join()
         self._observer.keep_samples()
         self._observer.ask_gone()
-        self.figures.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
+        self.observed.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
         self._sync.start(now_ns)
         self._pen.set_time(0, 0.0)
         self._begin_drawing()
@@ -158,7 +158,7 @@ class MonitorService:
     def stop(self, now_ns: int) -> None:
         for heard in self._observer.due(now_ns, all=True):
             self._hear(heard, now_ns)
-        self.figures.finish(now_ns)
+        self.observed.touch(now_ns)
         self._limit.all_due()
         self._ground.finish()
         self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
@@ -184,7 +184,7 @@ class MonitorService:
                 self._panel.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        self.figures.alive(peer, up, now_ns)
+        self.observed.alive(peer, up, now_ns)
         if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
             self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
@@ -226,15 +226,12 @@ class MonitorService:
             self._pen.flush()
 
     def _draw_plots(self, now_ns: int) -> None:
-        sample = self.figures.sample
-        if sample is not None and sample.time_s != self._last_sample_s:
-            self._last_sample_s = sample.time_s
-            self._panel.plots(sample)
         if self._limit.due("figures", now_ns):  # by our own clock: a swarm that says nothing any more is news, too
-            summary = self.figures.shown(now_ns)
-            self._movers.summarised(summary)
-            self._panel.summary(summary_markdown(self._setup, summary))
-            self.said = [facts.fact("elapsed_s").said(summary), *facts.lines(summary)]
+            state = state_of(self.observed, now_ns)
+            self._movers.summarised(state)
+            self._panel.plots(state)
+            self._panel.summary(summary_markdown(self._setup, state))
+            self.said = [facts.fact("elapsed_s").said(state), *facts.lines(state)]
 
 
 def load_view(

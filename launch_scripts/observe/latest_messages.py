@@ -321,10 +321,6 @@ class LatestState(Counts):
         gone = any(self.knows("planner", id) for id in ids) and not any(self.is_well("planner", id) for id in ids)
         return None if gone else self.status.get(target)
 
-    def ids_up(self, role: str) -> list[str]:
-        """Ids of the processes of a role which are alive."""
-        return [id for each, id in self.up() if each == role]
-
     def is_well(self, role: str, id: str) -> bool:
         """Returns True if a process is in order: alive, or ended on request."""
         if self._alive.get((role, id)):
@@ -434,14 +430,6 @@ class LatestState(Counts):
     def place_m(self, pose: TargetPose) -> tuple[float, float]:
         """(east, south) from the north-west corner of the grid."""
         return pose.x_m - self.grid.west_m, self.grid.north_m - pose.y_m
-
-    @property
-    def any_vehicles(self) -> bool:
-        return bool(self._fleets)
-
-    @property
-    def any_marks(self) -> bool:
-        return bool(self._marks)
 
     def learned_words(self) -> list[MarkSet]:
         """Returns the measurements of each author of terrain classes: sets in the tile beyond the map."""

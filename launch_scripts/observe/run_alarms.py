@@ -190,7 +190,7 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
     for role, id in latest.plan.crew_now(targets):
         if latest.fills(role, id) or starts(latest, role, id, now_ns):
             continue
-        leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
+        leads = next((ranked for each, ranked in latest.up() if (each, job_of(ranked)) == (role, job_of(id))), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
         generations = "is gone" if latest.knows(role, id) else "has not come up"
         yield _of_process("down", role, id, f"{generations}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))

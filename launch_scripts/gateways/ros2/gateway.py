@@ -95,8 +95,7 @@ class Moving:
     id              in the swarm
     frames          the one that does not move, and its own
     place           a heading of None is published as the last known one
-    speed_m_per_s   forward; negative backwards
-    turn_rad_per_s  clockwise
+    twist           m/s forward, negative backwards; rad/s clockwise
     route           float64 (n, 2): x, y; what it follows
     route_is_new    it was not published yet
     """
@@ -104,7 +103,7 @@ class Moving:
     def __init__(self, id: str, frames: tuple[str, str], seen: SeenVehicle, now_ns: int, made: RosMessages) -> None:
         self.id, self.frames = id, frames
         self.place: Place = (seen.x_m, seen.y_m, seen.heading_rad)
-        self.speed_m_per_s = self.turn_rad_per_s = 0.0
+        self.twist = (0.0, 0.0)
         self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
         self.route_is_new = False
         self.odometry = ros_messages.packed_odometry(made, frames)
@@ -116,7 +115,7 @@ class Moving:
         heading_rad = before_rad if seen.heading_rad is None else seen.heading_rad
         if self.place == (seen.x_m, seen.y_m, heading_rad):
             if now_ns - self._moved_ns > _STANDS_NS:
-                self.speed_m_per_s = self.turn_rad_per_s = 0.0
+                self.twist = (0.0, 0.0)
             return
         # Of two positions far apart in time, the first was left at an unknown time: no less than a report ago.
         since_s = (now_ns - self._moved_ns) / NS_PER_S
@@ -128,7 +127,7 @@ class Moving:
                 forward_m = east_m * math.sin(heading_rad) + north_m * math.cos(heading_rad)
                 if before_rad is not None:
                     turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
-            self.speed_m_per_s, self.turn_rad_per_s = forward_m / since_s, turned_rad / since_s
+            self.twist = (forward_m / since_s, turned_rad / since_s)
         self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
 
 
@@ -146,7 +145,7 @@ class Gateway:
     ) -> None:
         self._rows = {row.name: row for row in settings.rows() if to_wgs84 is not None or row.name != "fix"}
         self._bare, self._patterns = settings.frames.bare, settings.vehicles
-        self._feed, self._to_wgs84 = feed, to_wgs84
+        self._feed = feed
         self._messages = RosMessages(types, map)
         self._vehicles: dict[str, Moving] = {}
         """By name in ROS."""
@@ -157,7 +156,6 @@ class Gateway:
         self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
-        self._pose = ros_messages.packed_pose(self._messages)
         self._transforms: dict[str | None, PackedPlaces] = {}
         """Transforms of each group, since its vehicles changed last."""
         self._fresh: list[Window] = []
@@ -169,11 +167,17 @@ class Gateway:
         self._always = frozenset(self._channels_per(None))
         self.channels = self._always
         """The topics that are to be up, each a publisher with its token."""
+        made, pose = self._messages, ros_messages.packed_pose(self._messages)
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
-            "tf": self._tell_transforms, "odom": self._tell_odometry, "pose": self._tell_poses,
-            "plan": self._tell_plans, "fix": self._tell_fixes, "poses": self._tell_all_poses,
-            "targets": self._tell_targets, "target_pose": self._tell_target_poses,
+            "tf": self._tell_transforms,
+            "odom": self._tell_each(lambda each, at_ns: each.odometry.at(at_ns, [each.place], each.twist)),
+            "pose": self._tell_each(lambda each, at_ns: pose.at(at_ns, [each.place])),
+            "plan": self._tell_plans,
+            "fix": self._tell_each(
+                lambda each, at_ns: to_wgs84 and made.fix(at_ns, each.frames[1], *to_wgs84(*each.place[:2]))
+            ),
+            "poses": self._tell_all_poses, "targets": self._tell_targets, "target_pose": self._tell_target_poses,
             "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
         }  # fmt: skip
 
@@ -276,26 +280,15 @@ class Gateway:
 
     # --- vehicles -------------------------------------------------------------------------------------------------
 
-    def _tell_odometry(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            twist = each.speed_m_per_s, each.turn_rad_per_s
-            yield name, each.odometry.at(now.stamp_ns, [each.place], twist)
-
-    def _tell_poses(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            yield name, self._pose.at(now.stamp_ns, [each.place])
+    def _tell_each(self, message: Callable[[Moving, int], Any]) -> Callable[[_Now], _Told]:
+        """Makes the teller of a topic that every vehicle has, from its message at a stamp."""
+        return lambda now: ((name, message(each, now.stamp_ns)) for name, each in self._vehicles.items())
 
     def _tell_plans(self, now: _Now) -> _Told:
         for name, each in self._vehicles.items():
             if each.route_is_new:
                 each.route_is_new = False
                 yield name, self._messages.path(now.stamp_ns, each.route)
-
-    def _tell_fixes(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            if self._to_wgs84 is not None:
-                place = self._to_wgs84(*each.place[:2])
-                yield name, self._messages.fix(now.stamp_ns, each.frames[1], *place)
 
     def _groups(self) -> _Told:
         """Vehicles whose transforms go into one message, with the name of the one that has a topic of its own."""

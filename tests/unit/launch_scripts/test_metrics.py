@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from prometheus_client.metrics_core import Metric
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
@@ -19,7 +20,7 @@ from support.makers import planner_status, stats
 
 from launch_scripts import web
 from launch_scripts.observe.summed_counts import Counts
-from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, named
+from launch_scripts.web.prometheus import HELP, MetricsEndpoint, Run, families, named
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.messages.planning import PlannerStatus
@@ -51,17 +52,17 @@ def _agent() -> Counters:
 
 
 @pytest.fixture
-def figures() -> Figures:
+def figures() -> list[Metric]:
     counts, targets = Counts(), Counters()
     targets.count("captures", 2)
     targets.count_by(CAPTURES_OF, "t0")
     counts.count(_stats("agent", "a0", _agent()))
     counts.count(_stats("targets", "0", targets))
-    return Figures(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
+    return families(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
 
 
 def _scraped(
-    endpoint: MetricsEndpoint, figures: Figures, path: str = "/metrics", **headers: str
+    endpoint: MetricsEndpoint, figures: list[Metric], path: str = "/metrics", **headers: str
 ) -> tuple[int, str]:
     """Status and text of a scrape, answered by this thread as its owner would."""
     found: list[tuple[int, str]] = []
@@ -77,7 +78,7 @@ def _scraped(
     visitor = threading.Thread(target=scrape)
     visitor.start()
     while visitor.is_alive():
-        endpoint.answer(lambda: families(figures))
+        endpoint.answer(lambda: figures)
         visitor.join(0.01)
     return found[0]
 
@@ -97,7 +98,7 @@ def _samples(text: str) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: Figures) -> None:
+def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
     status, text = _scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0")
     found = _samples(text)
     assert status == 200
@@ -119,7 +120,7 @@ def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: F
     assert under["le=+Inf"] == 4
 
 
-def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: Figures) -> None:
+def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
     _, text = _scraped(endpoint, figures)
     assert {family.name for family in plain_families(text)} >= {"swarm_captures", "swarm_route_query_seconds"}
 
@@ -148,7 +149,7 @@ def test_no_name_from_the_network_breaks_a_scrape(
         Stats(role="agent", id="a0", incarnation=1, stamp_ns=1, counts=counts, gauges=gauges, histograms=histograms)
     )
     run = Run('a"\n\\b', "demo", _BEGAN_NS)
-    text = generate_latest(OneScrape(families(Figures(run, heard, {}, [("agent", "a0")])))).decode()
+    text = generate_latest(OneScrape(families(run, heard, {}, [("agent", "a0")]))).decode()
     found = _samples(text)
     assert found["swarm_process_up", "id=a0", "role=agent"] == 1
     assert found["swarm_run_info", 'run_id=a"\n\\b', "scenario=demo"] == 1

@@ -17,8 +17,8 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
-from launch_scripts.observe.recorder import Recorder, RunFigures
-from launch_scripts.observe.run_state import RunState
+from launch_scripts.observe.latest_messages import LatestState, plan_of
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -146,7 +146,7 @@ def test_a_generation_that_carries_on_what_earlier_ones_counted_is_not_added_to_
 
 def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
     """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
-    figures = RunFigures(scenario(), GRID, 0)
+    latest = LatestState(plan_of(scenario(), 0), GRID)
 
     def live(from_s: int, until_s: int) -> int:
         generations = [
@@ -156,12 +156,12 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
         for n, generation in zip(range(from_s, until_s), generations, strict=True):
             late = random.Random(n).choice(generations[: n - from_s + 1])
             for message in (generation, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
-                figures.heard(message, n * NS_PER_S)
-            figures.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
-            figures.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
-        assert figures.observed.total("marks") == until_s - 1
-        kept = {name: each for name, each in vars(figures.observed).items() if name != "book"}
-        return len(pickle.dumps([kept, figures.sample]))
+                latest.heard(message, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert latest.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(latest).items() if name != "book"}
+        return len(pickle.dumps(kept))
 
     minute = live(1, 60)
     assert live(60, 3600) < 1.1 * minute
@@ -442,26 +442,3 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
     hear(recorder, ended, at_s=later_s + 1)
     assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
-
-
-def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(
-    recorder: Recorder,
-) -> None:
-    made: list[int] = []
-    summary = recorder.summary
-
-    def counted(now_ns: int) -> RunState:
-        made.append(now_ns)
-        return summary(now_ns)
-
-    recorder.summary = counted  # type: ignore[method-assign]
-    for tick in range(100):
-        now_ns = tick * NS_PER_S // 10
-        recorder.heard(status("t0", None), now_ns)
-        shown = [recorder.shown(now_ns) for _ in range(3)]
-        assert shown[0] is shown[1] is shown[2]
-        assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0
-    assert len(made) == 10
-    for second in range(12, 20, 2):  # the swarm has fallen silent
-        assert recorder.shown(second * NS_PER_S).elapsed_s == second
-    assert len(made) == 14

@@ -20,10 +20,9 @@ Answer = Callable[[Route | str], None]
 class RouteQuestions:
     """Asks planners of targets, and the planner of places."""
 
-    def __init__(self, swarm: Swarm, queue: WorkQueue | None = None) -> None:
-        """queue  does the waiting for planners"""
+    def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
-        self._queue = queue or WorkQueue("ros2-routes", _THREADS, MOST_WAITING)
+        self._queue = WorkQueue("ros2-routes", _THREADS, MOST_WAITING)
         self.close = self._queue.close
 
     def ask(self, goal: Place | str, start: Place, vehicle_class: str, answer: Answer) -> None:
