@@ -23,6 +23,8 @@ MOST_STRETCH = 0.02
 _LIKE_WGS84 = (4326, 4258, 4269)
 """Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
 _EARTH_M = 6_371_000.0
+METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
+"""Coordinate system of what has no place on Earth."""
 HIGHEST_DEG = 85.0
 """Degrees nearer to a pole than this are not put on metres."""
 

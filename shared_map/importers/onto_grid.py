@@ -7,7 +7,6 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.georeference import bounds_in, crs_name, crs_of, pixel_m
@@ -67,7 +66,11 @@ class Placed:
         from rasterio.vrt import WarpedVRT
         from rasterio.warp import Resampling, reproject
 
-        place = {"src_crs": self.crs, "dst_crs": self.target, "dst_transform": transform_of(self.grid, row0)}
+        place = {
+            "src_crs": self.crs,
+            "dst_crs": self.target or self.crs,
+            "dst_transform": transform_of(self.grid, row0),
+        }
         with contextlib.ExitStack() as files:
             dataset = self.dataset
             if (dataset.crs, dataset.transform) != (self.crs, self.transform):
@@ -131,11 +134,3 @@ def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> f
             f" the terrain x {grid.west_m:.7g}..{grid_east:.7g}, y {grid_south:.7g}..{grid.north_m:.7g}"
         )
     return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
-
-
-def nearest(array: NDArray[Any], grid: GridSpec) -> tuple[Any, ...]:
-    """An index into an array over the same ground as a grid: the cell nearest to each cell of the grid."""
-    rows, cols = array.shape[:2]
-    at_row = ((np.arange(grid.rows) + 0.5) * rows / grid.rows).astype(np.intp)
-    at_col = ((np.arange(grid.cols) + 0.5) * cols / grid.cols).astype(np.intp)
-    return np.ix_(at_row, at_col)

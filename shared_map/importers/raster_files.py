@@ -21,12 +21,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
 from swarm.config.input_files import FileKind, check_bytes, read_text, size
 from swarm.errors import TerrainError
@@ -45,8 +46,10 @@ _SURFER_LINES = 5
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
 _HEAD_BYTES = 16
-AS_TEXT = "AS_TEXT"
-"""Tag of grids as text: few of these files say in which coordinate system they are."""
+NOTES = "NOTES"
+"""Tag of numbers which we have read ourselves: what people should know of them, a line each."""
+PLAIN = (".npz", ".csv", ".xyz")
+"""Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md)."""
 BAD_ARCHIVE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
     KeyError, OverflowError,
@@ -67,11 +70,26 @@ _MAX_BANDS = 256
 describes in memory."""
 
 
+class Numbers(NamedTuple):
+    """Numbers which we have read ourselves, and where they lie.
+
+    numbers    float32 (rows, cols), NaN where there is none
+    transform  affine; None if the file does not say how large a cell is
+    crs        rasterio's; None if the file does not say it
+    notes      for people
+    """
+
+    numbers: Floats
+    transform: Any = None
+    crs: Any = None
+    notes: tuple[str, ...] = ("numbers which are read without GDAL",)
+
+
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
     if not path.is_file():  # a pipe would wait for ever
         return False
-    if path.suffix.lower() in (*_NAMELESS, ".zip"):
+    if path.suffix.lower() in (*_NAMELESS, *PLAIN, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:
         return _magic_driver(file.read(_HEAD_BYTES)) is not None
@@ -94,15 +112,14 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     if not path.is_file():
         raise TerrainError(f"{what} {path} does not exist")
     try:
-        name, driver = _kind_of(path, what)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             # A .vrt names other files: none of them may be somewhere on the network.
             with (
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
-                _georeferenced(name, driver, path, f"{what} {path}") as dataset,
+                contextlib.ExitStack() as files,
             ):
-                yield dataset
+                yield _georeferenced(path, what, files)
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
@@ -110,24 +127,37 @@ def opened(path: Path, what: str) -> Iterator[Any]:
         raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
 
 
-@contextmanager
-def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iterator[Any]:
+def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     """A dataset of a size that fits and of real numbers. Where control points place it, it is warped by them."""
     import rasterio
     from rasterio.vrt import WarpedVRT
 
-    with contextlib.ExitStack() as files:
-        dataset = files.enter_context(rasterio.open(name, driver=driver))
-        _check_size(dataset, what)
-        if "text" in _FORMATS[driver]:
-            if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
-                cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
-                raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-            beside = _system_beside(path, what) if str(name).startswith("/vsisubfile/") else None
-            dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), beside, files)
-        if dataset.transform.is_identity and dataset.gcps[0]:
-            dataset = files.enter_context(WarpedVRT(dataset))
-        yield dataset
+    if path.suffix.lower() in PLAIN:
+        return in_memory(_plain(path, f"{what} {path}"), files)
+    name, driver = _kind_of(path, what)
+    dataset = files.enter_context(rasterio.open(name, driver=driver))
+    what = f"{what} {path}"
+    _check_size(dataset, what)
+    if "text" in _FORMATS[driver]:
+        if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
+            cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
+            raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
+        crs = dataset.crs or (_system_beside(path, what) if str(name).startswith("/vsisubfile/") else None)
+        notes = (f"a grid as text, {driver}",)
+        return in_memory(Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, notes), files)
+    if dataset.transform.is_identity and dataset.gcps[0]:
+        return files.enter_context(WarpedVRT(dataset))
+    return dataset
+
+
+def _plain(path: Path, what: str) -> Numbers:
+    if path.suffix.lower() == ".npz":
+        from shared_map.importers.array_grids import read_npz
+
+        return read_npz(path, what)
+    from shared_map.importers.xyz_grids import read_text_grid
+
+    return read_text_grid(path, what)
 
 
 def _system_beside(path: Path, what: str) -> Any:
@@ -143,26 +173,23 @@ def _system_beside(path: Path, what: str) -> Any:
         raise TerrainError(f"{what}: {found} holds no coordinate system") from error
 
 
-def _in_memory(
-    dataset: Any, numbers: NDArray[Any], nodata: float | None, beside: Any, files: contextlib.ExitStack
-) -> Any:
-    """The same raster with other numbers."""
+def in_memory(given: Numbers, files: contextlib.ExitStack) -> Any:
+    """A dataset of numbers, of which NaN is no-data."""
     from rasterio import MemoryFile
 
     memory = files.enter_context(MemoryFile())
-    profile = {"count": 1, "height": dataset.height, "width": dataset.width, "dtype": numbers.dtype}
-    place = {"crs": dataset.crs or beside, "transform": dataset.transform, "nodata": nodata}
-    with memory.open(driver="GTiff", BIGTIFF="YES", **profile, **place) as copy:
-        copy.write(numbers, 1)
-        copy.update_tags(**{AS_TEXT: dataset.driver})
+    rows, cols = given.numbers.shape
+    profile = {"count": 1, "height": rows, "width": cols, "dtype": "float32", "nodata": math.nan}
+    with memory.open(driver="GTiff", BIGTIFF="YES", crs=given.crs, transform=given.transform, **profile) as copy:
+        copy.write(given.numbers, 1)
+        copy.update_tags(**{NOTES: "\n".join(given.notes)})
     return files.enter_context(memory.open())
 
 
-def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], float | None]:
-    """The numbers of a grid as text, int32 if all are whole, else float32, and which of them states a void.
+def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
+    """The numbers of a grid as text, NaN for none.
 
-    GDAL reads its header only: its drivers read text that is no number, and numbers that are missing, as 0, and its
-    first 100 kB decide whether all of it is whole.
+    GDAL reads its header only: its drivers read text that is no number, and numbers that are missing, as 0.
     """
     numbers = np.empty(dataset.height * dataset.width, np.float32)
     expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
@@ -190,14 +217,11 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
             lines += piece.count(b"\n")
     if count < numbers.size:
         raise TerrainError(f"{what} has {count} numbers; {expected}")
-    whole = bool((np.abs(numbers) < 2**24).all() and (numbers == np.rint(numbers)).all())
-    nodata = math.nan if void is not None and not _is_number(void) else dataset.nodata
+    if dataset.nodata is not None:
+        with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
+            numbers[numbers == np.float32(dataset.nodata)] = np.nan
     grid = numbers.reshape(dataset.height, dataset.width)
-    grid = grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
-    stated = None if nodata is None or (whole and not abs(nodata) < 2**24) else nodata
-    with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
-        stored = None if stated is None else float(np.float32(stated))
-    return (grid.astype(np.int32) if whole else grid), stored
+    return grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
 
 
 def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:

@@ -10,23 +10,22 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from shared_map.array_files import Bools, Floats
-from shared_map.importers.array_grids import PlainGrid
+from shared_map.array_files import Floats
 from shared_map.importers.cover import cover_meaning
 from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
 from shared_map.importers.cover.land_cover import read_cover
 from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
-from shared_map.importers.georeference import check_metres, crs_of, overruled, plan_grid
+from shared_map.importers.georeference import METRES, check_metres, crs_of, overruled, plan_grid
 from shared_map.importers.level_ground import MOST_SAMPLED, looked_at, without
-from shared_map.importers.onto_grid import Placed, nearest
-from shared_map.importers.raster_files import AS_TEXT, READ_ROWS, middle_of, opened, thinned
+from shared_map.importers.onto_grid import Placed
+from shared_map.importers.raster_files import NOTES, READ_ROWS, Numbers, in_memory, middle_of, opened, thinned
 from shared_map.importers.sources import Source
 from shared_map.terrain.row_bands import Progress, bands
 from swarm.config.ground import TerrainConfig
@@ -35,8 +34,6 @@ from swarm.grid import MAX_CELLS
 
 UNITS_M = tomllib.loads((Path(__file__).parent / "units.toml").read_text(encoding="utf-8"))
 """Names of units in files, as `_scale_of` leaves them -> metres."""
-_METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
-"""Coordinate system of an image without a place."""
 _HALF_WORLD_M = math.pi * 6_378_137.0
 """Half of the side of the web's map, EPSG:3857."""
 _DEEPEST_ZOOM = 24
@@ -54,46 +51,19 @@ def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source
 
     Raises TerrainError if it cannot be read, may be one or the other, or does not fit a grid (see `plan_grid`).
     """
-    with opened(path, "terrain") as dataset:
-        holds = contents_of(dataset, f"terrain {path}", config)
+    what = f"terrain {path}"
+    with opened(path, "terrain") as dataset, ExitStack() as files:
+        holds = contents_of(dataset, what, config)
         place = _place_of(dataset, path, config, holds)
         if holds.is_cover:
             return _level_cover(dataset, place, path, config, progress)
-        if holds.encoding is None:
-            return _heights(dataset, None, place, path, config, progress)
-        heights, told = heights_decoded(dataset, holds.encoding, path)
-        known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
-        place = _Place(place.crs, place.transform, (known, *place.notes, *told))
-        return _heights(dataset, heights, place, path, config, progress)
-
-
-def read_array(plain: PlainGrid, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """Heights of a text or an archive, placed as those of a raster.
-
-    Raises TerrainError as `read_raster` does, and if nothing says how large a cell is.
-    """
-    import rasterio
-    from rasterio.transform import from_origin
-
-    assert plain.heights is not None
-    rows, cols = plain.heights.shape
-    step = plain.step if any(plain.step) else (config.resolution_m or 0.0,) * 2
-    if not any(step):
-        raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
-    place = from_origin(plain.west, plain.north, *step)
-    own = rasterio.CRS.from_user_input("EPSG:4326" if plain.degrees else _METRES)
-    notes = list(plain.notes)
-    if path.suffix.lower() != ".npz" and not plain.degrees and config.crs is None:
-        check_metres(step[0], plain.west, f"terrain {path}")
-        if any(plain.step):
-            notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
-    crs = crs_of(own, config.crs, f"terrain {path}")
-    frame = SimpleNamespace(height=rows, width=cols, count=1, dtypes=["float32"], crs=crs, transform=place)
-    frame.scales, frame.offsets, frame.units, frame.nodata = [1.0], [0.0], [""], None
-    source = _heights(frame, plain.heights, _Place(crs, place, tuple(notes)), path, config, progress)
-    if plain.photo is None:
-        return source
-    return replace(source, photo=plain.photo[nearest(plain.photo, source.grid)])
+        notes = [str(path), *place.notes]
+        if holds.encoding is not None:
+            notes.insert(1, f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}")
+            heights, told = heights_decoded(dataset, holds.encoding, path)
+            dataset = in_memory(Numbers(heights, place.transform, place.crs), files)
+            notes += told
+        return _heights(dataset, place, notes, config, progress, files)
 
 
 def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -160,8 +130,6 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
     from rasterio.enums import ColorInterp
 
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
-    if np.dtype(dataset.dtypes[0]).kind not in "iu":
-        return Contents()
     # A first look at the middle of a file: most height models are ruled out by it.
     window = middle_of(dataset, _LOOK_CELLS)
     values = dataset.read(1, window=window)[dataset.read_masks(1, window=window) > 0]
@@ -213,19 +181,23 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
     """Returns the georeference of a raster.
 
     An image without a place lies where its path says if that is the path of a tile of a web map, zoom/x/y.png. Else
-    it lies anywhere, in metres.
+    it lies anywhere, in metres, as numbers of our own reading do that have no system.
     """
     import rasterio
     from rasterio.transform import from_origin
 
+    what = f"terrain {path}"
     coded = holds.is_cover or holds.encoding is not None
-    if AS_TEXT in dataset.tags() and not dataset.crs and config.crs is None:
-        check_metres(dataset.transform.a, dataset.transform.c, f"terrain {path}")
-        return _Place(rasterio.CRS.from_wkt(_METRES), dataset.transform)
+    own = dataset.tags().get(NOTES)
+    notes = () if own is None else tuple(own.split("\n"))
     has_place = bool(dataset.crs) or not dataset.transform.is_identity
-    if has_place or not (coded or path.suffix.lower() == ".png"):
-        crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
-        return _Place(crs, dataset.transform, overruled(dataset.crs, config.crs))
+    if has_place and own is not None and not dataset.crs and config.crs is None:
+        check_metres(dataset.transform.a, dataset.transform.c, what)
+        notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
+        return _Place(rasterio.CRS.from_wkt(METRES), dataset.transform, notes)
+    if has_place or not (coded or own is not None or path.suffix.lower() == ".png"):
+        crs = crs_of(dataset.crs, config.crs, what)
+        return _Place(crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs)))
     tile = re.search(r"(?:^|/)(\d{1,2})/(\d{1,8})/(\d{1,8})(?:@2x)?\.\w+$", path.as_posix())
     if coded and tile is not None and dataset.height == dataset.width and config.crs is None:
         zoom, col, row = (int(number) for number in tile.groups())
@@ -235,60 +207,53 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
             step_m = side_m / dataset.width
             said = f"placed by its path: tile x {col}, y {row} (from the north) of zoom {zoom} of the web's map"
             return _Place(rasterio.CRS.from_epsg(3857), from_origin(west, north, step_m, step_m), (said,))
-    if config.resolution_m is None or not (coded or config.height_scale):
-        scale = "" if coded else " and terrain.height_scale (metres per grey level)"
-        raise TerrainError(
-            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel){scale}"
-        )
+    is_grey = not coded and own is None
+    if config.resolution_m is None or (is_grey and not config.height_scale):
+        scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""
+        raise TerrainError(f"{what} does not say how large a cell is; set terrain.resolution_m (metres){scale}")
     anywhere = from_origin(0.0, 0.0, config.resolution_m, config.resolution_m)
-    return _Place(rasterio.CRS.from_wkt(_METRES), anywhere)
+    return _Place(rasterio.CRS.from_wkt(METRES), anywhere, notes)
 
 
 # --- heights ------------------------------------------------------------------------------------------------
 
 
 def _heights(
-    dataset: Any, whole: Floats | None, place: _Place, path: Path, config: TerrainConfig, progress: Progress
+    dataset: Any, place: _Place, notes: list[str], config: TerrainConfig, progress: Progress, files: ExitStack
 ) -> Source:
-    """Heights on a square metric grid, a band of rows at a time. Bilinear; averaged where cells grow by half or
-    more.
-
-    whole  all heights as they are stored, NaN where there is none; None: they are read from the first band
-    """
-    if whole is None and dataset.count >= 3:
-        raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
+    """Heights of the first band on a square metric grid, some rows at a time. Bilinear; averaged where cells grow
+    by half or more."""
+    what = f"terrain {config.source}"
+    if dataset.count >= 3:
+        raise TerrainError(f"{what} has {dataset.count} bands: a photo? Name it in terrain.photo")
     if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-        raise TerrainError(f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
+        raise TerrainError(f"{what} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
     size = dataset.height, dataset.width
-    grid, target, notes = plan_grid(place.transform, *size, place.crs, config.resolution_m, f"terrain {path}")
+    grid, target, planned = plan_grid(place.transform, *size, place.crs, config.resolution_m, what)
     factor, offset, told = _scale_of(dataset, place.crs, config)
     if dataset.count == 2:
         told.append("the file has two bands; heights are taken from the first")
-    voids, found, looks = looked_at(_sampled(dataset) if whole is None else whole, config, factor, offset)
+    voids, found, looks = looked_at(_sampled(dataset), config, factor, offset)
+    if voids and target is not None:  # GDAL warps one value of no height only; of a second one it would make slopes
+        dataset = in_memory(Numbers(_whole(dataset, voids, what), place.transform, place.crs), files)
     placed = Placed(dataset, grid, place.transform, place.crs, target)
-    if target is None:
-        level: Bools = found[nearest(found, grid)]
-    else:
-        level = placed.warp(found.astype(np.uint8), np.zeros(grid.shape, np.uint8), "nearest") > 0
-    if voids and target is not None:
-        whole = without(_whole(dataset, voids, path) if whole is None else whole, voids)
-    void = math.nan
-    if whole is None and (dataset.nodata is not None or np.dtype(dataset.dtypes[0]).kind != "f"):
-        void = dataset.nodata
+    level = placed.warp(found.astype(np.uint8), np.zeros(grid.shape, np.uint8), "nearest") > 0
+    is_real = np.dtype(dataset.dtypes[0]).kind == "f"
+    void = math.nan if dataset.nodata is None and is_real else dataset.nodata
     how = "average" if placed.grows else "bilinear"
     elevation_m = np.empty(grid.shape, np.float32)
     for row0, row1 in bands(grid.rows, READ_ROWS):
         band = elevation_m[row0:row1]
         if target is not None:
-            placed.warp(1 if whole is None else whole, band, how, row0, src_nodata=void, dst_nodata=math.nan)
+            placed.warp(1, band, how, row0, src_nodata=void, dst_nodata=math.nan)
         else:
-            band[:] = without(_rows_of(dataset, row0, row1) if whole is None else whole[row0:row1], voids)
+            band[:] = without(_rows_of(dataset, row0, row1), voids)
         if (factor, offset) != (1.0, 0.0):
             band *= np.float32(factor)
             band += np.float32(offset)
         progress("reading heights", row1 / grid.rows)
     classes = np.zeros(elevation_m.shape, np.uint8)
-    return Source(grid, elevation_m, classes, level=level, notes=(str(path), *place.notes, *notes, *told, *looks))
+    return Source(grid, elevation_m, classes, level=level, notes=(*notes, *planned, *told, *looks))
 
 
 def _rows_of(dataset: Any, row0: int, row1: int) -> Floats:
@@ -341,11 +306,11 @@ def _sampled(dataset: Any) -> Floats:
     return sample
 
 
-def _whole(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
-    """The whole first band. GDAL warps one value of no height only; of a second one it would make slopes."""
+def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
+    """The whole first band, as stored; NaN where there is no height."""
     if dataset.height * dataset.width > MAX_CELLS:
         raise TerrainError(
-            f"terrain {path} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too"
-            " large to correct here: gdal_calc or gdal_edit.py -a_nodata does it"
+            f"{what} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too large to"
+            " correct here: gdal_calc or gdal_edit.py -a_nodata does it"
         )
-    return _rows_of(dataset, 0, dataset.height)
+    return without(_rows_of(dataset, 0, dataset.height), voids)

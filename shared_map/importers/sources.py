@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import DRIVERS_BY_ENDING, is_raster
+from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -114,14 +113,12 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.importers.array_grids import read_npz
-    from shared_map.importers.rasters import read_array
+    from shared_map.importers.rasters import read_raster
     from shared_map.terrain.synthetic.landscape import cover
 
-    path = _jacksboro_path()
     resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
     config = msgspec.structs.replace(config, resolution_m=resolution_m, crs=None)
-    source = read_array(read_npz(path), path, config, no_progress)
+    source = read_raster(_jacksboro_path(), config, no_progress)
     classes = cover(source.elevation_m, source.grid.resolution_m, seed)
     if config.level_is == "water":
         classes[source.level] = TerrainClass.WATER
@@ -151,60 +148,44 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     if not path.is_file():
         raise TerrainError(f"terrain {path} is a pipe or a device; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()
-    if suffix not in _READERS and not is_raster(path):
+    if suffix not in _ENDINGS and not is_raster(path):
         found = suffix or "a file without ending"
         others = "`gdal_translate FILE out.tif` converts most others"
         raise TerrainError(f"terrain {path}: {found} is unknown; give {FILE_KINDS}; {others}")
-    return _READERS.get(suffix, _raster)(path, config, progress)
-
-
-def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    if suffix in _LEVEL:
+        return _map(path, config)
     from shared_map.importers.rasters import read_raster
 
     return read_raster(path, config, progress)
 
 
-def _array(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.array_grids import read_npz
-    from shared_map.importers.rasters import read_array
-    from shared_map.importers.xyz_grids import read_text_grid
-
-    plain = read_npz(path) if path.suffix.lower() == ".npz" else read_text_grid(path)
-    return read_array(plain, path, config, progress)
-
-
-def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from shared_map.importers.array_grids import read_map, read_ros
 
-    plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
-    assert plain.factor is not None
-    resolution_m = plain.step[0] or config.resolution_m or 1.0
+    found = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
+    resolution_m = found.step_m or config.resolution_m or 1.0
     if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
         raise TerrainError(
             f"terrain {path} has cells of {resolution_m:g} m and cannot be resampled without closing gaps;"
             " leave terrain.resolution_m out"
         )
-    factor = plain.factor.copy()
+    factor = found.factor
     factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
-    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, plain.west, plain.north)
+    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, found.west, found.north)
     level = np.zeros(factor.shape, np.float32)
-    notes = (str(path), *plain.notes)
-    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=notes)
+    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=(str(path), found.note))
 
 
-_READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
-    **dict.fromkeys((*DRIVERS_BY_ENDING, ".zip"), _raster),
-    **dict.fromkeys((".npz", ".csv", ".xyz"), _array),
-    **dict.fromkeys((".map", ".yaml", ".yml"), _map),
-}
-"""Ending -> reader. A new kind of file is a row here; a raster of any other name is known by how it begins."""
-FILE_KINDS = ", ".join(_READERS)
+_LEVEL = (".map", ".yaml", ".yml")
+_ENDINGS = (*DRIVERS_BY_ENDING, ".zip", *PLAIN, *_LEVEL)
+"""Endings of terrains; a raster of any other name is known by how it begins."""
+FILE_KINDS = ", ".join(_ENDINGS)
 
 
 def is_terrain(path: Path) -> bool:
     """Returns True if a file is named as one that holds a terrain, or begins as a raster."""
-    return path.suffix.lower() in _READERS or is_raster(path)
+    return path.suffix.lower() in _ENDINGS or is_raster(path)
 
 
 # --- what covers the ground ---------------------------------------------------------------------------------

@@ -148,7 +148,7 @@ def test_the_setting_wins_and_what_it_cannot_mean_is_refused(tmp_path: Path) -> 
     with pytest.raises(TerrainError, match="has 1 bands of float32; Terrarium is three bands of uint8"):
         load(grey, elevation_encoding="terrarium")
     png = tile(tmp_path / "a.png", image, "PNG")
-    with pytest.raises(TerrainError, match=r"an image has no scale; set terrain\.resolution_m"):
+    with pytest.raises(TerrainError, match=r"does not say how large a cell is; set terrain\.resolution_m"):
         load(png)
     black = tile(tmp_path / "black.tif", np.zeros((3, 40, 40), np.uint8), **PLACE)
     with pytest.raises(TerrainError, match="no heights at all"):
