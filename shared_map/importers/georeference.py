@@ -63,18 +63,42 @@ def system_named(text: str, what: str) -> Any:
         raise TerrainError(f"{what} {text!r} is no coordinate system; write EPSG:32632 or alike") from error
 
 
-def crs_of(found: Any, given: str | None, what: str) -> Any:
-    """The coordinate system that the scenario names for a file (`given`), else the file's own (`found`).
+def crs_of(found: Any, given: str | None, what: str, key: str = "terrain.crs") -> Any:
+    """The coordinate system that the scenario names for a file (`given`, the value of `key`), else the file's own.
 
     Raises TerrainError if `given` is not one, or if there is neither; `what` names the file.
     """
     if given is not None:
-        return system_named(given, "terrain.crs")
+        return system_named(given, f"{what}: {key}")
     if not found:
         raise TerrainError(
-            f"{what} does not say in which coordinate system it is; set terrain.crs, for example 'EPSG:32632'"
+            f"{what} does not say in which coordinate system it is; set {key}, for example 'EPSG:32632', or 'local'"
+            " for metres of the terrain's own map"
         )
     return found
+
+
+def systems_of(grid: GridSpec, own: Any, given: str | None, what: str, key: str) -> tuple[Any, Any]:
+    """(the terrain's system, a file's); (None, None) if the file is in the terrain's own metres.
+
+    own    the file's system as it says; None if it does not
+    given  what the scenario says that it is, the value of `key`
+    """
+    import rasterio
+
+    if given == "local":
+        return None, None
+    found = crs_of(own, given, what, key)
+    if grid.crs == "local":
+        if is_local(found):
+            return None, None
+        raise TerrainError(
+            f"{what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local' if"
+            " its coordinates are metres of the terrain's own map"
+        )
+    if not found.is_geographic and not found.is_projected:
+        raise TerrainError(f"{what} is in {crs_name(found)}, which has no place on the Earth; set {key}")
+    return rasterio.CRS.from_user_input(grid.crs), found
 
 
 def overruled(found: Any, given: str | None) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,8 @@ _HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGN
 _SURFER_LINES = 5
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
-_HEAD_BYTES = 16
+_HEAD_BYTES = 4096
+"""Room for the comments before the root of an XML."""
 NOTES = "NOTES"
 """Tag of numbers which we have read ourselves: what people should know of them, a line each."""
 PLAIN = (".npz", ".csv", ".xyz")
@@ -134,9 +135,9 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
 
     if path.suffix.lower() in PLAIN:
         return in_memory(_plain(path, f"{what} {path}"), files)
+    what = f"{what} {path}"
     name, driver = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
-    what = f"{what} {path}"
     _check_size(dataset, what)
     if "text" in _FORMATS[driver]:
         if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
@@ -290,29 +291,60 @@ def _check_size(dataset: Any, what: str) -> None:
 def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
     """Returns GDAL's name for a file, or for the one raster in it, and the driver that reads it.
 
-    Raises TerrainError on a file that is not a raster; `what` names the file. Raises OSError as `open` does.
+    Raises TerrainError on a file that is not a raster; `what` names it. Raises OSError as `open` does.
     """
-    if path.suffix.lower() == ".zip":
-        return _in_archive(path, what)
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    driver = _driver(head, path.suffix.lower(), f"{what} {path}")
+    head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
+    if member is not None:
+        driver = _driver(head, Path(member).suffix.lower(), f"{what}: {member}")
+        if driver == "VRT":
+            raise TerrainError(f"{what}: {member} names other files; unpack it")
+        return f"/vsizip/{{{path}}}/{member}", driver
+    driver = _driver(head, path.suffix.lower(), what)
     length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
         raise TerrainError(
-            f"{what} {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
+            f"{what} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
             f" {_HGT_BYTES[0]}, one of 3601 has {_HGT_BYTES[1]}"
         )
     if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
-        raise TerrainError(f"{what} {path}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
+        raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
-        _check_virtual(path, f"{what} {path}", {})
+        _check_virtual(path, what, {})
     if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
         return f"/vsisubfile/3,{path}", driver
     header = path.with_suffix(".hdr")
     if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
     return path, driver
+
+
+def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> tuple[bytes, str | None, int]:
+    """The first bytes of a file; of a .zip those of the one file in it with such an ending, its name, and the size
+    of all parts of that file.
+
+    Raises TerrainError if there are several such files, or they are larger than the kind allows.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    if not head.startswith(b"PK"):
+        return head, None, 0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            files = [each for each in archive.infolist() if not each.is_dir()]
+            named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
+            if len(named) != 1:
+                raise TerrainError(
+                    f"{what} holds {len(named)} files of the kinds {', '.join(endings)}, expected one: unpack it"
+                )
+            parts = [each for each in files if Path(each.filename).stem == Path(named[0]).stem]
+            unpacked = sum(each.file_size for each in parts)
+            if unpacked > kind.most_bytes:
+                most = f"at most {size(kind.most_bytes)} are read"
+                raise TerrainError(f"{what}: {named[0]} has {size(unpacked)}, {most}: unpack it, and crop it")
+            with archive.open(named[0]) as member:
+                return member.read(_HEAD_BYTES), named[0], unpacked
+    except BAD_ARCHIVE as error:
+        raise TerrainError(f"{what} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
 
 
 def _magic_driver(head: bytes) -> str | None:
@@ -353,9 +385,9 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
             raise TerrainError(f"{what} names {name[:LONGEST_REASON]!r}; expected a file that lies on this machine")
         source = path.parent / name
         with source.open("rb") as file:
-            head = file.read(4096)
+            head = file.read(_HEAD_BYTES)
         # GDAL knows other kinds, also of the network.
-        _driver(head[:_HEAD_BYTES], source.suffix.lower(), f"{what}: {source}")
+        _driver(head, source.suffix.lower(), f"{what}: {source}")
         virtual = b"<VRTDataset" in head  # anywhere, for GDAL
         if virtual:
             if depth >= _DEEPEST:
@@ -388,30 +420,6 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     except ValueError:
         return 1.0  # GDAL states the fault
     return max(painted / cells, 1.0)
-
-
-def _in_archive(path: Path, what: str) -> tuple[str, str]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            files = [each for each in archive.infolist() if not each.is_dir()]
-            named = [each for each in files if Path(each.filename).suffix.lower() in _ZIPPED]
-            if len(named) != 1:
-                raise TerrainError(
-                    f"{what} {path} holds {len(named)} rasters ({', '.join(_ZIPPED)}), expected one: unpack it"
-                )
-            (member,) = named
-            if member.file_size > FileKind.IMAGE.most_bytes:
-                raise TerrainError(
-                    f"{what} {path}: {member.filename} has {size(member.file_size)}; unpack it, and crop it"
-                )
-            with archive.open(member) as file:
-                head = file.read(_HEAD_BYTES)
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"{what} {path} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
-    driver = _driver(head, Path(member.filename).suffix.lower(), f"{what} {path}: {member.filename}")
-    if driver == "VRT":
-        raise TerrainError(f"{what} {path}: {member.filename} names other files; unpack it")
-    return f"/vsizip/{{{path}}}/{member.filename}", driver
 
 
 # --- read ---------------------------------------------------------------------------------------------------

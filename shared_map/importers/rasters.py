@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rasterio.transform import Affine
 
 from shared_map.array_files import Floats
 from shared_map.importers.cover import cover_meaning
@@ -236,32 +237,22 @@ def _heights(
     voids, found, looks = looked_at(_sampled(dataset), config, factor, offset)
     if voids and target is not None:  # GDAL warps one value of no height only; of a second one it would make slopes
         dataset = in_memory(Numbers(_whole(dataset, voids, what), place.transform, place.crs), files)
-    placed = Placed(dataset, grid, place.transform, place.crs, target)
-    level = placed.warp(found.astype(np.uint8), np.zeros(grid.shape, np.uint8), "nearest") > 0
-    is_real = np.dtype(dataset.dtypes[0]).kind == "f"
-    void = math.nan if dataset.nodata is None and is_real else dataset.nodata
-    how = "average" if placed.grows else "bilinear"
+    placed = Placed(dataset, grid, place.transform, place.crs, target or place.crs, is_cells=target is None)
+    stretch = Affine.scale(dataset.width / found.shape[1], dataset.height / found.shape[0])
+    flat = in_memory(Numbers(found.astype(np.float32), place.transform @ stretch, place.crs), files)
+    with Placed(flat, grid, flat.transform, place.crs, placed.target).on_grid("nearest") as cells:
+        level = cells.read(1) > 0
     elevation_m = np.empty(grid.shape, np.float32)
-    for row0, row1 in bands(grid.rows, READ_ROWS):
-        band = elevation_m[row0:row1]
-        if target is not None:
-            placed.warp(1, band, how, row0, src_nodata=void, dst_nodata=math.nan)
-        else:
-            band[:] = without(_rows_of(dataset, row0, row1), voids)
-        if (factor, offset) != (1.0, 0.0):
-            band *= np.float32(factor)
-            band += np.float32(offset)
-        progress("reading heights", row1 / grid.rows)
+    with placed.on_grid("average" if placed.grows else "bilinear") as cells:
+        for row0, row1 in bands(grid.rows, READ_ROWS):
+            band = elevation_m[row0:row1]
+            band[:] = without(cells.read(1, window=((row0, row1), (0, grid.cols))), voids)
+            if (factor, offset) != (1.0, 0.0):
+                band *= np.float32(factor)
+                band += np.float32(offset)
+            progress("reading heights", row1 / grid.rows)
     classes = np.zeros(elevation_m.shape, np.uint8)
     return Source(grid, elevation_m, classes, level=level, notes=(*notes, *planned, *told, *looks))
-
-
-def _rows_of(dataset: Any, row0: int, row1: int) -> Floats:
-    """Rows of the first band, float32, as stored; NaN where no height is declared."""
-    window = ((row0, row1), (0, dataset.width))
-    rows: Floats = dataset.read(1, window=window).astype(np.float32)
-    rows[dataset.read_masks(1, window=window) == 0] = np.nan
-    return rows
 
 
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:
@@ -313,4 +304,6 @@ def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
             f"{what} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too large to"
             " correct here: gdal_calc or gdal_edit.py -a_nodata does it"
         )
-    return without(_rows_of(dataset, 0, dataset.height), voids)
+    heights: Floats = dataset.read(1).astype(np.float32)
+    heights[dataset.read_masks(1) == 0] = np.nan
+    return without(heights, voids)

@@ -6,6 +6,7 @@ Codes are never interpolated: a cell takes the nearest code, or the most frequen
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.cover_codes import HIGHEST_CODE, NOTHING, CoverTable, joined, some
 from shared_map.importers.cover.cover_meaning import Meaning, meaning_of, why_unknown
 from shared_map.importers.onto_grid import place_on
-from shared_map.importers.raster_files import READ_ROWS, opened
+from shared_map.importers.raster_files import READ_ROWS, Numbers, in_memory, opened
 from shared_map.importers.sources import Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, bands, no_progress
@@ -28,8 +29,6 @@ from swarm.grid import MAX_CELLS, GridSpec
 _TOLD_CODES = 6
 """Codes that the note names, the most frequent first: a sentence of some 300 characters. Codes listed in a note,
 which states how many more there are."""
-_NO_CODE = -1
-"""Below every code: cells that the file does not reach."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,37 +91,31 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
         unknown or one of several: then it names the setting that answers.
     """
     what = f"land cover {path}"
-    with opened(path, "land cover") as dataset:
+    with opened(path, "land cover") as dataset, ExitStack() as files:
         meaning = meaning_of(dataset, what, config)
         if meaning is None:
             raise TerrainError(why_unknown(dataset, what))
-        placed = place_on(dataset, grid, config.crs, what)
-        notes, how = [], "mode" if placed.target is not None and placed.grows else "nearest"
-        if placed.target is not None:
+        if meaning.codes is not None:
+            codes = _decoded(dataset, meaning.codes, what)
+            dataset = in_memory(Numbers(codes, dataset.transform, dataset.crs), files)
+        placed = place_on(dataset, grid, None if dataset.crs else config.crs, what)
+        notes, how = [], "mode" if placed.grows else "nearest"
+        if not placed.is_cells:
             taken, size = {"mode": "most frequent"}.get(how, how), f"{dataset.height} x {dataset.width} pixels"
             notes.append(f"land cover: {size}, each cell takes the {taken} code")
         if placed.share < 0.999:
             notes.append(f"the land cover's frame covers {placed.share:.1%} of the terrain")
-
-        def codes_of(row0: int, row1: int) -> NDArray[Any]:
-            if placed.target is None:
-                return _codes(dataset, meaning, row0, row1) if stored is None else stored[row0:row1]
-            codes = np.full((row1 - row0, grid.cols), _NO_CODE, np.int32)
-            nodata = dataset.nodata if stored is None else NOTHING
-            source = 1 if stored is None else stored
-            return placed.warp(source, codes, how, row0, src_nodata=nodata, dst_nodata=_NO_CODE)
-
-        stored = _codes_in_memory(dataset, meaning)
         kinds, factors, states = _look_up(meaning.table)
         classes, factor = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
         known = np.empty(grid.shape, np.bool_)
-        cells = np.zeros(HIGHEST_CODE + 3, np.int64)
-        for row0, row1 in bands(grid.rows, READ_ROWS):
-            at = _entries(codes_of(row0, row1))
-            classes[row0:row1], factor[row0:row1], known[row0:row1] = kinds[at], factors[at], states[at] == 0
-            cells += np.bincount(at.reshape(-1), minlength=len(cells))
-            progress("reading land cover", row1 / grid.rows)
-        return Cover(classes, factor, known, (*notes, *_told(what, meaning, cells, states)))
+        counts = np.zeros(HIGHEST_CODE + 3, np.int64)
+        with placed.on_grid(how) as cells:
+            for row0, row1 in bands(grid.rows, READ_ROWS):
+                at = _entries(cells.read(1, window=((row0, row1), (0, grid.cols))))
+                classes[row0:row1], factor[row0:row1], known[row0:row1] = kinds[at], factors[at], states[at] == 0
+                counts += np.bincount(at.reshape(-1), minlength=len(counts))
+                progress("reading land cover", row1 / grid.rows)
+        return Cover(classes, factor, known, (*notes, *_told(what, meaning, counts, states)))
 
 
 _STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
@@ -151,41 +144,19 @@ def _look_up(table: CoverTable) -> tuple[Bytes, Floats, Bytes]:
     return kinds, factors, states
 
 
-def _codes_in_memory(dataset: Any, meaning: Meaning) -> NDArray[Any] | None:
-    """Returns the codes of the whole file, if GDAL cannot warp it as stored: colours, and cells that a mask
-    hides."""
-    from rasterio.enums import MaskFlags
-
-    hidden = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
-    if meaning.codes is None and not hidden:
-        return None
+def _decoded(dataset: Any, codes: NDArray[np.uint16], what: str) -> Floats:
+    """The code of each pixel of a drawing, NaN where it shows nothing: GDAL would mix its colours."""
     if dataset.height * dataset.width > MAX_CELLS:
-        raise TerrainError(
-            f"land cover {dataset.name} has colours or a mask and is too large to look through: crop it"
-        )
-    codes = np.empty((dataset.height, dataset.width), np.uint16)
+        raise TerrainError(f"{what} has colours and is too large to look through: crop it")
+    found = np.empty((dataset.height, dataset.width), np.float32)
     for row0, row1 in bands(dataset.height, READ_ROWS):
-        found = _codes(dataset, meaning, row0, row1)
-        codes[row0:row1] = np.where((found >= 0) & (found <= NOTHING), found, NOTHING)
-    return codes
-
-
-def _codes(dataset: Any, meaning: Meaning, row0: int, row1: int) -> NDArray[Any]:
-    """Codes of some rows of a file; what it does not show is NOTHING."""
-    from rasterio.windows import Window
-
-    window = Window(0, row0, dataset.width, row1 - row0)
-    if dataset.count >= 3:
-        assert meaning.codes is not None
-        codes = meaning.codes[joined(dataset.read((1, 2, 3), window=window))].astype(np.float64)
-        codes[dataset.dataset_mask(window=window) == 0] = NOTHING
-        return codes
-    codes = np.asarray(dataset.read(1, window=window), np.float64).copy()
-    shown = dataset.read_masks(1, window=window) > 0
-    if meaning.codes is not None:
-        codes = meaning.codes[np.clip(codes, 0, len(meaning.codes) - 1).astype(np.intp)].astype(np.float64)
-    codes[~shown] = NOTHING
-    return codes
+        window = ((row0, row1), (0, dataset.width))
+        stored = (
+            joined(dataset.read((1, 2, 3), window=window)) if dataset.count >= 3 else dataset.read(1, window=window)
+        )
+        found[row0:row1] = codes[np.clip(stored, 0, len(codes) - 1).astype(np.intp)]
+        found[row0:row1][dataset.dataset_mask(window=window) == 0] = np.nan
+    return found
 
 
 def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable[str]:

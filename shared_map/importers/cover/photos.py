@@ -70,7 +70,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     """
     what = f"photo {path}"
     with opened(path, "photo") as dataset:
-        placed = place_on(dataset, grid, given_crs, what)
+        placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
         notes = []
         if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
             notes.append(
@@ -79,60 +79,26 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
         return _read(placed, notes, progress)
 
 
-def _band(placed: Placed, index: int, row0: int, row1: int) -> NDArray[Any]:
-    """Rows of a band on the grid, 0 beyond the photo. Palettes and transparency are not interpolated."""
-    from rasterio.enums import ColorInterp
-
-    dataset = placed.dataset
-    if placed.target is None:
-        return np.asarray(dataset.read(index, window=((row0, row1), (0, dataset.width))))
-    how = "average" if placed.grows else "bilinear"
-    if dataset.colorinterp[index - 1] in (ColorInterp.palette, ColorInterp.alpha):
-        how = "nearest"
-    return placed.warp(index, np.zeros((row1 - row0, placed.grid.cols), dataset.dtypes[index - 1]), how, row0)
-
-
-def _frame(placed: Placed, row0: int, row1: int) -> Bools:
-    """Returns which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
-    inside = np.zeros((row1 - row0, placed.grid.cols), np.uint8)
-    if placed.target is None:
-        return np.ones(inside.shape, np.bool_)
-    ones = np.ones((min(placed.dataset.height, 64), min(placed.dataset.width, 64)), np.uint8)
-    seen: Bools = placed.warp(ones, inside, "nearest", row0) > 0
-    return seen
-
-
 def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
-    from rasterio.enums import ColorInterp
-
     dataset, grid = placed.dataset, placed.grid
     indexes, palette = _colour_bands(dataset)
-    meanings = list(dataset.colorinterp)
-    alpha = meanings.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in meanings else None
     low, high = _stretch(dataset, indexes, notes)
     if len(indexes) == 1 and palette is None:
         notes.append("the photo is grey: without colour, what covers the ground is a guess")
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
-    for row0, row1 in bands(grid.rows, READ_ROWS):
-        raw = [_band(placed, index, row0, row1) for index in indexes]
-        inside = _frame(placed, row0, row1)
-        if raw[0].dtype.kind == "f":
-            inside &= ~np.any([np.isnan(values) for values in raw], axis=0)
-        if dataset.nodata is not None:
-            inside &= ~np.all([values == dataset.nodata for values in raw], axis=0)
-        if alpha is not None:
-            inside &= _band(placed, alpha, row0, row1) > 0
-        seen[row0:row1] = inside
-        for channel in range(3):
-            values = raw[channel % len(raw)]
-            if palette is not None:
-                values = palette[np.minimum(values.astype(np.intp), 255), channel]
-            elif high > low:
-                scaled = (values.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
-                values = np.clip(np.nan_to_num(scaled), 0, 255)
-            rgb[row0:row1, :, channel] = np.where(inside, values, 0)
-        progress("reading photo", row1 / grid.rows)
+    how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
+    with placed.on_grid(how) as cells:
+        for row0, row1 in bands(grid.rows, READ_ROWS):
+            raw = cells.read(indexes, window=((row0, row1), (0, grid.cols)))
+            inside = ~np.isnan(raw).any(axis=0)
+            raw[:, ~inside] = 0
+            if high > low:
+                raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
+            colours = raw.astype(np.uint8)
+            shown = np.moveaxis(colours, 0, -1) if palette is None else palette[colours[0]]
+            seen[row0:row1], rgb[row0:row1] = inside, np.where(inside[..., None], shown, 0)
+            progress("reading photo", row1 / grid.rows)
     if not seen.any():
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.importers.raster_files import BAD_ARCHIVE, LONGEST_REASON
+from shared_map.importers.raster_files import LONGEST_REASON, beginning
 from shared_map.importers.zones.shape_texts import Kind, checked_json, checked_xml, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
@@ -84,8 +84,8 @@ class Features:
 
 def is_vector(path: Path) -> bool:
     """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
-    with contextlib.suppress(OSError, TerrainError, *BAD_ARCHIVE):
-        return _found(path, "") is not None
+    with contextlib.suppress(OSError, TerrainError):
+        return kind_of(beginning(path, _IN_ARCHIVES, FileKind.VECTORS, "")[0], "") is not None
     return False
 
 
@@ -124,7 +124,7 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             if kind.driver == "ESRI Shapefile" and index_file.is_file():
                 count = max(count, (index_file.stat().st_size - 100) // 8)  # GDAL believes its header
             columns = tuple(str(field) for field in info["fields"])
-            shown = name if isinstance(source, str) else "fence"
+            shown = name if isinstance(source, str) else path.stem
             found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns, count))
         return found
 
@@ -209,77 +209,49 @@ def _refused(what: str) -> Iterator[None]:
 
 
 def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
-    """Returns GDAL's name for a file, whose text is checked. Raises TerrainError on a file of another kind."""
+    """Returns GDAL's name for a file, whose text is checked, or its content as GeoJSON. Raises TerrainError on a
+    file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
-        found = _found(path, what)
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"{what} is damaged or no .zip: {error}") from error
+        head, member, unpacked = beginning(path, _IN_ARCHIVES, FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
-    if found is None:
+    kind = kind_of(head, what)
+    if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
         raise TerrainError(
             f"{what} is neither GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor"
             " .waypoints, nor a .zip of one; `ogr2ogr -f GPKG out.gpkg FILE` converts most others"
         )
-    kind, member = found
     absolute = path.resolve()
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if kind.text is None:
         return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
-    if member is None:
-        data = read_bytes(path, FileKind.VECTOR_TEXT)
-    else:
-        with zipfile.ZipFile(path) as archive:
-            data = archive.read(member)
+    if unpacked > FileKind.VECTOR_TEXT.most_bytes:
+        raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(unpacked)}")
+    data = _read(path, member)
     if kind.text == "xml":
         checked_xml(data, what)
         return source, kind
     return checked_json(data, kind, what) or f"GeoJSON:{source}", kind
 
 
-def _found(path: Path, what: str) -> tuple[Kind, str | None] | None:
-    """The kind of a file, and the member of a .zip which holds it."""
-    with path.open("rb") as file:
-        head = file.read(4096)
-    if not head.startswith(b"PK"):
-        kind = kind_of(head, what)
-        if kind is not None and kind.text is not None:
-            check_bytes(path, FileKind.VECTOR_TEXT)
-        return None if kind is None else (kind, None)
+def _read(path: Path, member: str | None) -> bytes:
+    if member is None:
+        return read_bytes(path, FileKind.VECTOR_TEXT)
     with zipfile.ZipFile(path) as archive:
-        members = [each for each in archive.infolist() if not each.is_dir()]
-        named = [each for each in members if Path(each.filename).suffix.lower() in _IN_ARCHIVES]
-        if len(named) != 1:
-            if not what:
-                return None
-            raise TerrainError(
-                f"{what} holds {len(named)} files of shapes ({', '.join(_IN_ARCHIVES)}), expected one: unpack it"
-            )
-        name = named[0].filename
-        with archive.open(name) as member:
-            kind = kind_of(member.read(4096), what)
-        if kind is None:
-            return None
-        stem = str(Path(name).with_suffix(""))
-        unpacked = sum(each.file_size for each in members if str(Path(each.filename).with_suffix("")) == stem)
-        most = (FileKind.VECTORS if kind.text is None else FileKind.VECTOR_TEXT).most_bytes
-        if unpacked > most:
-            raise TerrainError(f"{what}: {name} has {size(unpacked)}, at most {size(most)} are read")
-    return kind, name
+        return archive.read(member)
 
 
 def _check_table(path: Path, source: str | bytes, layer: str, what: str) -> None:
     """A layer of a GeoPackage must be a table: a view is a program, which may not end."""
-    zipped = str(source).startswith("/vsizip/")
+    _, zipped, member = str(source).partition("}/")
     where = ":memory:" if zipped else path.resolve().as_uri() + "?mode=ro"
     try:
         with contextlib.closing(sqlite3.connect(where, uri=True)) as database:
             if zipped:
-                with zipfile.ZipFile(path) as archive:
-                    database.deserialize(archive.read(str(source).partition("}/")[2]))
+                database.deserialize(_read(path, member))
             found = database.execute("SELECT type FROM sqlite_master WHERE name = ?", (layer,)).fetchone()
     except sqlite3.Error as error:
         raise TerrainError(f"{what} is damaged: {error}") from error

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
+from shared_map.importers.georeference import bounds_in, crs_name, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -65,7 +65,10 @@ class Placing:
 
     def __init__(self, grid: GridSpec, layer: Layer, crs: str | None, margin_m: float) -> None:
         self.grid, self.layer = grid, layer
-        self._target, self._crs = systems_of(grid, layer.crs, crs, layer.what)
+        own = None
+        with suppress(TerrainError):
+            own = system_named(layer.crs, layer.what)
+        self._target, self._crs = systems_of(grid, own, crs, layer.what, "crs")
         self._margin_cells = margin_m / grid.resolution_m + 2.0
         with self._reprojecting():
             self._box = self._extent()
@@ -213,39 +216,6 @@ class Placing:
             xs, ys = np.asarray(moved[0]), np.asarray(moved[1])
         grid = self.grid
         return np.stack([(xs - grid.west_m) / grid.resolution_m, (grid.north_m - ys) / grid.resolution_m], axis=1)
-
-
-def systems_of(grid: GridSpec, own: str, given: str | None, what: str) -> tuple[Any, Any]:
-    """(the terrain's system, a file's); (None, None) if the file is in the terrain's own metres.
-
-    own    the file's system as it says; empty if it does not
-    given  what the scenario says that it is
-    """
-    import rasterio
-
-    if given == "local":
-        return None, None
-    found = None
-    if given is not None:
-        found = system_named(given, f"{what}: crs")
-    elif own:
-        with suppress(TerrainError):
-            found = system_named(own, what)
-    if found is None:
-        raise TerrainError(
-            f"{what} does not say in which coordinate system it is; set crs, for example 'EPSG:4326', or 'local'"
-            " for metres of the terrain's own map"
-        )
-    if grid.crs == "local":
-        if is_local(found):
-            return None, None
-        raise TerrainError(
-            f"{what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local' if"
-            " its coordinates are metres of the terrain's own map"
-        )
-    if not found.is_geographic and not found.is_projected:
-        raise TerrainError(f"{what} is in {crs_name(found)}, which has no place on the Earth; set crs")
-    return rasterio.CRS.from_user_input(grid.crs), found
 
 
 def _degrees_around(crs: Any, lon_deg: float) -> Any:

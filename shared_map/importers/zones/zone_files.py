@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -15,18 +14,18 @@ import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name
-from shared_map.importers.onto_grid import Placed, overlap
+from shared_map.importers.onto_grid import place_on
 from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones import way_classes
 from shared_map.importers.zones.burn import Drawn, burn
 from shared_map.importers.zones.shape_texts import INCLUSION
 from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layers, read_features, unusable
-from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
+from shared_map.importers.zones.vector_shapes import Placing, Shapes
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
 from swarm.errors import TerrainError, missing
-from swarm.grid import MAX_CELLS, GridSpec, Window
+from swarm.grid import GridSpec, Window
 
 _WIDEST_M = 1000.0
 """Lines that run so far outside the terrain are of no use to it."""
@@ -321,7 +320,13 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")
     with opened(path, where) as dataset:
-        values, crs = _values_on(dataset, grid, zone.crs, what)
+        placed = place_on(dataset, grid, zone.crs, what, "crs")
+        if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
+            found = f"{dataset.count} bands of {dataset.dtypes[0]}"
+            raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
+        # The nearest cell counts, or the mean where cells of the grid are half as large again.
+        with placed.on_grid("average" if placed.grows else "nearest") as cells:
+            values = cells.read(1) * np.float32(dataset.scales[0] or 1.0) + np.float32(dataset.offsets[0] or 0.0)
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]
@@ -334,35 +339,7 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     count = int(known.size + lethal.sum())
     if not count:
         raise TerrainError(f"{what} has no value on the terrain")
+    crs = "local" if zone.crs == "local" or placed.crs is None else crs_name(placed.crs)
     facts = FileFacts(path.name, "", crs, features=count, used=count)
     nothing = (Window(0, 0, 0, 0), np.zeros((0, 0), np.bool_))
     return Burnt(facts, (grid.window, values), (grid.window, lethal), nothing)
-
-
-def _values_on(dataset: Any, grid: GridSpec, crs: str | None, what: str) -> tuple[Floats, str]:
-    """The one band of a raster on a grid, float32, NaN where it has no value, and the name of its system. The
-    nearest cell counts, or the mean where cells of the grid are half as large again.
-
-    crs  its system, where the file does not say it; "local" is that of a terrain without a place
-
-    Raises TerrainError if it has several bands, is too large, or does not touch the grid.
-    """
-    import rasterio
-
-    if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
-        found = f"{dataset.count} bands of {dataset.dtypes[0]}"
-        raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
-    if dataset.height * dataset.width > MAX_CELLS:
-        raise TerrainError(f"{what} has {dataset.height} x {dataset.width} pixels; at most {MAX_CELLS} are read")
-    target, own = systems_of(grid, str(dataset.crs or ""), crs, what)
-    if own is None:
-        target = own = rasterio.CRS.from_epsg(3857)  # metres of the terrain's own map: which one does not matter
-    overlap(dataset, own, target, grid, what)
-    stored: Floats = dataset.read(1).astype(np.float32)
-    stored[dataset.read_masks(1) == 0] = np.nan
-    stored *= np.float32(dataset.scales[0] or 1.0)
-    stored += np.float32(dataset.offsets[0] or 0.0)
-    placed, values = Placed(dataset, grid, dataset.transform, own, target), np.full(grid.shape, np.nan, np.float32)
-    how = "average" if placed.grows else "nearest"
-    placed.warp(stored, values, how, src_nodata=math.nan, dst_nodata=math.nan)
-    return values, "local" if crs == "local" else crs_name(own)

@@ -48,7 +48,11 @@ REFUSED = {
         collection({"type": "Point", "coordinates": [1e300, -1e300]}).replace("1e+300", "1e999"),
         "is damaged",
     ),
-    "sqlite": ("SQLite format 3\0" + "x" * 5000, "is damaged"),
+    "sqlite": (
+        "SQLite format 3\0" + "x" * 5000,
+        "is SQLite, but no GeoPackage, perhaps SpatiaLite; it is not read",
+    ),
+    "geopackage": ("SQLite format 3\0".ljust(68, "x") + "GPKG" + "x" * 5000, "is damaged"),
     "shapefile": ("\0\0\x27\x0a" + "\xff" * 500, "is damaged"),
     "zip": ("PK\3\4" + "x" * 200, "is damaged or no .zip"),
 }
