@@ -16,8 +16,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
+import yaml
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
+from PIL import Image
+from rasterio import CRS
+from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
 from shared_map.importers.georeference import METRES
@@ -75,8 +79,6 @@ def read_npz(path: Path, what: str) -> Numbers:
     TerrainError
         If the file cannot be read, its arrays would unpack to more than the file may have, or are not as above.
     """
-    from rasterio import CRS
-    from rasterio.transform import from_origin
 
     arrays, held = _members(path, what)
     heights = arrays.pop("elevation", None)
@@ -234,7 +236,6 @@ def read_ros(path: Path) -> LevelMap:
 
 
 def _yaml(path: Path) -> Any:
-    import yaml
 
     try:
         return yaml.safe_load(read_text(path, FileKind.ROS_MAP))
@@ -260,7 +261,6 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     TerrainError
         If the file cannot be read, is no such image, or is shorter than its header says.
     """
-    from PIL import Image
 
     check_bytes(path, FileKind.IMAGE)
     try:

@@ -10,7 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
+from rasterio.errors import CRSError
+from rasterio.warp import transform as to_crs
 
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
@@ -53,8 +56,6 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 def system_named(text: str, what: str) -> Any:
     """rasterio's CRS of a text. Raises TerrainError, which `what` begins, if it is none."""
-    import rasterio
-    from rasterio.errors import CRSError
 
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
@@ -84,7 +85,6 @@ def systems_of(grid: GridSpec, own: Any, given: str | None, what: str, key: str)
     own    the file's system as it says; None if it does not
     given  what the scenario says that it is, the value of `key`
     """
-    import rasterio
 
     if given == "local":
         return None, None
@@ -105,7 +105,6 @@ def overruled(found: Any, given: str | None) -> tuple[str, ...]:
     """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`)."""
     if given is None or not found or not (found.is_geographic or found.is_projected):
         return ()
-    import rasterio
 
     counts = rasterio.CRS.from_user_input(given)
     if counts == found:
@@ -119,7 +118,6 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
 
     `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
     """
-    import rasterio
 
     if is_local(crs):
         return crs
@@ -144,7 +142,6 @@ def _scale(crs: Any, local: Any) -> float:
 
     local  a system that is true around its origin
     """
-    from rasterio.warp import transform as to_crs
 
     xs, ys = to_crs(local, crs, [0.0, 1000.0, 0.0], [0.0, 0.0, 1000.0])
     sides = [math.hypot(xs[n] - xs[0], ys[n] - ys[0]) / 1000.0 for n in (1, 2)]
@@ -164,7 +161,6 @@ def is_local(crs: Any) -> bool:
 
 def degrees_of(crs: Any) -> Any:
     """Latitude and longitude on the body on which a system lies: WGS 84 on the Earth."""
-    import rasterio
 
     return rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
 
@@ -212,7 +208,6 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what:
 
     Raises TerrainError if `crs` is not defined everywhere on its border.
     """
-    from rasterio.warp import transform as to_crs
 
     xs, ys = _border(transform, rows, cols)
     if target != crs:
@@ -227,7 +222,6 @@ def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, wh
 
     Raises TerrainError if it reaches beyond the edge of its system's map, where a place has other metres.
     """
-    from rasterio.warp import transform as to_crs
 
     xs, ys = _border(transform, rows, cols)
     found = to_crs(crs, degrees, xs, ys)
@@ -261,7 +255,6 @@ def is_kept(width_m: float, height_m: float, cells: int, resolution_m: float | N
 
 def pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
     """Width and height in metres of the pixel in the middle."""
-    from rasterio.warp import transform as to_crs
 
     at_row, at_col = np.array([0.0, 0.0, 1.0]) + rows / 2, np.array([0.0, 1.0, 0.0]) + cols / 2
     xs, ys = _placed(transform, at_row, at_col)
@@ -353,7 +346,6 @@ def plan_grid(
 
 def _system(crs: Any) -> str:
     """Text of a system in a GridSpec: as short as means the same."""
-    import rasterio
 
     short = crs.to_proj4().replace("=True", "")
     is_short = not crs.to_epsg() and not is_local(crs) and rasterio.CRS.from_proj4(short) == crs

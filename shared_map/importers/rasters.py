@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rasterio.transform import Affine
+import rasterio
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine, from_origin
 
 from shared_map.array_files import Floats
 from shared_map.importers.cover import cover_meaning
@@ -128,7 +130,6 @@ def _of_colours(dataset: Any, what: str) -> Contents:
 
 
 def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
-    from rasterio.enums import ColorInterp
 
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     # A first look at the middle of a file: most height models are ruled out by it.
@@ -184,8 +185,6 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
     An image without a place lies where its path says if that is the path of a tile of a web map, zoom/x/y.png. Else
     it lies anywhere, in metres, as numbers of our own reading do that have no system.
     """
-    import rasterio
-    from rasterio.transform import from_origin
 
     what = f"terrain {path}"
     coded = holds.is_cover or holds.encoding is not None

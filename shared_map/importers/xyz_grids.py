@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio import CRS
+from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
 from shared_map.importers.array_grids import check_cells
@@ -201,8 +203,6 @@ class _Axis(NamedTuple):
 
 
 def _points(layout: _Layout) -> Numbers:
-    from rasterio import CRS
-    from rasterio.transform import from_origin
 
     what, total = layout.what, 0
     xs = ys = np.zeros(0)

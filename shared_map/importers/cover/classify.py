@@ -16,6 +16,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.photo_rules import (
@@ -124,7 +126,6 @@ def _line_strength(rgb: Bytes, row0: int, row1: int, part: slice) -> Bytes:
 def _lakes(wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> Bools:
     """Patches of likely water of which a fifth is certain, and that are level. If a shadow covers a shore the patch
     is no lake; then its still part, and the shore of that."""
-    from scipy import ndimage
 
     likely = (wetness & LIKELY) > 0
     lakes, tilted = _patches(likely, wetness, elevation_m, resolution_m)
@@ -136,7 +137,6 @@ def _lakes(wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> B
 
 def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> tuple[Bools, Bools]:
     """(level, tilted) patches; small ones are puddles or shadows of houses and are neither."""
-    from scipy import ndimage
 
     labels, count = ndimage.label(likely)
     sizes = counted(labels, count + 1)
@@ -170,7 +170,6 @@ class Learner:
         columns : float32 (cells, 11), `Features.columns`
         kinds : uint8 (cells,), TerrainClass
         """
-        from scipy.spatial import cKDTree
 
         of_class = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
         some = [at[np.linspace(0, len(at) - 1, min(len(at), MOST_OF_A_CLASS)).astype(np.intp)] for at in of_class]

@@ -16,7 +16,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import rasterio.shutil
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
+from rasterio.errors import RasterioError
+from rasterio.warp import transform
 
 from shared_map.importers.cover import cover_codes
 from shared_map.importers.cover.cover_codes import TABLES, CoverTable, joined, legend_codes, legend_of, some
@@ -120,7 +124,6 @@ class Evidence:
 def evidence_of(dataset: Any, sample: NDArray[Any]) -> Evidence:
     """Returns the evidence in a file of one band; `sample` has codes of some of its cells, (cells,), no-data left
     out."""
-    from rasterio.enums import ColorInterp
 
     codes, cells = np.unique(sample, return_counts=True)
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
@@ -137,8 +140,6 @@ def evidence_of(dataset: Any, sample: NDArray[Any]) -> Evidence:
 
 
 def _middle(dataset: Any) -> tuple[float, float] | None:
-    from rasterio.errors import RasterioError
-    from rasterio.warp import transform
 
     if dataset.crs and (dataset.crs.is_geographic or dataset.crs.is_projected):
         x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
@@ -151,8 +152,6 @@ def _middle(dataset: Any) -> tuple[float, float] | None:
 def _names(dataset: Any) -> dict[int, str]:
     """Category names, or the texts of an attribute table. rasterio reads neither; GDAL's description of a file has
     both."""
-    import rasterio.shutil
-    from rasterio.errors import RasterioError
 
     faults = (RasterioError, OSError, ElementTree.ParseError)
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(*faults):
@@ -301,7 +300,6 @@ def why_unknown(dataset: Any, what: str) -> str:
 
 def is_drawn(path: Path, config: TerrainConfig) -> bool:
     """True if an image that is named as a photo is a map of land cover, in a legend's colours or with its codes."""
-    from rasterio.enums import ColorInterp
 
     with opened(path, "photo") as dataset:
         if dataset.count >= 3:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.layers import READABLE, TerrainClass, grade_of_padded, spread
@@ -222,7 +223,6 @@ def line_strength(rgb: Bytes) -> Bytes:
     uint8 (rows, cols), tenths of a grey level
         0 where there is no crest. The outer `REACH` rows and columns are found from less of the photo.
     """
-    from scipy import ndimage
 
     # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.
     grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
@@ -272,7 +272,6 @@ def long_lines(strength: Bytes) -> Bools:
     -------
     bool (rows, cols)
     """
-    from scipy import ndimage
 
     strong = strength >= _STRONG
     labels, count = ndimage.label(spread(strong, (1, 1)), np.ones((3, 3), np.int8))

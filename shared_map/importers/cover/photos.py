@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes
 from shared_map.importers.cover.cover_codes import joined
@@ -120,7 +121,6 @@ def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | No
 
 def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
     """Returns which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
-    from rasterio.enums import ColorInterp
 
     meanings = list(dataset.colorinterp)
     wanted = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)

@@ -6,17 +6,21 @@ therefore checked before: a GeoJSON against the types below, an XML in its coord
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
 import msgspec
 from msgspec import Meta, Struct
 
+from shared_map.importers.raster_files import beginning
+from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 
 
@@ -61,6 +65,16 @@ def kind_of(head: bytes, what: str) -> Kind | None:
     found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
     root = _ROOT.match(head) if found is None else None
     return Kind(_ROOTS[root[1]], "xml") if root is not None and root[1] in _ROOTS else found
+
+
+IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
+
+
+def is_vector(path: Path) -> bool:
+    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
+    with contextlib.suppress(OSError, TerrainError):
+        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0], "") is not None
+    return False
 
 
 # --- GeoJSON ------------------------------------------------------------------------------------------------

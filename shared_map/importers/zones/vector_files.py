@@ -15,17 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
+import shapely
 from numpy.typing import NDArray
+from pyogrio.raw import read
 
 from shared_map.importers.raster_files import LONGEST_REASON, beginning
-from shared_map.importers.zones.shape_texts import Kind, checked_json, checked_xml, kind_of
+from shared_map.importers.zones.shape_texts import IN_ARCHIVES, Kind, checked_json, checked_xml, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import SwarmError, TerrainError
 
 _CHUNK = 100_000
 """Features which are read at once."""
-_IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
 _TOGETHER = {"LIBKML": None, "GPX": {"waypoints", "routes", "tracks"}, "OSM": {"points", "lines", "multipolygons"}}
 """Formats whose layers are one drawing, and the layers which hold it; None: all."""
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
@@ -82,20 +84,12 @@ class Features:
         return next((tags[name] for name in _IDS if name in tags), str(self.numbers[feature]))[:60]
 
 
-def is_vector(path: Path) -> bool:
-    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
-    with contextlib.suppress(OSError, TerrainError):
-        return kind_of(beginning(path, _IN_ARCHIVES, FileKind.VECTORS, "")[0], "") is not None
-    return False
-
-
 def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
     """The layer that is named, or the one of a file, or those which are one drawing.
 
     Raises TerrainError with one sentence, which `what` begins, if the file is missing, too large, damaged, of
     another kind, or holds several layers and none is named.
     """
-    import pyogrio
 
     source, kind = _source(path, what)
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # which takes new, negative ids for damage
@@ -135,8 +129,6 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
     Raises TerrainError, which names the feature, if one has no shape, or a part of it none, or a coordinate is no
     number: GDAL leaves out of a shape what it cannot read. Raises it if the file is damaged.
     """
-    import shapely
-    from pyogrio.raw import read
 
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
     for first in range(0, 1 << 31, _CHUNK):
@@ -178,7 +170,6 @@ def unusable(what: str, id: str, why: str) -> TerrainError:
 
 def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, empty ones too, and of which each is a part."""
-    import shapely
 
     of = np.arange(len(geometries))
     parts = np.asarray(geometries, object)
@@ -213,7 +204,7 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
-        head, member, unpacked = beginning(path, _IN_ARCHIVES, FileKind.VECTORS, what)
+        head, member, unpacked = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
     kind = kind_of(head, what)

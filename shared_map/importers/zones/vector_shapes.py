@@ -12,7 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rasterio
+import shapely
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import RasterioError
+from rasterio.transform import from_origin
+from rasterio.warp import transform as to_crs
 
 from shared_map.importers.georeference import bounds_in, crs_name, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
@@ -84,8 +90,6 @@ class Placing:
 
     def _extent(self) -> Box:
         """The terrain with its margin, in the layer's coordinates; degrees go on beyond 180."""
-        from rasterio.transform import from_origin
-        from rasterio.warp import transform as to_crs
 
         grid, out = self.grid, self._margin_cells * self.grid.resolution_m
         rows, cols = grid.rows + 2 * self._margin_cells, grid.cols + 2 * self._margin_cells
@@ -147,7 +151,6 @@ class Placing:
 
     def place(self, features: Features) -> Shapes:
         """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
-        import shapely
 
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
@@ -180,7 +183,6 @@ class Placing:
         self, shapes: NDArray[Any], of: NDArray[np.int64], shift: float, features: Features
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """The parts of shapes within the terrain's box that is turned by some degrees."""
-        import shapely
 
         box = (self._box[0] + shift, self._box[1], self._box[2] + shift, self._box[3])
         shapes, within = _simple(np.asarray(shapely.clip_by_rect(shapes, *box), object))
@@ -197,8 +199,6 @@ class Placing:
     @contextmanager
     def _reprojecting(self) -> Iterator[None]:
         """Makes what PROJ says of systems that do not go together a TerrainError."""
-        from rasterio._err import CPLE_BaseError
-        from rasterio.errors import RasterioError
 
         try:
             yield
@@ -208,7 +208,6 @@ class Placing:
             ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
-        from rasterio.warp import transform as to_crs
 
         xs, ys = points[:, 0] + shift, points[:, 1]
         if self._crs is not None and self._crs != self._target and len(points):
@@ -220,7 +219,6 @@ class Placing:
 
 def _degrees_around(crs: Any, lon_deg: float) -> Any:
     """The same degrees, with longitudes counted from one in the middle of the terrain."""
-    import rasterio
 
     return rasterio.CRS.from_proj4(f"+proj=longlat +pm={lon_deg!r} +datum=WGS84 +no_defs")
 
@@ -235,7 +233,6 @@ def _shown(box: Box) -> str:
 
 def _jumps(geometry: Any) -> bool:
     """Returns True if an edge spans more than half of the globe, and not all of it."""
-    import shapely
 
     parts, _ = _simple(np.array([geometry], object))
     for part in parts:
@@ -248,7 +245,6 @@ def _jumps(geometry: Any) -> bool:
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, without empty ones, and of which each is a part."""
-    import shapely
 
     parts, of = parts_of(geometries)
     kept = ~shapely.is_empty(parts)
@@ -262,7 +258,6 @@ def _mended(
 
     Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
     """
-    import shapely
 
     shapes = features.shapes.copy()
     polygons = near & (shapely.get_type_id(shapes) == _POLYGONS)
@@ -279,7 +274,6 @@ def _mended(
 
 def _crossings(polygon: Any) -> float:
     """Estimates the crossings of a polygon's edges from a sample: counting all takes as long as the repair."""
-    import shapely
 
     points = shapely.get_coordinates(polygon)
     edges = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
