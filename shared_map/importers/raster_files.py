@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
-from swarm.config.input_files import FileKind, check_bytes, read_text, size
+from swarm.config.input_files import FileKind, check_bytes, check_file, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -110,8 +110,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    if not path.is_file():
-        raise TerrainError(f"{what} {path} does not exist")
+    check_file(path, FileKind.IMAGE)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -14,8 +15,12 @@ from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_raste
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
+from swarm.config.input_files import FileKind, check_file
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
+
+if TYPE_CHECKING:
+    from shared_map.importers.cover.photos import Photo
 
 JACKSBORO_RESOLUTION_M = 75.0
 """Its heights are 3 arc seconds apart, at 36.6 degrees north 74.5 m from west to east and 92.5 m from north to
@@ -35,8 +40,7 @@ class Source:
     classes      uint8 (rows, cols), TerrainClass
     readings     uint8 (rows, cols), possible classes of an unknown cell, bits of `layers.READABLE`; 0 where none is
                  known; None without readings
-    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
-    drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
+    photo        the colour photo, uint8 (rows, cols, 3); black where it shows nothing
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
     level        bool (rows, cols), flat cells of the file, before any resampling; None if not examined
     notes        origin and processing steps, for people
@@ -48,8 +52,6 @@ class Source:
     _: KW_ONLY
     readings: Bytes | None = None
     photo: Bytes | None = None
-    seen: Bools | None = None
-    drawn: str | None = None
     factor: Floats | None = None
     level: Bools | None = None
     notes: tuple[str, ...] = ()
@@ -86,9 +88,11 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
         if is_drawn(Path(config.photo), config):
             config = msgspec.structs.replace(config, photo=None, cover=config.photo)
     if config.photo is not None:
-        source = with_photo(source, Path(config.photo), config, progress)
-    if source.photo is not None:
-        source = classified(source, config, progress)
+        from shared_map.importers.cover.photos import read_photo
+
+        source = with_photo(
+            source, read_photo(Path(config.photo), source.grid, config.crs, progress), config, progress
+        )
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
@@ -141,12 +145,7 @@ def _jacksboro_path() -> Path:
 
 
 def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    if not path.exists():
-        raise TerrainError(f"terrain {path} does not exist: no such file; give one, or jacksboro or synthetic")
-    if path.is_dir():
-        raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
-    if not path.is_file():
-        raise TerrainError(f"terrain {path} is a pipe or a device; give a file: {FILE_KINDS}")
+    check_file(path, FileKind.TEXT_GRID)
     suffix = path.suffix.lower()
     if suffix not in _ENDINGS and not is_raster(path):
         found = suffix or "a file without ending"
@@ -236,41 +235,28 @@ def with_water(source: Source, config: TerrainConfig) -> Source:
     return replace(source, classes=classes, notes=notes)
 
 
-def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.cover.photos import read_photo
+def with_photo(source: Source, photo: Photo, config: TerrainConfig, progress: Progress) -> Source:
+    """The source with a photo, and with the classes that it shows unless it is no true-colour one."""
+    from shared_map.importers.cover.classify import class_readings, learnt, read_labels
 
-    photo = read_photo(path, source.grid, config.crs, progress)
-    notes = (*source.notes, str(path), *photo.notes)
-    return replace(source, photo=photo.rgb, seen=photo.seen, drawn=photo.drawn, notes=notes)
-
-
-def classified(source: Source, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.cover.classify import class_readings, learnt
-    from shared_map.importers.cover.photos import why_not_true_colour
-
-    assert source.photo is not None
-    inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
-    seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
-    other = source.drawn or why_not_true_colour(source.photo, seen)
-    if config.labels is None and other is not None:
+    inputs = (photo.rgb, source.elevation_m, source.grid.resolution_m)
+    classes, readings = source.classes, None
+    if config.labels is not None:
+        labels = read_labels(Path(config.labels), source.grid)
+        classes = learnt(*inputs, labels.classes, photo.seen, progress)
+        note = f"classes from the photo, learnt from {labels.count} labels"
+    elif photo.other is not None:
         note = (
-            f"the photo is {other}; no classes are read from it: give a true-colour one, terrain.labels, or its"
-            " codes as terrain.cover"
+            f"the photo is {photo.other}; no classes are read from it: give a true-colour one, terrain.labels, or"
+            " its codes as terrain.cover"
         )
-        return replace(source, notes=(*source.notes, note))
-    readings = None
-    if config.labels is None:
-        classes, readings = class_readings(*inputs, source.seen, progress)
-        doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
+    else:
+        classes, readings = class_readings(*inputs, photo.seen, progress)
+        doubtful = float((classes[photo.seen] == TerrainClass.UNKNOWN).mean())
         note = (
             f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
             " exposed a little differently, is unknown and costs as the costliest of these classes: see"
             " terrain.labels and cost.class_factor.unknown"
         )
-    else:
-        from shared_map.importers.cover.classify import read_labels
-
-        labels = read_labels(Path(config.labels), source.grid)
-        classes = learnt(*inputs, labels.classes, source.seen, progress)
-        note = f"classes from the photo, learnt from {labels.count} labels"
-    return replace(source, classes=classes, readings=readings, notes=(*source.notes, note))
+    notes = (*source.notes, *photo.notes, note)
+    return replace(source, classes=classes, readings=readings, photo=photo.rgb, notes=notes)

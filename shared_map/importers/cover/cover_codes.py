@@ -71,7 +71,6 @@ class CoverTable:
     grounds  what each code stands for
     nothing  codes that stand for no data
     words    what its files call it in their metadata or names, in lower case
-    where    west, south, east, north in degrees, beyond which it was not published
     gappy    whether whole numbers between its codes are none, so that heights are hardly all among them
     """
 
@@ -80,7 +79,6 @@ class CoverTable:
     grounds: Mapping[int, Ground]
     nothing: frozenset[int] = frozenset((0,))
     words: tuple[str, ...] = ()
-    where: tuple[float, float, float, float] = (-180.0, -90.0, 180.0, 90.0)
     gappy: bool = True
 
     def replaced(self, own: Mapping[int, Ground]) -> CoverTable:

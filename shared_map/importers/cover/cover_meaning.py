@@ -20,7 +20,6 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
-from rasterio.warp import transform
 
 from shared_map.importers.cover import cover_codes
 from shared_map.importers.cover.cover_codes import TABLES, CoverTable, joined, legend_codes, legend_of, some
@@ -40,7 +39,6 @@ _MOST_SAMPLED = 1 << 20
 _LOOK_CELLS = 256
 """Side of the sample that is examined first, in cells. Among 65,536 pixels a photo has far more than
 `MOST_COLOURS`, so it is not read as a whole."""
-_VALUE_COLUMNS = ("value", "code", "gridcode", "grid_code")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +105,12 @@ class Evidence:
     palette  colour of each code; empty if it has none
     names    name of each code; empty if it has none
     text     its name, tags and descriptions, in lower case
-    middle   longitude and latitude of its middle; None if it has no place
     """
 
     counts: Mapping[int, int]
     palette: Mapping[int, cover_codes.Rgb]
     names: Mapping[int, str]
     text: str
-    middle: tuple[float, float] | None
 
     def share(self, codes: Iterable[int]) -> float:
         """Returns the share of the cells that has one of these codes."""
@@ -135,48 +131,19 @@ def evidence_of(dataset: Any, sample: NDArray[Any]) -> Evidence:
         palette,
         _names(dataset),
         " ".join(str(word)[:2000] for word in words if word).lower(),
-        _middle(dataset),
     )
 
 
-def _middle(dataset: Any) -> tuple[float, float] | None:
-
-    if dataset.crs and (dataset.crs.is_geographic or dataset.crs.is_projected):
-        x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
-        with contextlib.suppress(RasterioError, ValueError):
-            (lon,), (lat,) = transform(dataset.crs, "EPSG:4326", [x], [y])
-            return lon, lat
-    return None
-
-
 def _names(dataset: Any) -> dict[int, str]:
-    """Category names, or the texts of an attribute table. rasterio reads neither; GDAL's description of a file has
-    both."""
-
+    """Category names. rasterio does not read them; GDAL's description of a file has them."""
     faults = (RasterioError, OSError, ElementTree.ParseError)
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(*faults):
         path = Path(folder) / "described.vrt"
         rasterio.shutil.copy(dataset, str(path), driver="VRT")
         if path.stat().st_size < _MOST_XML:
-            root = ElementTree.fromstring(path.read_bytes())
-            categories = enumerate(root.iterfind(".//Category"))
-            return _attributes(root) or {code: (node.text or "").strip() for code, node in categories if node.text}
+            categories = enumerate(ElementTree.fromstring(path.read_bytes()).iterfind(".//Category"))
+            return {code: node.text.strip() for code, node in categories if node.text}
     return {}
-
-
-def _attributes(root: ElementTree.Element) -> dict[int, str]:
-    """Value -> text, of the first attribute table that has a column of values and one of texts."""
-    fields = root.findall(".//GDALRasterAttributeTable[1]/FieldDefn")
-    names = [field.findtext("Name", "").strip().lower() for field in fields]
-    values = [n for n, name in enumerate(names) if name in _VALUE_COLUMNS]
-    texts = [n for n, field in enumerate(fields) if field.findtext("Type", "").strip() in ("2", "String")]
-    found: dict[int, str] = {}
-    if values and texts:
-        for row in root.iterfind(".//GDALRasterAttributeTable[1]/Row"):
-            cells = [cell.text or "" for cell in row.iterfind("F")]
-            with contextlib.suppress(ValueError, IndexError, OverflowError):
-                found[int(float(cells[values[0]]))] = cells[texts[0]].strip()
-    return found
 
 
 def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
@@ -238,11 +205,8 @@ def recognise(found: Evidence, what: str) -> tuple[CoverTable, str] | None:
         ("its codes", by_codes),
     ):
         others = [title for title, codes in cover_codes.OTHERS.items() if how == "its codes" and there <= codes]
-        near = [table for table in chosen if _is_there(found, table)]
         if len(chosen) == 1 and not others:
             return chosen[0], how
-        if len(near) == 1 and not others:
-            return near[0], f"{how} and where it lies"
         if chosen:
             keys = " or ".join(repr(table.key) for table in chosen)
             titles = ", and of ".join([*(table.title for table in chosen), *others])
@@ -274,13 +238,6 @@ def _has_its_names(found: Evidence, table: CoverTable) -> bool:
 
 def _most(alike: Collection[bool], least: int) -> bool:
     return len(alike) >= least and sum(alike) >= _LEAST_ALIKE * len(alike)
-
-
-def _is_there(found: Evidence, table: CoverTable) -> bool:
-    if found.middle is None:
-        return False
-    (lon, lat), (west, south, east, north) = found.middle, table.where
-    return west <= lon <= east and south <= lat <= north
 
 
 def why_unknown(dataset: Any, what: str) -> str:

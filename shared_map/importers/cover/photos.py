@@ -40,13 +40,13 @@ class Photo:
     rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
     seen   bool (rows, cols): where it shows anything
     notes  processing steps, for people
-    drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
+    other  the kind of an image that is no true-colour photo, for people; None if it may be one
     """
 
     rgb: Bytes
     seen: Bools
     notes: tuple[str, ...]
-    drawn: str | None = None
+    other: str | None = None
 
 
 def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
@@ -72,7 +72,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     what = f"photo {path}"
     with opened(path, "photo") as dataset:
         placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
-        notes = []
+        notes = [str(path)]
         if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
             notes.append(
                 f"photo: {dataset.height} x {dataset.width} pixels, covers {placed.share:.1%} of the terrain"
@@ -104,7 +104,8 @@ def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    return Photo(rgb, seen, tuple(notes), _why_drawn(dataset, indexes, palette))
+    other = _why_drawn(dataset, indexes, palette) or why_not_true_colour(rgb, seen)
+    return Photo(rgb, seen, tuple(notes), other)
 
 
 def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:

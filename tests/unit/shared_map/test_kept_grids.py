@@ -237,7 +237,7 @@ def test_a_refusal_states_what_was_found(
 @pytest.mark.parametrize("ending", ["tif", "asc", "npz", "xyz", "yaml", "geojson"])
 def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
     os.mkfifo(tmp_path / f"dem.{ending}")
-    with pytest.raises(TerrainError, match="is a pipe or a device"):
+    with pytest.raises(TerrainError, match="it is a device or pipe, not a file"):
         load(tmp_path / f"dem.{ending}")
 
 
