@@ -17,7 +17,7 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -162,15 +162,10 @@ def _plain(path: Path, what: str) -> Numbers:
 
 def _system_beside(path: Path, what: str) -> Any:
     """The system of a .prj, which GDAL does not find beside a part of a file."""
-    import rasterio
+    from shared_map.importers.georeference import system_named
 
     found = path.with_suffix(".prj")
-    if not found.is_file():
-        return None
-    try:
-        return rasterio.CRS.from_wkt(read_text(found, FileKind.SYSTEM), morph_from_esri_dialect=True)
-    except ValueError as error:
-        raise TerrainError(f"{what}: {found} holds no coordinate system") from error
+    return system_named(read_text(found, FileKind.SYSTEM), f"{what}: {found}") if found.is_file() else None
 
 
 def in_memory(given: Numbers, files: contextlib.ExitStack) -> Any:
@@ -200,14 +195,12 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
             text = rest + piece
             words = text.replace(b",", b".").split()
             rest = words.pop() if words and not text[-1:].isspace() else b""
-            fits = words[: numbers.size - count]
+            fits = [b"nan" if each == void else each for each in words[: numbers.size - count]]
             try:
-                numbers[count : count + len(fits)] = np.array(
-                    [each if each != void else "nan" for each in fits], np.float64
-                )
+                numbers[count : count + len(fits)] = np.array(fits, np.float64)
                 wrong = len(fits)
             except ValueError:
-                wrong = next(n for n, each in enumerate(fits) if each != void and not _is_number(each))
+                wrong = next(n for n, each in enumerate(fits) if not _is_number(each))
             if wrong < len(words):
                 at = next(itertools.islice(re.finditer(rb"\S+", text), wrong, None)).start()
                 shown = words[wrong][:40].decode("ascii", "replace")
@@ -424,18 +417,15 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
 # --- read ---------------------------------------------------------------------------------------------------
 
 
-def thinned(read: Callable[..., NDArray[Any]], dataset: Any, bands_read: Any, every: int) -> NDArray[Any]:
-    """Returns every n-th row and column of a dataset's `read`. GDAL's own way to read fewer cells unpacks a tile
-    again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
-    from rasterio.windows import Window
-
-    if every == 1:
-        return np.asarray(read(bands_read))
+def sampled(dataset: Any, indexes: int | tuple[int, ...], most_cells: int) -> Any:
+    """Every n-th row and column of bands, at most so many cells: a masked array, as stored. GDAL's own way to read
+    fewer cells unpacks a tile again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
+    every = math.ceil(math.sqrt(max(dataset.height * dataset.width / most_cells, 1.0)))
     parts = []
     for row0, row1 in bands(dataset.height, every * max(READ_ROWS // every, 1)):
-        window = Window(0, row0, dataset.width, row1 - row0)
-        parts.append(read(bands_read, window=window)[..., ::every, ::every].copy())
-    return np.concatenate(parts, axis=-2)
+        rows = dataset.read(indexes, window=((row0, row1), (0, dataset.width)), masked=True)
+        parts.append(rows[..., ::every, ::every].copy())
+    return np.ma.concatenate(parts, axis=-2)  # type: ignore[no-untyped-call]
 
 
 def middle_of(dataset: Any, most_side: int) -> Any:

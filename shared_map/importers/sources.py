@@ -16,7 +16,7 @@ from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_file
-from swarm.errors import TerrainError
+from swarm.errors import TerrainError, require
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
     if config.photo is not None and config.cover is None and config.labels is None:
-        from shared_map.importers.cover.cover_meaning import is_drawn
+        from shared_map.importers.cover.land_cover import is_drawn
 
         if is_drawn(Path(config.photo), config):
             config = msgspec.structs.replace(config, photo=None, cover=config.photo)
@@ -132,13 +132,9 @@ def _jacksboro(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro_path() -> Path:
     # Not matplotlib.cbook.get_sample_data: importing it takes 0.8 s.
+    require("terrain.source = 'jacksboro'", "matplotlib")
     spec = importlib.util.find_spec("matplotlib")
-    if spec is None or spec.origin is None:
-        raise TerrainError("terrain.source = 'jacksboro' comes with matplotlib, which is not installed")
-    path = Path(spec.origin).parent / "mpl-data" / "sample_data" / JACKSBORO_FILE
-    if not path.is_file():
-        raise TerrainError(f"matplotlib is installed without its sample data: {path} is missing")
-    return path
+    return Path(str(spec and spec.origin)).parent / "mpl-data" / "sample_data" / JACKSBORO_FILE
 
 
 # --- files --------------------------------------------------------------------------------------------------

@@ -14,13 +14,15 @@ from rasterio.enums import ColorInterp
 from shared_map.array_files import Bools, Bytes
 from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
-from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
+from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, sampled
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
+_STRETCHED_CELLS = 1 << 18
+"""Of 512 x 512 pixels a percentile is known to a thousandth."""
 _DARK = 30
 """Out of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
 channels have no meaning."""
@@ -139,9 +141,8 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
-    every = -(-max(dataset.height, dataset.width) // 512)
-    sample = thinned(dataset.read, dataset, indexes, every).astype(np.float64)
-    sample = sample[np.isfinite(sample) & (sample != (0 if dataset.nodata is None else dataset.nodata))]
+    sample = sampled(dataset, tuple(indexes), _STRETCHED_CELLS).compressed().astype(np.float64)
+    sample = sample[np.isfinite(sample) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(sample, (2, 98)))

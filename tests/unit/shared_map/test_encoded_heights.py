@@ -11,8 +11,7 @@ import rasterio
 from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, written
 
-from shared_map.importers.encoded_heights import ENCODINGS, decoded, is_plausible
-from shared_map.importers.rasters import contents_of
+from shared_map.importers.rasters import ENCODINGS, contents_of, decoded, is_plausible
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
