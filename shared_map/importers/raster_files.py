@@ -418,7 +418,7 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
 
 
 def sampled(dataset: Any, indexes: int | tuple[int, ...], most_cells: int) -> Any:
-    """Every n-th row and column of bands, at most so many cells: a masked array, as stored. GDAL's own way to read
+    """Every n-th row and column of bands, at most `most_cells`: a masked array, as stored. GDAL's own way to read
     fewer cells unpacks a tile again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
     every = math.ceil(math.sqrt(max(dataset.height * dataset.width / most_cells, 1.0)))
     parts = []

@@ -22,7 +22,7 @@ from swarm.grid import GridSpec
 MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
 _STRETCHED_CELLS = 1 << 18
-"""Of 512 x 512 pixels a percentile is known to a thousandth."""
+"""Sample of 512 x 512 pixels, from which a percentile is known to a thousandth."""
 _DARK = 30
 """Out of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
 channels have no meaning."""
