@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from rasterio.errors import CRSError
+from rasterio.transform import array_bounds
 from rasterio.warp import transform as to_crs
+from rasterio.warp import transform_bounds
 
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
@@ -188,51 +189,13 @@ def crs_name(crs: Any) -> str:
     return text if len(text) < 60 else text[:57] + "..."
 
 
-def _placed(transform: Any, at_row: NDArray[Any], at_col: NDArray[Any]) -> tuple[list[float], list[float]]:
-    xs = transform.a * at_col + transform.b * at_row + transform.c
-    ys = transform.d * at_col + transform.e * at_row + transform.f
-    return [float(x) for x in xs], [float(y) for y in ys]
-
-
-def _border(transform: Any, rows: int, cols: int) -> tuple[list[float], list[float]]:
-    """Points all around a raster, in its own coordinates."""
-    along = np.linspace(0.0, 1.0, 21)
-    zero, one = np.zeros(21), np.ones(21)
-    at_col = np.concatenate([along, one, along, zero]) * cols
-    at_row = np.concatenate([zero, along, one, along]) * rows
-    return _placed(transform, at_row, at_col)
-
-
-def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what: str) -> tuple[float, ...]:
-    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`.
-
-    Raises TerrainError if `crs` is not defined everywhere on its border.
-    """
-
-    xs, ys = _border(transform, rows, cols)
+def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float, float, float]:
+    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`; degrees count on
+    beyond 180."""
+    west, south, east, north = array_bounds(rows, cols, transform)
     if target != crs:
-        xs, ys = to_crs(crs, target, xs, ys)
-    if not np.isfinite([xs, ys]).all():
-        raise TerrainError(f"{what} reaches where its coordinate system {crs_name(crs)} is not defined; crop it")
-    return min(xs), min(ys), max(xs), max(ys)
-
-
-def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, what: str) -> tuple[float, float]:
-    """(west, east) of a raster of metres with 180 degrees counted on from there: 179 to 181, not -180 to 180.
-
-    Raises TerrainError if it reaches beyond the edge of its system's map, where a place has other metres.
-    """
-
-    xs, ys = _border(transform, rows, cols)
-    found = to_crs(crs, degrees, xs, ys)
-    back = to_crs(degrees, crs, found[0], found[1])
-    if not np.allclose(back[0], xs, rtol=0, atol=abs(transform.a) + abs(transform.b)):
-        raise TerrainError(
-            f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
-            " brings it onto one map"
-        )
-    lon = np.asarray(found[0]) % 360
-    return float(lon.min()), float(lon.max())
+        west, south, east, north = transform_bounds(crs, target, west, south, east, north)
+    return west, south, east + 360.0 * (target.is_geographic and east < west), north
 
 
 def check_metres(step: float, west: float, what: str) -> None:
@@ -255,10 +218,9 @@ def is_kept(width_m: float, height_m: float, cells: int, resolution_m: float | N
 
 def pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
     """Width and height in metres of the pixel in the middle."""
-
-    at_row, at_col = np.array([0.0, 0.0, 1.0]) + rows / 2, np.array([0.0, 1.0, 0.0]) + cols / 2
-    xs, ys = _placed(transform, at_row, at_col)
-    if target is not None and target != crs:
+    places = [transform @ (cols / 2 + right, rows / 2 + down) for right, down in ((0, 0), (1, 0), (0, 1))]
+    xs, ys = zip(*places, strict=True)
+    if target != crs:
         xs, ys = to_crs(crs, target, xs, ys)
     return math.hypot(xs[1] - xs[0], ys[1] - ys[0]), math.hypot(xs[2] - xs[0], ys[2] - ys[0])
 
@@ -301,9 +263,15 @@ def plan_grid(
             " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
         )
     degrees = crs if is_local(crs) else degrees_of(crs)
-    west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
-    if not is_local(crs) and east - west > 180 and not crs.is_geographic:
-        west, east = _around_180(transform, rows, cols, crs, degrees, what)
+    west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
+    if east > 180 and crs.is_projected:
+        ends, _ = to_crs(crs, degrees, *zip(transform @ (0, 0), transform @ (cols, rows), strict=True))
+        back, _ = to_crs(degrees, crs, ends, [south, south])
+        if abs(back[1] - back[0]) > 2 * abs(transform.a * cols) + abs(transform.b * rows):
+            raise TerrainError(
+                f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
+                " brings it onto one map"
+            )
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
     if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:
@@ -333,7 +301,7 @@ def plan_grid(
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
         return grid, None, notes
     resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
-    west, south, east, north = bounds_in(transform, rows, cols, crs, target, what)
+    west, south, east, north = bounds_in(transform, rows, cols, crs, target)
     high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
     if high < 1 or wide < 1:
         raise TerrainError(

@@ -104,7 +104,7 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
 def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
     """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
     try:
-        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target)
     except (RasterioError, CPLE_BaseError) as error:
         names = crs_name(crs), crs_name(target)
         raise TerrainError(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import rasterio
 import shapely
 from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError
@@ -97,12 +96,7 @@ class Placing:
         if self._crs is None or self._crs == self._target:
             return west, north - rows * grid.resolution_m, west + cols * grid.resolution_m, north
         around = from_origin(west, north, grid.resolution_m, grid.resolution_m)
-        what = f"{self.layer.what}: the terrain"
-        box = bounds_in(around, rows, cols, self._target, self._crs, what)  # type: ignore[arg-type]
-        if self._crs.is_geographic and box[2] - box[0] > 180:
-            middle, _ = to_crs(self._target, self._crs, [west + cols / 2 * grid.resolution_m], [north])
-            turned = bounds_in(around, rows, cols, self._target, _degrees_around(self._crs, middle[0]), what)  # type: ignore[arg-type]
-            box = (turned[0] + middle[0], turned[1], turned[2] + middle[0], turned[3])
+        box = bounds_in(around, rows, cols, self._target, self._crs)  # type: ignore[arg-type]
         # The border was looked at in some of its points only, and may bulge between them.
         wide, high = 0.01 * (box[2] - box[0]), 0.01 * (box[3] - box[1])
         return box[0] - wide, box[1] - high, box[2] + wide, box[3] + high
@@ -215,12 +209,6 @@ class Placing:
             xs, ys = np.asarray(moved[0]), np.asarray(moved[1])
         grid = self.grid
         return np.stack([(xs - grid.west_m) / grid.resolution_m, (grid.north_m - ys) / grid.resolution_m], axis=1)
-
-
-def _degrees_around(crs: Any, lon_deg: float) -> Any:
-    """The same degrees, with longitudes counted from one in the middle of the terrain."""
-
-    return rasterio.CRS.from_proj4(f"+proj=longlat +pm={lon_deg!r} +datum=WGS84 +no_defs")
 
 
 def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
