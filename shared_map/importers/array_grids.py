@@ -79,7 +79,6 @@ def read_npz(path: Path, what: str) -> Numbers:
     TerrainError
         If the file cannot be read, its arrays would unpack to more than the file may have, or are not as above.
     """
-
     arrays, held = _members(path, what)
     heights = arrays.pop("elevation", None)
     if heights is None:
@@ -261,7 +260,6 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     TerrainError
         If the file cannot be read, is no such image, or is shorter than its header says.
     """
-
     check_bytes(path, FileKind.IMAGE)
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG", "BMP")) as image:

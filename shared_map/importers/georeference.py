@@ -19,7 +19,6 @@ from rasterio.warp import transform_bounds
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
-_SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
 MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
 MOST_STRETCH = 0.02
@@ -57,7 +56,6 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 def system_named(text: str, what: str) -> Any:
     """rasterio's CRS of a text. Raises TerrainError, which `what` begins, if it is none."""
-
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
             return rasterio.CRS.from_user_input(text)
@@ -86,7 +84,6 @@ def systems_of(grid: GridSpec, own: Any, given: str | None, what: str, key: str)
     own    the file's system as it says; None if it does not
     given  what the scenario says that it is, the value of `key`
     """
-
     if given == "local":
         return None, None
     found = crs_of(own, given, what, key)
@@ -119,7 +116,6 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
 
     `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
     """
-
     if is_local(crs):
         return crs
     local = rasterio.CRS.from_proj4(
@@ -143,7 +139,6 @@ def _scale(crs: Any, local: Any) -> float:
 
     local  a system that is true around its origin
     """
-
     xs, ys = to_crs(local, crs, [0.0, 1000.0, 0.0], [0.0, 0.0, 1000.0])
     sides = [math.hypot(xs[n] - xs[0], ys[n] - ys[0]) / 1000.0 for n in (1, 2)]
     return max(sides, key=lambda side: abs(math.log(side)) if 0 < side < math.inf else math.inf)
@@ -162,7 +157,6 @@ def is_local(crs: Any) -> bool:
 
 def degrees_of(crs: Any) -> Any:
     """Latitude and longitude on the body on which a system lies: WGS 84 on the Earth."""
-
     return rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
 
 
@@ -178,14 +172,8 @@ def _shape_of(crs: Any) -> str:
 
 
 def crs_name(crs: Any) -> str:
-    """Returns the name of a rasterio CRS for people: EPSG:32632, or +proj=..., or the beginning of its text."""
-    if is_local(crs):
-        return "a local system"
-    text = str(crs.to_string())
-    if not text.startswith("EPSG:") and crs.to_epsg() is None:
-        known = crs.to_dict()
-        if known.get("proj"):
-            text = " ".join(f"+{key}={known[key]}" for key in ("proj", *_SHOWN) if known.get(key))
+    """Returns the name of a rasterio CRS for people: EPSG:32632, or the beginning of its text."""
+    text = "a local system" if is_local(crs) else _system(crs)
     return text if len(text) < 60 else text[:57] + "..."
 
 
@@ -314,10 +302,11 @@ def plan_grid(
 
 def _system(crs: Any) -> str:
     """Text of a system in a GridSpec: as short as means the same."""
-
+    if is_local(crs):
+        return "local"
     short = crs.to_proj4().replace("=True", "")
-    is_short = not crs.to_epsg() and not is_local(crs) and rasterio.CRS.from_proj4(short) == crs
-    return "local" if is_local(crs) else short if is_short else str(crs.to_string())
+    is_short = short and not crs.to_epsg() and rasterio.CRS.from_proj4(short) == crs
+    return short if is_short else str(crs.to_string())
 
 
 def check_size(rows: int, cols: int, what: str) -> None:

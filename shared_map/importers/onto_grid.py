@@ -21,6 +21,11 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 
+def transform_of(grid: GridSpec) -> Any:
+    """The affine transform from (col, row) of a grid to metres."""
+    return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
+
+
 @dataclass(frozen=True, eq=False)
 class Placed:
     """Transformation of a raster onto the grid of a terrain.
@@ -55,22 +60,14 @@ class Placed:
         grid, dataset = self.grid, self.dataset
         is_real = np.dtype(dataset.dtypes[0]).kind == "f"
         void = math.nan if dataset.nodata is None and is_real else dataset.nodata
-        place = from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
-        with WarpedVRT(
-            dataset,
-            src_crs=self.crs,
-            src_transform=place if self.is_cells else self.transform,
-            src_nodata=void,
-            crs=self.target,
-            transform=place,
-            width=grid.cols,
-            height=grid.rows,
-            resampling=Resampling.nearest if self.is_cells else Resampling[how],
-            nodata=math.nan,
-            dtype="float32",
-            NUM_THREADS="ALL_CPUS",
-            UNIFIED_SRC_NODATA="YES",  # a photo shows nothing only where no band does
-        ) as cells:
+        resampling = Resampling.nearest if self.is_cells else Resampling[how]
+        place = transform_of(grid)
+        own = place if self.is_cells else self.transform
+        size = {"width": grid.cols, "height": grid.rows, "dtype": "float32", "nodata": math.nan}
+        source = {"src_crs": self.crs, "src_transform": own, "src_nodata": void}
+        # A photo shows nothing only where no band does.
+        target = {"crs": self.target, "transform": place, "NUM_THREADS": "ALL_CPUS", "UNIFIED_SRC_NODATA": "YES"}
+        with WarpedVRT(dataset, resampling=resampling, **source, **target, **size) as cells:
             yield cells
 
 
@@ -96,8 +93,7 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
     if target is None:
         target = crs = rasterio.CRS.from_wkt(METRES)
     share = _overlap(dataset, crs, target, grid, what)
-    place = from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
-    is_cells = crs == target and same_shape and dataset.transform.almost_equals(place, 1e-3)
+    is_cells = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
     return Placed(dataset, grid, dataset.transform, crs, target, share, is_cells)
 
 

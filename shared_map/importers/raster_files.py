@@ -12,7 +12,6 @@ import itertools
 import lzma
 import math
 import re
-import stat
 import tomllib
 import warnings
 import zipfile
@@ -368,20 +367,12 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
     for node in root.iter():
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
             continue
-        name = (node.text or "").strip()
-        try:
-            ordinary = not name.startswith("/vsi") and stat.S_ISREG((path.parent / name).stat().st_mode)
-        except (OSError, ValueError):
-            ordinary = False
-        if not ordinary:
-            raise TerrainError(f"{what} names {name[:LONGEST_REASON]!r}; expected a file that lies on this machine")
-        source = path.parent / name
+        source = path.parent / (node.text or "").strip()
+        check_file(source, FileKind.VIRTUAL_RASTER)
         with source.open("rb") as file:
             head = file.read(_HEAD_BYTES)
-        # GDAL knows other kinds, also of the network.
-        _driver(head, source.suffix.lower(), f"{what}: {source}")
-        virtual = b"<VRTDataset" in head  # anywhere, for GDAL
-        if virtual:
+        _driver(head, source.suffix.lower(), f"{what}: {source}")  # GDAL knows other kinds, also of the network
+        if b"<VRTDataset" in head:  # anywhere, for GDAL
             if depth >= _DEEPEST:
                 raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
             if source not in known:
@@ -401,14 +392,10 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     """Returns how many times over the pixels of a band are painted, at least once."""
     try:
         cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
-        sources = [node for node in band if node.tag.endswith("Source")]
-        painted = 0.0
-        for source in sources:
-            place = source.find("DstRect")
-            if place is None:
-                painted += cells
-            else:
-                painted += abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
+        places = [node.find("DstRect") for node in band if node.tag.endswith("Source")]
+        painted = cells * places.count(None)
+        for place in places:
+            painted += 0 if place is None else abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
     except ValueError:
         return 1.0  # GDAL states the fault
     return max(painted / cells, 1.0)

@@ -201,7 +201,6 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
     An image without a place lies where its path says if that is the path of a tile of a web map, zoom/x/y.png. Else
     it lies anywhere, in metres, as numbers of our own reading do that have no system.
     """
-
     what = f"terrain {path}"
     coded = holds.is_cover or holds.encoding is not None
     own = dataset.tags().get(NOTES)

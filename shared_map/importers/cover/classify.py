@@ -113,7 +113,6 @@ def _line_strength(rgb: Bytes, row0: int, row1: int, part: slice) -> Bytes:
 def _lakes(wetness: Bytes, elevation_m: Floats, resolution_m: float) -> Bools:
     """Patches of likely water of which a fifth is certain, and that are level. If a shadow covers a shore the patch
     is no lake; then its still part, and the shore of that."""
-
     likely = (wetness & rules.LIKELY) > 0
     lakes, tilted = _patches(likely, wetness, elevation_m, resolution_m)
     if tilted.any():
@@ -124,7 +123,6 @@ def _lakes(wetness: Bytes, elevation_m: Floats, resolution_m: float) -> Bools:
 
 def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats, resolution_m: float) -> tuple[Bools, Bools]:
     """(level, tilted) patches; small ones are puddles or shadows of houses and are neither."""
-
     labels, count = ndimage.label(likely)
     sizes = counted(labels, count + 1)
     certain = counted(labels, count + 1, (wetness & rules.CERTAIN) > 0)

@@ -135,18 +135,10 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
         return Cover(classes, factor, known, (*notes, *_told(what, meaning, counts, states)))
 
 
-_STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
-"""Rows of the look-up after those of all codes."""
-
-
-def _entries(codes: NDArray[Any]) -> NDArray[np.intp]:
-    """Returns the table index of each value: a code at itself, an unknown code at _STRANGE, no data at _EMPTY."""
-    with np.errstate(invalid="ignore"):
-        empty = ~(codes >= 0) | (codes == cover_codes.NOTHING) | (codes == np.inf)
-        strange = ~empty & (codes > HIGHEST_CODE)
-        at: NDArray[np.intp] = np.where(empty | strange, 0, codes).astype(np.intp)
-    at[strange], at[empty] = _STRANGE, _EMPTY
-    return at
+def _entries(codes: Floats) -> NDArray[np.intp]:
+    """The entry of the look-up for each value: a code itself, NO_COLOUR of a larger number, else NOTHING."""
+    empty = ~(codes >= 0) | (codes == cover_codes.NOTHING) | (codes == np.inf)
+    return np.where(empty, cover_codes.NOTHING, np.minimum(codes, cover_codes.NO_COLOUR)).astype(np.intp)
 
 
 def _look_up(table: cover_codes.CoverTable) -> tuple[Bytes, Floats, Bytes]:
@@ -157,7 +149,7 @@ def _look_up(table: cover_codes.CoverTable) -> tuple[Bytes, Floats, Bytes]:
     for code, ground in table.grounds.items():
         if code <= HIGHEST_CODE:
             kinds[code], factors[code], states[code] = ground.kind, ground.factor, 0
-    states[[code for code in table.nothing if code <= HIGHEST_CODE] + [_EMPTY]] = 2
+    states[[code for code in table.nothing if code <= HIGHEST_CODE] + [cover_codes.NOTHING]] = 2
     return kinds, factors, states
 
 
@@ -298,7 +290,6 @@ class Evidence:
 def evidence_of(dataset: Any, sample: NDArray[Any]) -> Evidence:
     """Returns the evidence in a file of one band; `sample` has codes of some of its cells, (cells,), no-data left
     out."""
-
     codes, cells = np.unique(sample, return_counts=True)
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     palette = {code: colour[:3] for code, colour in dataset.colormap(1).items()} if has_palette else {}
@@ -428,7 +419,6 @@ def why_unknown(dataset: Any, what: str) -> str:
 
 def is_drawn(path: Path, config: TerrainConfig) -> bool:
     """True if an image that is named as a photo is a map of land cover, in a legend's colours or with its codes."""
-
     with opened(path, "photo") as dataset:
         if dataset.count >= 3:
             return cover_codes.legend_of(sampled_colours(dataset), f"photo {path}") is not None

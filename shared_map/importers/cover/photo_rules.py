@@ -221,7 +221,6 @@ def line_strength(rgb: Bytes) -> Bytes:
     uint8 (rows, cols), tenths of a grey level
         0 where there is no crest. The outer `REACH` rows and columns are found from less of the photo.
     """
-
     # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.
     grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
     smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * _FIXED).astype(np.int16)
@@ -270,7 +269,6 @@ def long_lines(strength: Bytes) -> Bools:
     -------
     bool (rows, cols)
     """
-
     strong = strength >= _STRONG
     labels, count = ndimage.label(spread(strong, (1, 1)), np.ones((3, 3), np.int8))
     sizes = counted(labels, count + 1, strong)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
-from shared_map.array_files import Bools, Bytes
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, sampled
@@ -19,7 +19,7 @@ from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
-MOST_SIDE = 1024
+_MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
 _STRETCHED_CELLS = 1 << 18
 """Sample of 512 x 512 pixels, from which a percentile is known to a thousandth."""
@@ -88,6 +88,14 @@ def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
     low, high = _stretch(dataset, indexes, notes)
     if len(indexes) == 1 and palette is None:
         notes.append("the photo is grey: without colour, what covers the ground is a guess")
+
+    def colours(raw: Floats) -> Bytes:
+        if high > low:
+            raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
+        stored = raw.astype(np.uint8)
+        rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
+        return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
+
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
     how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
@@ -95,36 +103,22 @@ def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
         for row0, row1 in bands(grid.rows, READ_ROWS):
             raw = cells.read(indexes, window=((row0, row1), (0, grid.cols)))
             inside = ~np.isnan(raw).any(axis=0)
-            raw[:, ~inside] = 0
-            if high > low:
-                raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
-            colours = raw.astype(np.uint8)
-            shown = np.moveaxis(colours, 0, -1) if palette is None else palette[colours[0]]
-            seen[row0:row1], rgb[row0:row1] = inside, np.where(inside[..., None], shown, 0)
+            seen[row0:row1] = inside
+            rgb[row0:row1] = colours(np.where(inside, raw, 0)) * inside[..., None]
             progress("reading photo", row1 / grid.rows)
     if not seen.any():
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    other = _why_drawn(dataset, indexes, palette) or why_not_true_colour(rgb, seen)
+    # Looked for in the file's own pixels: between two colours of a legend an interpolation makes others.
+    middle = middle_of(dataset, _MOST_SIDE)
+    own = np.nan_to_num(dataset.read(indexes, window=middle).astype(np.float32))
+    other = why_not_true_colour(colours(own), dataset.dataset_mask(window=middle) > 0)
     return Photo(rgb, seen, tuple(notes), other)
-
-
-def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:
-    """Looked for in the file's own pixels, in its middle."""
-    if len(indexes) == 1 and palette is None:
-        return None
-    if any(dataset.dtypes[index - 1] != "uint8" for index in indexes):
-        return None
-    window = middle_of(dataset, MOST_SIDE)
-    stored = dataset.read(indexes, window=window)
-    rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
-    return why_drawn(rgb, dataset.dataset_mask(window=window) > 0)
 
 
 def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
     """Returns which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
-
     meanings = list(dataset.colorinterp)
     wanted = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
     if all(colour in meanings for colour in wanted):
@@ -150,9 +144,6 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     return low, max(high, low + 1e-9)
 
 
-# --- true colour or not -------------------------------------------------------------------------------------
-
-
 def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
     """Returns the kind of an image that is not a true-colour photo, for people; None if it may be one.
 
@@ -168,33 +159,14 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
         A map with a legend has few colours, in areas. In images that show near infrared as red, plants are red,
         with as much green as blue; the reds of true ground have more green than blue.
     """
-    drawn = why_drawn(rgb, seen)
-    if drawn is not None:
-        return drawn
-    red, green, blue = np.moveaxis(_middle(rgb).astype(np.int32), -1, 0)
-    lit = _middle(seen) & (red + green + blue > _DARK)
+    same = (rgb[1:, 1:] == rgb[:-1, 1:]).all(axis=2) & (rgb[1:, 1:] == rgb[1:, :-1]).all(axis=2)
+    count = np.unique(joined(np.moveaxis(rgb, -1, 0))[seen]).size
+    if 1 < count <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
+        return f"a drawn map: it has {count} colours, in areas"
+    red, green, blue = np.moveaxis(rgb.astype(np.int32), -1, 0)
+    lit = seen & (red + green + blue > _DARK)
     false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit
     share = false.sum() / max(int(lit.sum()), 1)
     if share > _FALSE_SHARE:
         return f"in false colour: {share:.0%} of it is as red as plants are where near infrared is shown as red"
     return None
-
-
-def why_drawn(rgb: Bytes, seen: Bools) -> str | None:
-    """Returns a sentence that an image is a drawn map; None if it may be a photo. Arguments as of
-    `why_not_true_colour`.
-
-    Pixels must be the file's own, or copies of them: between two colours of a legend an interpolation makes others.
-    """
-    some = _middle(rgb)
-    same = (some[1:, 1:] == some[:-1, 1:]).all(axis=2) & (some[1:, 1:] == some[1:, :-1]).all(axis=2)
-    colours = np.unique(joined(np.moveaxis(some, -1, 0))[_middle(seen)]).size
-    if 1 < colours <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
-        return f"a drawn map: it has {colours} colours, in areas"
-    return None
-
-
-def _middle(array: NDArray[Any]) -> NDArray[Any]:
-    """At most `MOST_SIDE` rows and columns in the middle of an array."""
-    row0, col0 = (max(side - MOST_SIDE, 0) // 2 for side in array.shape[:2])
-    return array[row0 : row0 + MOST_SIDE, col0 : col0 + MOST_SIDE]

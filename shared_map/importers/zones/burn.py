@@ -49,7 +49,6 @@ def burn(
 
     Raises TerrainError, which `what` begins, if shapes lie upon each other too often.
     """
-
     if not drawing:
         return Window(0, 0, 0, 0), np.zeros((0, 0), np.float32)
     shapes = np.array([each.shape for each in drawing], object)
@@ -92,7 +91,6 @@ def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, w
 
 def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
     """Polygons as they are, lines and points as areas, long ones in pieces; and of which shape each is a part."""
-
     of = np.arange(len(shapes))
     long = np.flatnonzero((halves > 0) & (shapely.get_num_coordinates(shapes) > _PIECE)) if len(shapes) else of
     if len(long):
@@ -129,7 +127,6 @@ def _rasterize(
 def _parts(shape: Any) -> list[Any]:
     """A shape in pieces that GDAL burns in a bounded time: a polygon of very many corners is cut along rows of
     cells."""
-
     west, north, east, south = shape.bounds
     heavy = shapely.get_num_coordinates(shape) * (south - north) > _HEAVY
     if shape.geom_type != "Polygon" or not heavy or south - north < 2:

@@ -119,36 +119,26 @@ class _Worth:
     def __init__(self, zone: ZoneConfig, layer: Layer, facts: FileFacts) -> None:
         self._zone, self._layer, self._facts = zone, layer, facts
         self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
-        self._by_class = bool(zone.classes) or (self._kind is not None and not self._is_plain())
-        self.columns = [*TAGS, *PACKED, *(column for column in layer.columns if states_extent(column))]
-        listed, name = self._listed(), zone.attribute
-        if name is not None:
-            if not {name, *PACKED} & set(layer.columns):
-                raise TerrainError(f"{layer.what} has no column {name!r}; it has {listed}")
-            self.columns.append(name)
-        elif self._kind is not None:
-            self.columns += COLUMNS[self._kind]
-        elif zone.classes:
-            raise TerrainError(f"{layer.what}: classes need an attribute; the columns are {listed}")
-        elif zone.kind in ("pace", "factor") and zone.value is None:
-            key = "factor" if zone.kind == "factor" else "pace_s_per_m"
-            raise TerrainError(
-                f"{layer.what}: set {key}, or attribute to the column that holds it; the columns are {listed}"
-            )
-        if zone.classes and zone.kind == "pace":
-            raise TerrainError(f"{layer.what}: classes have factors, which kind pace does not take")
-
-    def _is_plain(self) -> bool:
-        """True if each line is a road or a river of one width, as nothing tells of classes."""
-        zone, assumed = self._zone, COLUMNS[self._kind or "road"]
-        if zone.attribute is not None or {*assumed, *PACKED} & set(self._layer.columns):
-            return False
-        if zone.width_m is None:
-            raise TerrainError(
-                f"{self._layer.what} has no column {' or '.join(assumed)} (it has {self._listed()}); set attribute"
-                " to the column with the classes, or width_m, which takes each feature for one of this width"
-            )
-        return True
+        name, assumed = zone.attribute, () if self._kind is None else COLUMNS[self._kind]
+        has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
+        self._by_class = bool(zone.classes) or (self._kind is not None and has_classes)
+        key = "factor" if zone.kind == "factor" else "pace_s_per_m"
+        self.columns = [*TAGS, *PACKED, *assumed, *filter(states_extent, layer.columns), *([name] if name else ())]
+        for is_wrong, why in (
+            (name is not None and {name, *PACKED}.isdisjoint(layer.columns), f"has no column {name!r}"),
+            (zone.classes and zone.kind == "pace", "has classes with factors, which kind pace does not take"),
+            (zone.classes and name is None and self._kind is None, "has classes; set attribute to their column"),
+            (
+                self._kind is not None and not has_classes and zone.width_m is None,
+                f"has no column {' or '.join(assumed)}; set attribute to the column with the classes, or width_m",
+            ),
+            (
+                zone.kind in ("pace", "factor") and not zone.classes and name is None and zone.value is None,
+                f"has no {zone.kind}; set {key}, or attribute to the column that holds it",
+            ),
+        ):
+            if is_wrong:
+                raise TerrainError(f"{layer.what} {why}; it has the columns {self._listed()}")
 
     def _listed(self) -> str:
         columns = self._layer.columns
@@ -169,8 +159,7 @@ class _Worth:
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
                 said = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
-                inside = self.closes and said.lower() in ("yes", "true", "1")
-                ways[key] = way, bridge, inside
+                ways[key] = way, bridge, self.closes and said.lower() in ("yes", "true", "1")
             way, bridge, inside = ways[key]
             if way is not None:
                 if inside and not way.width_m and shape.geom_type != "Polygon":
@@ -184,7 +173,7 @@ class _Worth:
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
         zone, kind = self._zone, self._kind
-        name = self._class_of(tags) if self._by_class else ""
+        name = way_classes.class_of(kind, tags, zone.attribute) if self._by_class else ""
         if name is None:
             self._facts.skip("without a class")
             return None
@@ -212,12 +201,6 @@ class _Worth:
             own_m = None
         return Way(own_m or zone.width_m or way.width_m, None if closes else way.factor)
 
-    def _class_of(self, tags: dict[str, str]) -> str | None:
-        attribute = self._zone.attribute
-        return (
-            tags.get(attribute or "") if self._kind is None else way_classes.class_of(self._kind, tags, attribute)
-        )
-
     def _stated(self, tags: dict[str, str], id: str) -> Way | None:
         """The value that a feature's own attribute states."""
         name = self._zone.attribute or ""
@@ -230,14 +213,12 @@ class _Worth:
 
     def check_used(self) -> None:
         """Raises TerrainError if features are on the terrain, and none counts for what they are."""
-        facts = self._facts
-        if facts.used:
-            return
-        reasons = ", ".join(f"{count} {why}" for why, count in facts.skipped.most_common(4))
-        raise TerrainError(
-            f"{self._layer.what}: none of its features on the terrain counts ({reasons}); set attribute and"
-            f" classes, the columns are {self._listed()}"
-        )
+        reasons = ", ".join(f"{count} {why}" for why, count in self._facts.skipped.most_common(4))
+        if not self._facts.used:
+            raise TerrainError(
+                f"{self._layer.what}: none of its features on the terrain counts ({reasons}); set attribute and"
+                f" classes; it has the columns {self._listed()}"
+            )
 
 
 # --- areas for orders -----------------------------------------------------------------------------------------

@@ -90,7 +90,6 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
     Raises TerrainError with one sentence, which `what` begins, if the file is missing, too large, damaged, of
     another kind, or holds several layers and none is named.
     """
-
     source, kind = _source(path, what)
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # which takes new, negative ids for damage
     with _refused(what):
@@ -129,7 +128,6 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
     Raises TerrainError, which names the feature, if one has no shape, or a part of it none, or a coordinate is no
     number: GDAL leaves out of a shape what it cannot read. Raises it if the file is damaged.
     """
-
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
     for first in range(0, 1 << 31, _CHUNK):
         with _refused(layer.what), np.errstate(all="ignore"):
@@ -170,7 +168,6 @@ def unusable(what: str, id: str, why: str) -> TerrainError:
 
 def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, empty ones too, and of which each is a part."""
-
     of = np.arange(len(geometries))
     parts = np.asarray(geometries, object)
     while (several := (shapely.get_type_id(parts) > _POLYGONS) & ~shapely.is_empty(parts)).any():

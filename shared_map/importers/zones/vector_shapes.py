@@ -221,7 +221,6 @@ def _shown(box: Box) -> str:
 
 def _jumps(geometry: Any) -> bool:
     """Returns True if an edge spans more than half of the globe, and not all of it."""
-
     parts, _ = _simple(np.array([geometry], object))
     for part in parts:
         for ring in shapely.get_rings(part) if part.geom_type == "Polygon" else [part]:
@@ -233,7 +232,6 @@ def _jumps(geometry: Any) -> bool:
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, without empty ones, and of which each is a part."""
-
     parts, of = parts_of(geometries)
     kept = ~shapely.is_empty(parts)
     return parts[kept], of[kept]
@@ -246,7 +244,6 @@ def _mended(
 
     Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
     """
-
     shapes = features.shapes.copy()
     polygons = near & (shapely.get_type_id(shapes) == _POLYGONS)
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
@@ -262,7 +259,6 @@ def _mended(
 
 def _crossings(polygon: Any) -> float:
     """Estimates the crossings of a polygon's edges from a sample: counting all takes as long as the repair."""
-
     points = shapely.get_coordinates(polygon)
     edges = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
     some = edges[np.unique(np.linspace(0, len(edges) - 1, 200).astype(np.intp))]
