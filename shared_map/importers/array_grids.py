@@ -156,9 +156,7 @@ def read_map(path: Path) -> LevelMap:
         if marker != "map":
             raise ValueError(marker)
     except (ValueError, KeyError) as error:
-        raise TerrainError(
-            f"terrain {path} is no MovingAI map: it must begin with type, height, width, map"
-        ) from error
+        raise TerrainError(f"terrain {path} is no MovingAI map, which has type, height, width, map") from error
     check_cells(rows, cols, f"terrain {path}")
     letters = np.full(256, np.nan, np.float32)
     letters[list(b".GS")], letters[list(b"@OTW")] = 1.0, np.inf
@@ -209,9 +207,7 @@ def read_ros(path: Path) -> LevelMap:
     west, south, *turned = found.origin
     image, occupied, free = path.parent / found.image, found.occupied_thresh, found.free_thresh
     if turned and abs(turned[0]) > 1e-9:
-        raise TerrainError(
-            f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image and set it to 0"
-        )
+        raise TerrainError(f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image instead")
     if free > occupied:
         raise TerrainError(f"terrain {path}: thresholds are {free:g}, {occupied:g}; expected free <= occupied")
     if not image.is_file():

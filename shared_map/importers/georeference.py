@@ -242,13 +242,10 @@ def plan_grid(
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
     if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
-        raise TerrainError(
-            f"{what} has pixels without a size ({tuple(transform)[:6]}); its georeference is damaged"
-        )
+        raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
     if not crs.is_geographic and not crs.is_projected and not is_local(crs):
         raise TerrainError(
-            f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
-            " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
+            f"{what} is in {crs_name(crs)}, without metres or degrees: reproject it, or set terrain.crs"
         )
     degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
@@ -265,7 +262,7 @@ def plan_grid(
     if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:
         raise TerrainError(
             f"{what} lies around latitude {(south + north) / 2:.4g}, where degrees of longitude have no width;"
-            " reproject it to a polar system (gdalwarp -t_srs EPSG:3413, in the south EPSG:3031)"
+            " gdalwarp -t_srs EPSG:3413 (in the south EPSG:3031) helps"
         )
     target = metric_crs(crs, (west + east) / 2, (south + north) / 2, north - south)
     if (
@@ -274,7 +271,7 @@ def plan_grid(
     ):
         raise TerrainError(
             f"{what} spans {north - south:.4g} x {east - west:.4g} degrees: no flat grid is true over more than"
-            f" {MAX_SPAN_DEG:g}; crop it, or reproject it to metres yourself"
+            f" {MAX_SPAN_DEG:g}; crop it"
         )
     width, height = pixel_m(transform, rows, cols, crs, target)
     notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
@@ -292,9 +289,7 @@ def plan_grid(
     west, south, east, north = bounds_in(transform, rows, cols, crs, target)
     high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
     if high < 1 or wide < 1:
-        raise TerrainError(
-            f"{what} is {north - south:.3g} m x {east - west:.3g} m: no cell of {resolution:g} m fits"
-        )
+        raise TerrainError(f"{what} is {north - south:.3g} x {east - west:.3g} m: no cell of {resolution:g} m fits")
     check_size(high, wide, what)
     notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
     return GridSpec(high, wide, resolution, west, north, _system(target)), target, notes

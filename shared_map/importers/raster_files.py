@@ -236,9 +236,7 @@ def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | N
     if driver == "GRASSASCIIGrid":  # of which GDAL reads a part only
         turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(said.get(key, b""))]
         if turned or said.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
-            raise TerrainError(
-                f"{what}: its header has degrees and minutes or a multiplier; r.out.gdal writes a .tif"
-            )
+            raise TerrainError(f"{what}: its header has degrees and minutes or a multiplier; write it as a .tif")
     return number, void
 
 
@@ -254,14 +252,9 @@ def _check_size(dataset: Any, what: str) -> None:
     """Refuses what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
     if dataset.count == 0:
         held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
-        raise TerrainError(
-            f"{what} holds several rasters ({', '.join(held)}), expected one: gdal_translate takes one out"
-        )
+        raise TerrainError(f"{what} holds several rasters ({', '.join(held)}): gdal_translate takes one out")
     if any(dtype.startswith("complex") for dtype in dataset.dtypes):
-        raise TerrainError(
-            f"{what} holds complex numbers ({dataset.dtypes[0]}), expected real ones: gdal_calc --calc 'A.real'"
-            " makes such a file"
-        )
+        raise TerrainError(f"{what} holds complex numbers ({dataset.dtypes[0]}), expected real ones")
     rows, cols = dataset.height, dataset.width
     most = _MAX_PIXELS if "by_rows" in _FORMATS[dataset.driver] else MAX_CELLS
     if rows * cols > most:
@@ -293,10 +286,7 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
     driver = _driver(head, path.suffix.lower(), what)
     length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
-        raise TerrainError(
-            f"{what} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
-            f" {_HGT_BYTES[0]}, one of 3601 has {_HGT_BYTES[1]}"
-        )
+        raise TerrainError(f"{what} is truncated or no .hgt: it has {length} bytes, expected one of {_HGT_BYTES}")
     if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
         raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
@@ -324,9 +314,7 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
             files = [each for each in archive.infolist() if not each.is_dir()]
             named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
             if len(named) != 1:
-                raise TerrainError(
-                    f"{what} holds {len(named)} files of the kinds {', '.join(endings)}, expected one: unpack it"
-                )
+                raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")
             parts = [each for each in files if Path(each.filename).stem == Path(named[0]).stem]
             unpacked = sum(each.file_size for each in parts)
             if unpacked > kind.most_bytes:
@@ -381,10 +369,7 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
             nested = max(nested, known[source])
     times = nested * max((_painted(root, band) for band in root.iter("VRTRasterBand")), default=1.0)
     if times > _MOST_TIMES:
-        raise TerrainError(
-            f"{what} paints its pixels {times:.0f} times over, as its sources overlap; at most {_MOST_TIMES} times"
-            " are read: gdal_translate makes one file of it"
-        )
+        raise TerrainError(f"{what} paints its pixels {times:.0f} times over; at most {_MOST_TIMES} times are read")
     return times
 
 

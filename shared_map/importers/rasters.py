@@ -140,8 +140,7 @@ def _of_colours(dataset: Any, what: str) -> Contents:
     if legend_of(land_cover.sampled_colours(dataset), what) is not None:
         return Contents(is_cover=True)
     raise TerrainError(
-        f"{what} has {dataset.count} bands: a photo? Name it in terrain.photo; of heights stored as colours"
-        f" say {settings}"
+        f"{what} has {dataset.count} bands: a photo? Name it in terrain.photo; of coded heights say {settings}"
     )
 
 
@@ -307,8 +306,7 @@ def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
     """The whole first band, as stored; NaN where there is no height."""
     if dataset.height * dataset.width > MAX_CELLS:
         raise TerrainError(
-            f"{what} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too large to"
-            " correct here: gdal_calc or gdal_edit.py -a_nodata does it"
+            f"{what} has undeclared voids ({', '.join(f'{v:g}' for v in voids)}): gdal_edit.py -a_nodata"
         )
     heights: Floats = dataset.read(1).astype(np.float32)
     heights[dataset.read_masks(1) == 0] = np.nan
@@ -399,12 +397,11 @@ def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> tuple[Float
     what = f"terrain {path}"
     if not _is_colours(dataset):
         raise TerrainError(
-            f"{what} has {dataset.count} bands of {dataset.dtypes[0]}; {TITLES[encoding]} is three bands of uint8"
+            f"{what} has {dataset.count} bands of {dataset.dtypes[0]}; {TITLES[encoding]} has three of uint8"
         )
     if _is_lossy(dataset):
         raise TerrainError(
-            f"{what} is compressed with loss, which spoils heights stored as colours; fetch it as PNG or"
-            " lossless WebP"
+            f"{what} is compressed with loss, which spoils heights stored as colours; fetch it as PNG"
         )
     rows, cols = dataset.height, dataset.width
     if rows * cols > _MOST_CELLS:

@@ -162,8 +162,7 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     resolution_m = found.step_m or config.resolution_m or 1.0
     if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
         raise TerrainError(
-            f"terrain {path} has cells of {resolution_m:g} m and cannot be resampled without closing gaps;"
-            " leave terrain.resolution_m out"
+            f"terrain {path} cannot be resampled without closing gaps; leave terrain.resolution_m out"
         )
     factor = found.factor
     factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
@@ -188,7 +187,7 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.level_ground import HIGHEST_M, fill_voids, voids_of
+    from shared_map.importers.level_ground import fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
@@ -201,8 +200,7 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     if share == 1.0 and np.isfinite(some_m).any():
         found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
         raise TerrainError(
-            f"terrain {config.source} has heights of {found} m, expected at most {HIGHEST_M:g}: of centimetres set"
-            " terrain.height_scale = 0.01"
+            f"terrain {config.source} has heights of {found} m: of centimetres set terrain.height_scale = 0.01"
         )
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")

@@ -107,9 +107,7 @@ def _layout(path: Path, what: str) -> _Layout:
     except ValueError:
         x, y, z = (next((words.index(name) for name in names if name in words), None) for names in (_X, _Y, _Z))
         if x is None or y is None or z is None:
-            raise TerrainError(
-                f"{what}, line {number}: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
-            ) from None
+            raise TerrainError(f"{what}, line {number}: {first[:60]!r} names no x, y, z or lon, lat, z") from None
         degrees = words[x] in _DEGREES and words[y] in _DEGREES
         return _Layout(path, what, delimiter, number, (x, y, z), degrees)
     is_xyz = path.suffix.lower() == ".xyz" or words[3:] in ([], [""])

@@ -184,9 +184,7 @@ def table_named(name: str) -> CoverTable:
         return TABLES[name]
     path = Path(name)
     if not path.is_file():
-        raise TerrainError(
-            f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file of code and class"
-        )
+        raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
     return read_cover_table(path)
 
 

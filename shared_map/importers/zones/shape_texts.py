@@ -201,7 +201,7 @@ def checked_xml(data: bytes, what: str) -> None:
             for place in places:
                 if len(place) not in (2, 3) or not all(_is_number(each) for each in place):
                     raise TerrainError(
-                        f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers; repair it"
+                        f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers"
                     )
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
@@ -230,9 +230,7 @@ def checked_xml(data: bytes, what: str) -> None:
             raise TerrainError(f"{what}: relation {area} cannot be used: its ways form no closed ring; repair it")
     for absent in needed.keys() - known:
         user = needed[absent]
-        raise TerrainError(
-            f"{what} is not complete: {user} needs {absent[0]} {absent[1]}; load it with all it needs"
-        )
+        raise TerrainError(f"{what} is not complete: {user} needs {absent[0]} {absent[1]}")
 
 
 def _is_area(relation: ElementTree.Element) -> bool:

@@ -156,8 +156,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
         if len(numbers) < _CHUNK:
             if first + len(numbers) != layer.count:
                 raise TerrainError(
-                    f"{layer.what} is damaged: it holds {layer.count} features, of which {first + len(numbers)} are"
-                    " read; ogr2ogr makes a copy of these"
+                    f"{layer.what} is damaged: of its {layer.count} features {first + len(numbers)} are read"
                 )
             return
 

@@ -159,8 +159,7 @@ class Placing:
             self._corners += int(shapely.get_num_coordinates(features.shapes[near]).sum())
             if self._features > MOST_FEATURES or self._corners > MOST_CORNERS:
                 raise TerrainError(
-                    f"{self.layer.what} has more than {MOST_FEATURES} features or {MOST_CORNERS} corners on the"
-                    " terrain; crop, dissolve or simplify it"
+                    f"{self.layer.what} has over {MOST_FEATURES} features or {MOST_CORNERS} corners; simplify it"
                 )
             of = features.of[near]
             shapes, of, mended = _mended(features, near, self.layer.what)
@@ -198,7 +197,7 @@ class Placing:
             yield
         except (RasterioError, CPLE_BaseError) as error:
             raise TerrainError(
-                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system; is crs right?"
+                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system"
             ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:

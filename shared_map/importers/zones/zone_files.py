@@ -109,8 +109,7 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     if known.size and not LEAST <= known.min() <= known.max() <= MOST:
         worst = known.min() if known.min() < LEAST else known.max()
         raise TerrainError(
-            f"{what} holds {worst:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf where nothing"
-            " drives; declare what stands for no value as nodata"
+            f"{what} holds {worst:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf where nothing drives"
         )
     count = int(known.size + lethal.sum())
     if not count:

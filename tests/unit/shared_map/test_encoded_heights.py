@@ -144,7 +144,7 @@ def test_the_setting_wins_and_what_it_cannot_mean_is_refused(tmp_path: Path) -> 
     with pytest.raises(TerrainError, match="has 3 bands"):
         load(path, elevation_encoding="metres")
     grey = written(tmp_path / "grey.tif", hills(1, 300))
-    with pytest.raises(TerrainError, match="has 1 bands of float32; Terrarium is three bands of uint8"):
+    with pytest.raises(TerrainError, match="has 1 bands of float32; Terrarium has three of uint8"):
         load(grey, elevation_encoding="terrarium")
     png = tile(tmp_path / "a.png", image, "PNG")
     with pytest.raises(TerrainError, match=r"does not say how large a cell is; set terrain\.resolution_m"):

@@ -126,7 +126,7 @@ def test_empty_fields_and_nan_are_voids(tmp_path: Path) -> None:
     [
         ("", "holds no numbers"),
         ("# nothing\n\n", "holds no numbers"),
-        ("a,b,c\n1,2,3\n", "line 1: 'a,b,c' are no numbers, and name no x, y, z"),
+        ("a,b,c\n1,2,3\n", "line 1: 'a,b,c' names no x, y, z"),
         ("x,y,z\n1,2,3\n2,x,3\n", "line 3: could not convert string 'x'"),
         ("x,y,z\n1,2,3\n2,3\n", "line 3: invalid column index 2; expected x, y and z"),
         ("1,2,3,4\n1,2,3\n", "is ragged: line 2 has 3 heights, others 4"),
