@@ -12,8 +12,6 @@ from swarm.config.agents import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
 from swarm.liveness import ranked_id
 
-Restart = Literal["always", "never"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Role:
@@ -134,15 +132,13 @@ only. Every plan of machines has one, and keeps it on the machine of its store."
 class ProcessSpec:
     """One row of the table.
 
-    entry    `module:function`, called as function(setup, stop_when)
-    restart  whether it is started again when it crashes
-    added    an operator's order started it: the run goes on without it, whatever keeps it from starting
+    entry  `module:function`, called as function(setup, stop_when)
+    added  an operator's order started it: the run goes on without it, whatever keeps it from starting
     """
 
     role: str
     id: str
     entry: str
-    restart: Restart = "always"
     added: bool = False
 
     @property

@@ -38,8 +38,6 @@ CPU without any query."""
 def route(
     where: Where,
     target: TargetId = None,
-    row: Annotated[int | None, typer.Option(hidden=True)] = None,
-    col: Annotated[int | None, typer.Option(hidden=True)] = None,
     steps: Annotated[int, typer.Option(min=0)] = 0,
     cost: bool = False,
     terrain: str | None = None,
@@ -78,17 +76,16 @@ def route(
 
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png")
     if terrain is not None:
-        if start is None or end is None or target is not None or row is not None or col is not None:
+        if start is None or end is None or target is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
         terrain_routes.print_route(terrain_routes.find_route(terrain, start, end, preset), out, as_json)
         return
     if preset is not None:
         raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
-    by_cell = row is not None and col is not None
     to_place = end is not None and not cost
-    if (target is None) != to_place or (start is None) == (not by_cell) or (cost and out is not None):
+    if (target is None) != to_place or start is None or (cost and out is not None):
         raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
-    place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
+    place = read_place(start, "--from")
     from launch_scripts.commands import swarm_route
 
     goal = None if end is None else read_place(end, "--to")

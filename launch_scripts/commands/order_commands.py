@@ -37,7 +37,6 @@ Id = Annotated[
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
-AsScenario = Annotated[bool, typer.Option(hidden=True)]
 
 
 @command(short, ORDER)
@@ -70,10 +69,7 @@ def resume(where: Where, as_json: AsJson = False) -> int:
 def group(
     name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
     where: Where,
-    targets: Annotated[
-        list[str] | None, typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)
-    ] = None,
-    as_scenario: AsScenario = False,
+    targets: Annotated[list[str], typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)],
     as_json: AsJson = False,
 ) -> int:
     """Set the targets that the vehicles of a group may chase.
@@ -81,22 +77,16 @@ def group(
     swarm order group red t1 t2
 
     name     The group.
-    targets  The targets that it may chase.
+    targets  The targets that it may chase. `swarm order unset groups.NAME` restores those of the scenario.
     """
-    chosen = list(targets or ())
-    if chosen[:1] == ["targets"]:
-        chosen = chosen[1:]
-    if as_scenario == bool(chosen):
-        raise ConfigError(f"group: give targets; `swarm order unset groups.{name}` restores those of the scenario")
-    return give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
+    return give(where, as_json, {"subject": "group", "name": name, "targets": targets})
 
 
 @command(app, name="set", context_settings={"ignore_unknown_options": True})  # a number below 0 is no option
 def set_(
     key: Key,
     where: Where,
-    value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
-    as_scenario: AsScenario = False,
+    value: Annotated[float, typer.Argument(metavar="VALUE")],
     as_json: AsJson = False,
 ) -> int:
     """Change a setting of a running swarm.
@@ -109,9 +99,7 @@ def set_(
     value  Its new value.
     """
     _check_setting(key)
-    if as_scenario == (value is not None):
-        raise ConfigError(f"set: give a value; `swarm order unset {key}` restores that of the scenario")
-    return give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
+    return give(where, as_json, {"subject": "set", "name": key, "value": value})
 
 
 @command(app)

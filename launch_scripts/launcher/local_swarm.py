@@ -349,8 +349,6 @@ class LocalSwarm:
         if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
             expendable = running.spec.added or TABLE[running.spec.role].expendable
             wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
-        if running.spec.restart != "always":
-            wait_s = None
         if wait_s is not None:
             running.due_s = now_s + wait_s
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
