@@ -96,7 +96,7 @@ def set_(
     swarm order set time_scale 5
 
     key    A key of the scenario, such as time_scale.
-    value  Its new value.
+    value  Its new value. `swarm order unset KEY` restores that of the scenario.
     """
     _check_setting(key)
     return give(where, as_json, {"subject": "set", "name": key, "value": value})
