@@ -10,7 +10,9 @@ import msgspec
 
 from swarm.config.agents import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
+from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
+from swarm.wire.fields import check_id
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +171,14 @@ def spec_of(role: str, id: str, *, added: bool = False) -> ProcessSpec:
 def planner_spec(id: str) -> ProcessSpec:
     """The planner of a target that was added while the swarm runs, or one of its standbys."""
     return spec_of("planner", id, added=True)
+
+
+def check_name(option: str, name: str) -> None:
+    """Raises ConfigError if the value of an option cannot be the id of a process, a run or a certificate."""
+    try:
+        check_id(option, name)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
 
 
 LAUNCHER = "launcher"

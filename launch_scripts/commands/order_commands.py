@@ -10,12 +10,14 @@ import json
 import time
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import ORDER, command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, Walk
+from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain
 from swarm.errors import ConfigError
 
@@ -132,8 +134,6 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
 
     swarm order ls --json
     """
-    import msgspec
-
     from swarm.runtime.operator import Operator
     from swarm.runtime.order_book import OrderBook, described
 
@@ -198,8 +198,6 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     orders  fields of `GiveOrder`, or those with a `vehicle` of `SendVehicle`
     at      the place that they are about, if any: becomes their `cell`
     """
-    import msgspec
-
     from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
@@ -242,8 +240,6 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
 
 def checked(kind: type[M], fields: dict[str, Any]) -> M:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
-    import msgspec
-
     from swarm.wire.versions import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}
@@ -258,7 +254,6 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
 def print_obeyed(acknowledged: Acknowledged) -> int:
     """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
-    from launch_scripts.plain_text import unanswered
     from swarm.runtime.operator import OBEY_S
 
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3

@@ -11,11 +11,14 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import NETWORK, from_environment
 from launch_scripts.commands.shared_options import Tls
+from swarm.config.input_files import FileKind, read_text
+from swarm.errors import BusError, ConfigError, SwarmError
 
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
@@ -50,7 +53,6 @@ class Where(Tls):
     @cached_property
     def _found(self) -> NetworkConfig:
         from swarm.config.scenario import NetworkConfig
-        from swarm.errors import ConfigError
 
         if self.connect is not None:
             if self.run is not None:
@@ -63,8 +65,6 @@ class Where(Tls):
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
         wrong option."""
-        import msgspec
-
         from launch_scripts.launcher.options import as_process, with_network
         from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
@@ -91,7 +91,6 @@ class Where(Tls):
         from launch_scripts.observe.latest_messages import run_of_most
         from launch_scripts.observe.run_observer import ask_run
         from swarm.bus.zenoh_bus import open_bus
-        from swarm.errors import BusError
         from swarm.runtime.run_secret import authenticator_of
 
         network = self.network()
@@ -134,14 +133,13 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
     """
     from launch_scripts.observe.run_folder import RUNS, find_run
     from swarm.bus.endpoints import listening
-    from swarm.config import scenario
-    from swarm.errors import BusError
+    from swarm.config.scenario import NetworkConfig
 
     folders = [find_run(name, runs or RUNS)] if name is not None else _newest_first(runs)
     networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
     tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
-        tried.append(("", scenario.NetworkConfig()))
+        tried.append(("", NetworkConfig()))
     # Of runs with the same router only the newest can be connected to it.
     by_router = {network.connect: (run, network) for run, network in reversed(tried)}
     newest_first = sorted(by_router.values(), key=tried.index)
@@ -164,12 +162,8 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
 
 def _network_of(folder: Path) -> NetworkConfig | None:
     """The network of a run, from its scenario as it ran; None if it was simulated or that cannot be read."""
-    import msgspec
-
     from launch_scripts.observe.run_folder import SCENARIO_FILE, run_facts
-    from swarm.config.input_files import FileKind, read_text
     from swarm.config.scenario import NetworkConfig
-    from swarm.errors import SwarmError
 
     try:
         raw = tomllib.loads(read_text(folder / SCENARIO_FILE, FileKind.SCENARIO)).get("network", {})

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,6 +29,8 @@ from shared_map.terrain.slope_rules import (
     slope_factor,
     step_limits_deg,
 )
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 from swarm.config.cost_rules import PRESETS, cost_of_preset
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
@@ -37,9 +39,6 @@ from swarm.config.write import toml_value
 from swarm.errors import ConfigError
 from swarm.files import replacing
 from swarm.grid import GridSpec
-
-if TYPE_CHECKING:
-    from shared_map.terrain.terrain import Terrain
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
@@ -88,9 +87,6 @@ def info(
     cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
     elevation_encoding  Encoding of heights, where the file does not state it.
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
         "cover": cover, "cover_codes": cover_codes, "elevation_encoding": elevation_encoding,
@@ -157,8 +153,6 @@ def cost(
     out            Write seconds per metre as GeoTIFF; lethal is -1.
     vehicle_class  Vehicle class of the scenario.
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
     from shared_map.vehicle_class_grounds import class_terrains
 
     check_target(out, "--out", *_TIFF)
@@ -243,8 +237,6 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    from shared_map.terrain.terrain import build_terrain
-
     check_target(out, "--out", *_TIFF, ".npz")
     check_target(photo, "--photo", *_TIFF)
     check_target(picture, "--picture", ".png")
@@ -345,9 +337,6 @@ def classify(
     labels     Learn from these labels (TOML), and compare with them.
     out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-
     check_target(out, "--out", *_TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
