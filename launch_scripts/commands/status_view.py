@@ -281,15 +281,8 @@ def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], consol
 
 def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:
     """The same for programs."""
-    told = [{name: _rounded(value) for name, value in asdict(each).items()} for each in processes]
+    told = list(map(asdict, processes))
     return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": told}
-
-
-def _rounded(value: Any) -> Any:
-    """A number with two digits of its fraction, if it has any."""
-    if not isinstance(value, float):
-        return value
-    return int(value) if value.is_integer() else round(value, 2)
 
 
 @contextmanager

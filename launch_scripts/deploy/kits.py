@@ -15,7 +15,6 @@ import msgspec
 
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
-from launch_scripts.deploy.hosts import HostName
 from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
@@ -33,21 +32,11 @@ CONTENTS = "contents"
 """The file that names all others of an archive, a line each."""
 
 
-class _ProcessBefore(msgspec.Struct):
-    role: str
-    id: str
-
-
-class _HostBefore(msgspec.Struct):
-    name: HostName
-    processes: tuple[_ProcessBefore, ...]
-
-
 class _Before(msgspec.Struct):
     """Content of an earlier plan."""
 
     run_id: str = ""
-    hosts: tuple[_HostBefore, ...] = ()
+    hosts: tuple[PlannedHost, ...] = ()
 
 
 def write_kits(

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.deploy.hosts import HostConfig, HostsConfig
+from launch_scripts.deploy.hosts import HostConfig, HostName, HostsConfig
 from launch_scripts.process_table import (
     RECORDED_BESIDE,
     ROLES,
@@ -75,7 +75,7 @@ class PlannedHost(msgspec.Struct, frozen=True, kw_only=True):
     has_files  whether it gets the files of the terrain; others ask a keeper for the base map
     """
 
-    name: str
+    name: HostName
     address: str
     cores: float
     processes: tuple[PlannedProcess, ...]

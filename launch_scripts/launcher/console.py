@@ -115,13 +115,13 @@ class Terminal:
         """Returns True if the next summary is due."""
         return time.monotonic() >= self._due_s
 
-    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType]) -> None:
-        """Redraws the table, or prints the line if there is no table."""
+    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType] | None = None) -> None:
+        """Redraws the table, which is the line without one. Prints the line where the terminal has no table."""
         self._due_s = time.monotonic() + (_TABLE_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
             self.say(line())
             return
-        table = table_on(self._console)
+        table = Text(line()) if table_on is None else table_on(self._console)
         with contextlib.suppress(OSError):  # of a closed terminal
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)

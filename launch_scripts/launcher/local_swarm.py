@@ -175,14 +175,6 @@ class LocalSwarm:
     def restarts(self) -> int:
         return sum(running.restarts for running in self.running)
 
-    def by_role(self) -> dict[str, tuple[int, int]]:
-        """Role -> (alive, all), in the order of the table."""
-        counts: dict[str, tuple[int, int]] = {}
-        for running in self.running:
-            alive, every = counts.get(running.spec.role, (0, 0))
-            counts[running.spec.role] = (alive + running.alive, every + 1)
-        return counts
-
     def seen(self) -> list[Process]:
         """Returns the condition of each process. Called by any thread: it waits for nothing."""
         return [running.seen() for running in list(self.running)]
