@@ -40,11 +40,6 @@ def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_the_launcher_never_imports_numba_or_rerun() -> None:
-    program = "import launch_scripts.launcher.up, sys; sys.exit('numba' in sys.modules or 'rerun' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     names = ("ca.pem", "ca.key", "operator.anna.pem", "operator.anna.key")
     files = [tmp_path / name for name in names]

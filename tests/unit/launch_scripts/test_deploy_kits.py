@@ -22,7 +22,7 @@ from launch_scripts.deploy.revocations import revoke
 from launch_scripts.deploy.service_files import UNIT, systemd_files
 from launch_scripts.launcher.options import chosen_processes
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.errors import StoreError
+from swarm.errors import ConfigError, StoreError
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'
 ON_GROUND = (
@@ -52,6 +52,14 @@ def unpacked(plan: Plan, out: Path) -> list[Path]:
         with tarfile.open(archive) as file:
             file.extractall(out / "unpacked", filter="data")
     return [out / "unpacked" / f"swarm-{host.name}" for host in plan.hosts]
+
+
+def test_an_address_of_version_6_is_written_in_brackets_and_standbys_need_machines() -> None:
+    first, other, *_ = planned(machines=hosts("fd00::1", "10.0.0.1", "10.0.0.2")).hosts
+    assert "tls/[fd00::1]:7447" in other.connect
+    assert first.listen == ("tls/[::]:7447",)
+    with pytest.raises(ConfigError, match="'planner' is among the roles of 3 machines, expected at least 4"):
+        planned(f"{SCENARIO}[standbys]\nplanner = 3\n")
 
 
 def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: Path) -> None:

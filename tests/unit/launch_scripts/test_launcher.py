@@ -135,16 +135,6 @@ def test_why_a_process_ended_is_said_and_only_one_that_refuses_is_not_started_ag
     assert ("Traceback" in log) <= (again_s is not None)
 
 
-def test_what_all_roles_wait_for_loads_nothing_slow() -> None:
-    slow = ("numba", "rasterio", "rerun", "scipy", "skimage", "sklearn", "matplotlib")
-    code = (
-        "import sys; from launch_scripts.launcher.preloaded import MODULES;"
-        "missing = [m for m in MODULES if m not in sys.modules]; assert not missing, missing;"
-        f"found = [m for m in {slow!r} if m in sys.modules]; assert not found, found"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[3], timeout=60)
-
-
 def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
