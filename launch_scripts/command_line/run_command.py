@@ -19,6 +19,7 @@ from launch_scripts.plain_text import plain
 from swarm.config.explain import choice, nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
+from swarm.files import discard_output
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
@@ -67,7 +68,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         print(f"swarm: this needs {missing(package)}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:
-        _leave_output()
+        discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
         return 0
     except OSError as error:
         if error.errno in _NO_PATHS and error.filename is not None:
@@ -75,7 +76,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             return ConfigError.exit_code
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
             raise
-        _leave_output()
+        discard_output(1)
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
     except KeyboardInterrupt:
@@ -142,10 +143,3 @@ def _fill_streams() -> None:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
             setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
-
-
-def _leave_output() -> None:
-    """Sends what still waits to be printed nowhere: the interpreter would complain about it at its end."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)

@@ -6,6 +6,7 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -178,7 +179,6 @@ def run_role(
 
     joins  vehicles that the scenario does not have, for an agent that is added
     """
-    from launch_scripts.launcher.child_process import load_entry
     from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.log_file import Speaker, log_to
@@ -233,7 +233,7 @@ def run_role(
     setup = RoleSetup(
         scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
     )
-    load_entry(TABLE[role].entry)(setup, None, **role_options)
+    resolve_name(TABLE[role].entry)(setup, None, **role_options)
 
 
 def _health_of(name: str, place: Place) -> Health:

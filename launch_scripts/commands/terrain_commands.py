@@ -435,6 +435,11 @@ class Curve(NamedTuple):
         found = factor.astype(np.float64)
         return self.cost.flat_speed_m_per_s / found if self.unit == "m/s" else found
 
+    def by_slope(self) -> dict[str, float | None]:
+        """Slope in percent -> value; None where it is too steep."""
+        values = zip(_SLOPES, self.at(SLOPES_PERCENT).round(4).tolist(), strict=True)
+        return {slope: value if 0 < value < math.inf else None for slope, value in values}
+
 
 Shown = dict[str, list[Curve]]
 """Groups of curves under their titles."""
@@ -473,18 +478,10 @@ def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
 
 
 def _rules_fields(shown: Shown) -> dict[str, Any]:
-    """For programs. Slopes that are too steep have no value."""
+    """For programs."""
     return {
         title: [
-            {
-                "name": curve.name,
-                **curve.notes,
-                "unit": curve.unit,
-                "by_slope_percent": {
-                    slope: round(float(value), 4) if 0 < value < math.inf else None
-                    for slope, value in zip(_SLOPES, curve.at(SLOPES_PERCENT), strict=True)
-                },
-            }
+            {"name": curve.name, **curve.notes, "unit": curve.unit, "by_slope_percent": curve.by_slope()}
             for curve in curves
         ]
         for title, curves in shown.items()
@@ -500,8 +497,8 @@ def _show_rules(shown: Shown) -> None:
         for slope in _SLOPES:
             table.add_column(slope, justify="right")
         for curve in curves:
-            values = curve.at(SLOPES_PERCENT)
-            table.add_row(curve.name, *(f"{value:.2f}" if 0 < value < math.inf else "-" for value in values))
+            values = curve.by_slope().values()
+            table.add_row(curve.name, *("-" if value is None else f"{value:.2f}" for value in values))
         console.print(table)
         for curve in curves:
             for key, text in curve.notes.items():

@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.plain_text import plain
+from swarm.files import discard_output
 
 log = logging.getLogger(__name__)
 
@@ -250,9 +251,7 @@ class OutlivingOutput:
             if error.errno not in _READER_GONE:
                 raise
             log.info("the output has no reader any more: %s", error.strerror or error)
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            discard_output(self._stream.fileno())
 
 
 def make_output_outlive_readers() -> None:
