@@ -21,6 +21,7 @@ from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.explain import nearest
+from swarm.config.input_files import FileKind, check_file
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
@@ -62,17 +63,17 @@ def _of_source(name: str) -> Iterator[Finding]:
 
 
 def _of_file(key: str, path: Path) -> Iterator[Finding]:
-    if not path.exists():
-        yield failure(key, f"no such file {path}")
-    elif not path.is_file():  # to open a pipe waits for a writer
-        what = "a folder" if path.is_dir() else "a device or pipe"
-        yield failure(key, f"found {path}, it is {what}; expected a file")
-    else:
-        try:
-            with path.open("rb"):
-                pass
-        except OSError as error:
-            yield failure(key, f"cannot read {path}: {error.strerror or error}")
+    kind = (
+        FileKind.SLOPE_TABLE if key == "cost.slope_csv" else FileKind.VECTORS if "zones" in key else FileKind.POINTS
+    )
+    try:
+        check_file(path, kind)
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        yield failure(key, str(kind.unreadable(path, error)))
+    except SwarmError as error:
+        yield failure(key, str(error))
 
 
 def places_counted(scenario: Scenario) -> Iterator[Finding]:
