@@ -63,9 +63,9 @@ def _of_source(name: str) -> Iterator[Finding]:
 
 
 def _of_file(key: str, path: Path) -> Iterator[Finding]:
-    kind = (
-        FileKind.SLOPE_TABLE if key == "cost.slope_csv" else FileKind.VECTORS if "zones" in key else FileKind.POINTS
-    )
+    kind = FileKind.VECTORS if "zones" in key else FileKind.POINTS
+    if key == "cost.slope_csv":
+        kind = FileKind.SLOPE_TABLE
     try:
         check_file(path, kind)
         with path.open("rb"):
