@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -127,15 +127,19 @@ class Found:
 def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
     """The newest run whose router listens; a router at the usual endpoint if there is none.
 
-    runs  folder of the runs that are looked at; None: all of this user, and those in ./runs
+    runs  folder of the runs that are looked at; None: all of this user
     name  of the run, or its folder; only that is looked at then
     Raises BusError with the places that were tried, ConfigError if there is no run of that name.
     """
     from launch_scripts.observe.run_folder import RUNS, find_run
+    from launch_scripts.observe.run_registry import registered
     from swarm.bus.endpoints import listening
     from swarm.config.scenario import NetworkConfig
 
-    folders = [find_run(name, runs or RUNS)] if name is not None else _newest_first(runs)
+    if name is not None:
+        folders = [find_run(name, runs or RUNS)]
+    else:
+        folders = [each.folder for each in registered() if runs is None or each.folder.parent == runs.resolve()]
     networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
     tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
@@ -170,21 +174,3 @@ def _network_of(folder: Path) -> NetworkConfig | None:
         return None if run_facts(folder).get("simulated") else msgspec.convert(raw, NetworkConfig)
     except (OSError, ValueError, SwarmError, msgspec.ValidationError):
         return None
-
-
-def _newest_first(runs: Path | None) -> list[Path]:
-    """Folders of runs: those whose launcher runs first, then those that have left no report, and of these the
-    newest."""
-    from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE, RUNS
-    from launch_scripts.observe.run_registry import registered
-
-    known = registered()
-    launched = {run.folder for run in known if run.launchers}
-    folders = set() if runs is not None else {run.folder for run in known}
-    with suppress(OSError):
-        folders |= {each.resolve() for each in (runs or RUNS).iterdir() if each.name != LAST}
-
-    def newness(folder: Path) -> tuple[bool, bool, float]:
-        return folder in launched, not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
-
-    return sorted((each for each in folders if (each / RUN_FILE).is_file()), key=newness, reverse=True)
