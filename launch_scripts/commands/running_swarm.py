@@ -58,9 +58,9 @@ class Where(Tls):
             if self.run is not None:
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
-        found = find_swarm(self.runs, self.run)
-        say_newest(found.run, found.others)
-        return found.network
+        (run, network), *others = find_swarm(self.runs, self.run)
+        say_newest(run, [name for name, _ in others if name])
+        return network
 
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
@@ -105,31 +105,20 @@ class Where(Tls):
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
-def say_newest(run: str | None, others: Sequence[str]) -> None:
+def say_newest(run: str, others: Sequence[str]) -> None:
     """Says which run a command asks, if others run too."""
     if others:
         told = ", ".join(others[:_NAMED])
         typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A router that listens, and whose it is as far as that is known.
-
-    others  names of further runs whose routers listen
-    """
-
-    network: NetworkConfig
-    run: str | None = None
-    others: tuple[str, ...] = ()
-
-
-def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
-    """The newest run whose router listens; a router at the usual endpoint if there is none.
+def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[str, NetworkConfig]]:
+    """The runs whose routers listen, at least one, the newest first; of a router at the usual endpoint no run is
+    known, and its name is empty.
 
     runs  folder of the runs that are looked at; None: all of this user
     name  of the run, or its folder; only that is looked at then
-    Raises BusError with the places that were tried, ConfigError if there is no run of that name.
+    Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
     from launch_scripts.observe.run_folder import RUNS, find_run
     from launch_scripts.observe.run_registry import registered
@@ -147,20 +136,15 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
     # Of runs with the same router only the newest can be connected to it.
     by_router = {network.connect: (run, network) for run, network in reversed(tried)}
     newest_first = sorted(by_router.values(), key=tried.index)
-    found = [each for each in newest_first if any(map(listening, each[1].connect))]
-    if found:
-        run, network = found[0]
-        return Found(network, run or None, tuple(run for run, _ in found[1:] if run))
-    looked = [f"{run} at {', '.join(at.connect)}" if run else at.connect[0] for run, at in newest_first]
+    if found := [each for each in newest_first if any(map(listening, each[1].connect))]:
+        return found
     if name is not None:
-        raise BusError(
-            f"run {name} does not run here: no process listens ({'; '.join(looked) or 'it names no router'})"
-        )
+        looked = ", ".join(each for _, network in tried for each in network.connect) or "it names no router"
+        raise BusError(f"run {name} does not run here: no process listens ({looked})")
     runs_in = "your runs" if runs is None else f"the runs in {runs}"
-    more = f" and {len(looked) - _NAMED} more" if len(looked) > _NAMED else ""
     raise BusError(
         f"no swarm runs here: no process listens at any router of {runs_in} or at the usual endpoint "
-        f"({'; '.join(looked[:_NAMED])}{more}); --connect names another"
+        f"({tried[-1][1].connect[0]}); --connect names another"
     )
 
 

@@ -163,12 +163,6 @@ def _plain(value: Any) -> str:
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
 
 
-def busy_loading(*, as_json: bool, plain: bool) -> contextlib.AbstractContextManager[None]:
-    """Says so while the modules of a launcher are loaded, before there is a run whose terminal could."""
-    console = Console(stderr=as_json, highlight=False)
-    return _busy_line(console, console.print, lambda: "loading", changes=console.is_terminal and not plain)
-
-
 @contextlib.contextmanager
 def _busy_line(
     console: Console, say: Callable[[str], None], text: Callable[[], str], *, changes: bool

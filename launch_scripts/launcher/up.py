@@ -473,9 +473,8 @@ class _Run:
         as_json = self._options.as_json
         if isinstance(known, OwnPart):
             if as_json:
-                self._terminal.print_json(
-                    json.dumps(known.report(restarts=self._swarm.restarts, **measured), indent=2)
-                )
+                part = {**measured, "recorded": False, "restarts": self._swarm.restarts}
+                self._terminal.print_json(json.dumps(part, indent=2))
             else:
                 self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
             return True

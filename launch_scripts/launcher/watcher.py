@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
-from typing import Any
 
 from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS
 from launch_scripts.observe.fact_table import lines_of
@@ -65,17 +64,6 @@ class OwnPart(LatestState):
         """Returns their alarms, in lines for people."""
         alarms = alarms_of(self, self.plan.targets, now_ns)
         return lines_of([alarm for alarm in alarms if alarm.lasts], self.grid, SHOWN_ALARMS)
-
-    def report(self, *, run_id: str, seconds: float, startup_s: float | None, restarts: int) -> dict[str, Any]:
-        """Returns for programs: these processes, and a note that another launcher reports all others."""
-        return {
-            "run_id": run_id,
-            "recorded": False,
-            "seconds": seconds,
-            "startup_s": startup_s,
-            "restarts": restarts,
-            "processes": sorted(spec.name for spec in self.own),
-        }
 
     def line(self, title: str, now_ns: int, restarts: int) -> str:
         """All of it in one line."""

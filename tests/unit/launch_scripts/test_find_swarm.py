@@ -67,19 +67,18 @@ def test_the_newest_run_whose_router_listens_is_found_whatever_its_port_and_name
     make_run(tmp_path, "old", listens[0])
     make_run(tmp_path, "mine", listens[1], namespace="north")
     make_run(tmp_path, "dead", silent)
-    found = find_swarm(tmp_path)
-    assert (found.run, found.others) == ("mine", ("old",))
-    assert (found.network.connect, found.network.namespace) == ((f"tcp/127.0.0.1:{listens[1]}",), "north")
-    assert find_swarm(tmp_path, "old").network.connect == (f"tcp/127.0.0.1:{listens[0]}",)
-    assert find_swarm(tmp_path, str(tmp_path / "mine")).run == "mine"
+    (run, network), (other, _) = find_swarm(tmp_path)
+    assert (run, other) == ("mine", "old")
+    assert (network.connect, network.namespace) == ((f"tcp/127.0.0.1:{listens[1]}",), "north")
+    assert find_swarm(tmp_path, "old")[0][1].connect == (f"tcp/127.0.0.1:{listens[0]}",)
+    assert find_swarm(tmp_path, str(tmp_path / "mine"))[0][0] == "mine"
 
 
 def test_a_port_that_a_later_run_took_over_is_that_runs(tmp_path: Path, listens: list[int]) -> None:
     make_run(tmp_path, "earlier", listens[0])
     make_run(tmp_path, "later", listens[0])
     make_run(tmp_path, "over", listens[1], over=True)
-    found = find_swarm(tmp_path)
-    assert (found.run, found.others) == ("later", ("over",))
+    assert [run for run, _ in find_swarm(tmp_path)] == ["later", "over"]
 
 
 def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
@@ -88,13 +87,9 @@ def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
         make_run(tmp_path, f"r{n}", port)
     make_run(tmp_path, "simulated", ports[0])
     (tmp_path / "simulated" / "run.json").write_text('{"simulated": true}')
-    with pytest.raises(
-        BusError, match=rf"no swarm runs here: [^(]*\(r4 at tcp/127\.0\.0\.1:{ports[4]}.* and 3 more"
-    ):
-        find_swarm(tmp_path)
     with pytest.raises(BusError, match=r"no swarm runs here: .*usual endpoint"):
         find_swarm(tmp_path / "nowhere")
-    with pytest.raises(BusError, match=rf"run r1 does not run here: no process listens \(r1 at .*:{ports[1]}\)"):
+    with pytest.raises(BusError, match=rf"run r1 does not run here: no process listens \(tcp/.*:{ports[1]}\)"):
         find_swarm(tmp_path, "r1")
     with pytest.raises(ConfigError, match="there is no run 'r9'"):
         find_swarm(tmp_path, "r9")
@@ -121,8 +116,8 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
     assert [run.name for run in registered() if run.launchers] == ["second", "first"]
     assert find_run("first", Path("runs")) == tmp_path / "first" / "first"
     assert find_run("LAST", Path("runs")).name == "second"
-    assert find_swarm(name="first").network.connect == (f"tcp/127.0.0.1:{listens[0]}",)
-    assert set(find_swarm().others) | {find_swarm().run} == {"first", "second"}
+    assert find_swarm(name="first")[0][1].connect == (f"tcp/127.0.0.1:{listens[0]}",)
+    assert {run for run, _ in find_swarm()} == {"first", "second"}
     (tmp_path / "third" / "first").mkdir(parents=True)
     other = json.dumps({"folder": str(tmp_path / "third/first"), "pid": 9, "started_s": 0})
     (tmp_path / "state/runs/other.json").write_text(other)
