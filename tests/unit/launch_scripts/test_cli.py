@@ -77,11 +77,6 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
         ports.check_ports(scenario, ("router", "agent"))
 
 
-def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> None:
-    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000"
-    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000", "a run keeps its folder"
-
-
 def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(swarm: Swarm, tmp_path: Path) -> None:
     code, out, _ = swarm(
         "simulate", "synthetic", "--seconds", "2", "--seed", "9", "--runs", str(tmp_path), "--json"
