@@ -204,11 +204,9 @@ class _Run:
             with open_bus(network, authenticator=authenticator_of(network, self._run_id)) as bus:
                 self._join(bus)
                 self._say_begin()
-                known: Recorder | OwnPart
+                known: Recorder | OwnPart = OwnPart(self._terrain.grid, self._started_ns)
                 if self._options.records:
                     known = Recorder(self._scenario, self._terrain.grid, self._started_ns)
-                else:
-                    known = OwnPart(self._terrain.grid, self._started_ns)
                 self._known = known
                 watcher = Watcher(bus, known, MonotonicClock())
                 watcher.begin()
