@@ -37,10 +37,10 @@ def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Findi
         return found, facts, ""
     summary = (
         f"{path} can run, {counted(found, 'warning')}: vehicles {facts['vehicles']:,},"
-        f" targets {facts['targets']:,}, processes {facts['processes']}, {facts['seconds']:g} s;"
+        f" targets {facts['targets']:,}, processes {facts['needs']['processes']}, {facts['seconds']:g} s;"
         f" {facts['rows']} x {facts['cols']} cells of {facts['resolution_m']:g} m,"
-        f" {facts['passable_share']:.0%} passable; about {facts['estimated_cores']:.1f} of {facts['cores']} cores"
-        f" and {size(facts['estimated_memory_bytes'])}"
+        f" {facts['passable_share']:.0%} passable; about {facts['needs']['cores']:.1f} of"
+        f" {facts['machine']['cores']} cores and {size(facts['needs']['memory_bytes'])}"
     )
     return found, facts, summary
 
@@ -77,15 +77,11 @@ def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator
     facts |= {
         "targets": len(scenario.target_ids),
         "vehicles": scenario.vehicle_count,
-        "agents": wanted.agents,
-        "processes": wanted.processes,
         "seconds": scenario.seconds,
         "rows": terrain.grid.rows,
         "cols": terrain.grid.cols,
         "resolution_m": terrain.grid.resolution_m,
         "passable_share": round(1 - float(terrain.lethal.mean()), 4),
-        "estimated_cores": round(wanted.cores, 2),
-        "cores": here.cores,
-        "estimated_memory_bytes": wanted.memory_bytes,
-        "available_memory_bytes": here.free_bytes,
+        "needs": wanted._asdict(),
+        "machine": here._asdict(),
     }

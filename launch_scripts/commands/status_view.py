@@ -201,11 +201,8 @@ def status_fields(status: Status) -> dict[str, Any]:
     def process_fields(info: RunInfo) -> dict[str, Any]:
         stats = latest.newest_stats(info.role, info.id)
         return {
-            "role": info.role,
-            "id": info.id,
+            **msgspec.to_builtins(info),
             "pid": status.pids.get(f"{info.role}-{info.id}"),
-            "incarnation": info.incarnation,
-            "wire_version": info.wire_version,
             "leads": status.latest.leads.get((info.role, info.id)),
             "counts": None if stats is None else stats.counts,
             "gauges": None if stats is None else stats.gauges,
