@@ -216,7 +216,6 @@ def _show_size(found: Needs) -> None:
         ("between machines, messages/s", found.crossings_per_s),
         ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
         ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
-        ("out, routers each with each, Mbit/s", found.link_mbit_per_s),
         ("out, by a router of the region, Mbit/s", found.link_out_mbit_per_s),
         ("sessions of a router", found.sessions),
     ):
