@@ -10,12 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
+from launch_scripts.launcher.console import REPORTED, progress
+from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
 from swarm.config.explain import choice
+from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -48,12 +54,6 @@ def compare(
 
     run  Folders of runs, or their names in --runs.
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from launch_scripts.launcher.console import REPORTED
-    from launch_scripts.observe.run_folder import SCENARIO_FILE
     from launch_scripts.report.compare import circumstances_that_differ, figures, settings_that_differ, text_of
 
     if len(run) < 2:
@@ -82,9 +82,7 @@ def compare(
 
 
 def _left(name: str, runs: Path) -> LeftRun:
-    from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
     from launch_scripts.report.compare import LeftRun
-    from swarm.config.input_files import FileKind, parse_toml, read_text
 
     folder = find_run(name, runs)
     report, path = read_report(folder), folder / SCENARIO_FILE
@@ -102,7 +100,6 @@ def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
 
     swarm runs report LAST
     """
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_page import write_page
 
     typer.echo(write_page(find_run(run, runs)))
@@ -138,8 +135,6 @@ def export(
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     force   Replace files that are there.
     """
-    from launch_scripts.launcher.console import progress
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
     ending = "" if out is None or out.is_dir() else out.suffix.lower().removeprefix(".")
@@ -183,7 +178,6 @@ def replay(
     until_s  Stop at this time (s) of the run's own clock.
     keep     Copy the replayed files into a folder: a test case.
     """
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.simulation.replay import keep as keep_recorded
     from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 

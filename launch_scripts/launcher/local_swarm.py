@@ -176,14 +176,6 @@ class LocalSwarm:
     def restarts(self) -> int:
         return sum(running.restarts for running in self.running)
 
-    def by_role(self) -> dict[str, tuple[int, int]]:
-        """Role -> (alive, all), in the order of the table."""
-        counts: dict[str, tuple[int, int]] = {}
-        for running in self.running:
-            alive, every = counts.get(running.spec.role, (0, 0))
-            counts[running.spec.role] = (alive + running.alive, every + 1)
-        return counts
-
     def seen(self) -> list[Process]:
         """Returns the condition of each process. Called by any thread: it waits for nothing."""
         return [running.seen() for running in list(self.running)]
@@ -350,8 +342,6 @@ class LocalSwarm:
         if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
             expendable = running.spec.added or TABLE[running.spec.role].expendable
             wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
-        if running.spec.restart != "always":
-            wait_s = None
         if wait_s is not None:
             running.due_s = now_s + wait_s
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)

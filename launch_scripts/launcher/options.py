@@ -23,6 +23,7 @@ from launch_scripts.process_table import (
     TABLE,
     ProcessSpec,
     certificate_name,
+    check_name,
     processes_of,
     spec_of,
 )
@@ -39,7 +40,6 @@ from swarm.errors import ConfigError, StoreError
 from swarm.files import writing
 from swarm.journal import digest_of
 from swarm.liveness import split_rank
-from swarm.wire.fields import check_id
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
@@ -206,10 +206,7 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     """Returns the folder of a run on this machine: files of the run, such as a keeper's store, are found there when
     its processes restart. Raises ConfigError on an id that no folder may have, StoreError where the folder cannot
     be made."""
-    try:
-        check_id("run id", run_id)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    check_name("run id", run_id)
     if run_id in (".", "..", LAST):
         raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
     run_dir = runs / run_id
@@ -339,10 +336,7 @@ def chosen_processes(
             ids = [spec.id for spec in processes_of(scenario, (role,))]
             if id not in ids and not TABLE[role].any_id:
                 raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
-            try:
-                check_id("--only", id)
-            except ValueError as error:
-                raise ConfigError(str(error)) from error
+            check_name("--only", id)
             every = [spec_of(role, id)]
         chosen |= {spec.name: spec for spec in every}
     if not chosen:

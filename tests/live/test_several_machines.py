@@ -90,7 +90,7 @@ def test_launchers_on_two_machines_make_one_run_each_with_the_certificates_of_it
 def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successor_is_not(hands: Hands) -> None:
     certs = issue(hands)
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
-    start = ("router", str(hands.path), "--listen", endpoint, *tls(certs))
+    start = ("role", "router", str(hands.path), "--listen", endpoint, *tls(certs))
     heard: list[str] = []
 
     def tell(event: Event) -> None:
