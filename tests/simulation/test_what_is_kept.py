@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import io
 from collections.abc import Iterator
 
 import msgspec
@@ -19,6 +20,7 @@ from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
 from swarm.wire.messages.traffic import Entry, Granted, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.driving.driver import Driver
 from vehicle_agent.service import AgentService
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
@@ -43,10 +45,11 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
     return msgspec.structs.replace(scenario, rovers=ROVERS if others else ()), terrain
 
 
-def simulation_of(name: str, seed: int) -> Simulation:
+def simulation_of(name: str, seed: int, trace: io.StringIO | None = None, slower: float = 1.0) -> Simulation:
     scenario, terrain = world(name, seed)
+    scenario = msgspec.structs.replace(scenario, time_scale=scenario.time_scale / slower)
     faults = random_plan(scenario, seed, SECONDS)
-    return Simulation(scenario, faults=faults, terrain=terrain)
+    return Simulation(scenario, faults=faults, terrain=terrain, trace=trace)
 
 
 WORLDS = pytest.mark.parametrize(
@@ -58,6 +61,23 @@ WORLDS = pytest.mark.parametrize(
         ("maze parked", 6),
     ],
 )
+
+
+@WORLDS
+def test_events_are_those_of_agents_that_look_at_all_vehicles_in_every_tick(name, seed, monkeypatch):
+    looked, logs = [0, 0], [io.StringIO(), io.StringIO()]
+    waits = Driver.waits
+    for run, log in enumerate(logs):
+
+        def count(driver: Driver, vehicle: Vehicle, now_ns: int, run: int = run) -> bool:
+            looked[run] += 1
+            return waits(driver, vehicle, now_ns)
+
+        monkeypatch.setattr(Driver, "waits", count)
+        simulation_of(name, seed, log, slower=4.0).run_until(SECONDS)  # several ticks a cell
+        monkeypatch.setattr(Vehicle, "needs_nothing", property(lambda vehicle: False))
+    assert logs[0].getvalue() == logs[1].getvalue()
+    assert looked[0] < looked[1]
 
 
 @WORLDS
