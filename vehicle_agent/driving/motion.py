@@ -24,7 +24,7 @@ Stop = tuple[int, Point]
 """Beginning or end of a step: a cell, and a point in it."""
 Rows = NDArray[np.float64]
 """A row for each motion, with these columns. Its stretch leads from (ROW, COL) straight to (TO_ROW, TO_COL), and
-begins after SINCE_M of its step. It rolls up to UNTIL_M, at FACTOR times the pace of cell BY; up to 0 is not at all.
+begins after SINCE_M of its step. It rolls up to UNTIL_M, at FACTOR times the pace of cell BY; up to 0: never.
 The share COUNTS of the seconds that it drives is added to DRIVEN_S; that is NaN of a step which is not measured."""
 (DONE_M, UNTIL_M, BY, FACTOR, COUNTS, CELL, HEADING_RAD, ROW, COL, TO_ROW, TO_COL, SINCE_M, LENGTH_M) = range(13)
 DRIVEN_S = 13
