@@ -14,7 +14,7 @@ from swarm.wire.messages.traffic import Entry
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.motion import Motion, Point, roll, together
+from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, Point, roll, together
 
 
 class Driver:
@@ -108,9 +108,9 @@ class Driver:
                 # A vehicle with dynamics of its own has its full pace between two cells before and behind.
                 freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
                 if self._measures and freely:
-                    motion.driven_s = 0.0
+                    motion.row[DRIVEN_S] = 0.0
             before = motion.cell
-            had_s, head, measured_s = left_s, motion.head, motion.driven_s
+            had_s, head, measured_s = left_s, motion.head, motion.row.item(DRIVEN_S)
             length_m = motion.length_m - motion.border_m if self._pulled else motion.length_m
             climbing = self._climbing(motion)
             pace_s_per_m = self._physics.item(before if self._pulled else head) * climbing
@@ -119,7 +119,7 @@ class Driver:
                 enters = entering is None or self._holdings.may_enter(vehicle.id, entering)
                 left_s = motion.advance(left_s, pace_s_per_m, enters=enters)
                 if not enters and left_s > 0.0:
-                    motion.driven_s = math.nan
+                    motion.row[DRIVEN_S] = math.nan
                     return left_s  # in this tick another of ours may leave yet
             else:
                 path = self._holdings.open(vehicle.id)
@@ -134,7 +134,7 @@ class Driver:
                     if not math.isnan(measured_s):
                         self.driven.append((head, measured_s / (length_m * climbing)))
                 else:
-                    motion.driven_s = measured_s
+                    motion.row[DRIVEN_S] = measured_s
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
@@ -191,5 +191,5 @@ def climbing_of(motion: Motion, climb: Climb, pulled: bool) -> float:
     """
     if not pulled:
         return climb.driven(motion.tail, motion.head)
-    (row0, col0), (row1, col1), _ = motion.stretch()
-    return climb.flown(motion.tail, motion.head, motion.length_m, row1 - row0, col1 - col0)
+    south, east = (motion.row[TO_ROW : TO_COL + 1] - motion.row[ROW : COL + 1]).tolist()
+    return climb.flown(motion.tail, motion.head, motion.length_m, south, east)

@@ -50,31 +50,26 @@ class Motion:
         self._grid = grid
         self.heading_rad = 0.0
         self.row: Rows = np.zeros(_COLUMNS)
-        self.put(cell)
-
-    def put(self, cell: int) -> None:
-        """At rest in the middle of a cell."""
-        self.tail = self.head = cell
-        self._at = self._to = middle_of(self._grid, cell)
+        self.head, self._to = cell, middle_of(grid, cell)
         self._rest()
 
     def _rest(self) -> None:
+        """Comes to rest at the end of the step."""
+        self.tail, self._at = self.head, self._to
+        self._via = self._to
+        """Point where it passes the border."""
         self.length_m = self.border_m = 0.0
-        self._via: Point | None = None
-        """Point where it passes the border, if the step is not from middle to middle."""
         self.at_rest = True
-        self.driven_s = math.nan
+        self.row[DRIVEN_S] = math.nan
         self._settle(0.0)
 
     def _settle(self, done_m: float) -> None:
         """Begins a stretch. Like the state of rest, it is read far more often than it changes."""
-        before = done_m < self.border_m
-        self.cell = self.tail if before else self.head
-        begin, end, since_m, length_m = self._at, self._to, 0.0, self.length_m
-        if self._via is not None and before:
-            end, length_m = self._via, self.border_m
-        elif self._via is not None:
-            begin, since_m, length_m = self._via, self.border_m, self.length_m - self.border_m
+        if done_m < self.border_m:
+            self.cell, begin, end, since_m, length_m = self.tail, self._at, self._via, 0.0, self.border_m
+        else:
+            self.cell, begin, end, since_m = self.head, self._via, self._to, self.border_m
+            length_m = self.length_m - since_m
         self.row[:DRIVEN_S] = (done_m, 0, 0, 1, 0, self.cell, self.heading_rad, *begin, *end, since_m, length_m)
 
     def roll_on(self, by: int, factor: float, *, counts: bool) -> None:
@@ -89,15 +84,6 @@ class Motion:
     def done_m(self) -> float:
         """Metres driven of the step."""
         return self.row.item(DONE_M)
-
-    @property
-    def driven_s(self) -> float:
-        """Seconds driven of the step; NaN if they are not measured."""
-        return self.row.item(DRIVEN_S)
-
-    @driven_s.setter
-    def driven_s(self, seconds: float) -> None:
-        self.row[DRIVEN_S] = seconds
 
     @property
     def goal(self) -> Stop:
@@ -138,7 +124,7 @@ class Motion:
             self._at, self._to = self._to, self._at
             self.border_m = self.length_m - self.border_m
             self.heading_rad = (self.heading_rad + math.pi) % math.tau
-            self.driven_s = math.nan
+            self.row[DRIVEN_S] = math.nan
             self._settle(self.length_m - self.done_m)
 
     def advance(self, seconds: float, pace_s_per_m: float, *, enters: bool = True) -> float:
@@ -161,17 +147,10 @@ class Motion:
             self._settle(done_m + seconds / pace_s_per_m)  # rounding may take it to the border
             return 0.0
         if goal_m == self.length_m:
-            self.tail, self._at = self.head, self._to
             self._rest()
         else:
             self._settle(goal_m)
         return seconds - needed_s
-
-    def stretch(self) -> tuple[Point, Point, float]:
-        """Beginning and end of the current straight stretch, and the share of it that is driven, 0 to 1."""
-        done_m, since_m, length_m = self.row[[DONE_M, SINCE_M, LENGTH_M]].tolist()
-        row, col, to_row, to_col = self.row[ROW : TO_COL + 1].tolist()
-        return (row, col), (to_row, to_col), (done_m - since_m) / length_m if length_m else 0.0
 
     def place_m(self) -> tuple[float, float]:
         """(east, south) in metres from the north-west corner of the grid."""
@@ -215,12 +194,12 @@ def places_m(rows: Rows, grid: GridSpec) -> tuple[NDArray[np.float64], NDArray[n
 class Way(NamedTuple):
     """A step from a point of a cell to a point of a neighbour.
 
-    via          where it passes their border; None if it leads from middle to middle
+    via          where it passes their border
     border_m     metres up to there; length_m: of the whole
     heading_rad  clockwise from north
     """
 
-    via: Point | None
+    via: Point
     border_m: float
     length_m: float
     heading_rad: float
@@ -232,9 +211,6 @@ def way_of(grid: GridSpec, start: Stop, goal: Stop) -> Way:
     middle = middle_of(grid, tail)
     rows, cols = head // grid.cols - tail // grid.cols, head % grid.cols - tail % grid.cols
     heading_rad = math.atan2(end[1] - begin[1], begin[0] - end[0]) % math.tau
-    if begin == middle and end == middle_of(grid, head):
-        length_m = math.hypot(rows, cols) * grid.resolution_m
-        return Way(None, 0.5 * length_m, length_m, heading_rad)
     via = _via(begin, end, (middle[0] + 0.5 * rows, middle[1] + 0.5 * cols), rows, cols)
     border_m = math.dist(begin, via) * grid.resolution_m
     return Way(via, border_m, border_m + math.dist(via, end) * grid.resolution_m, heading_rad)
