@@ -287,7 +287,7 @@ class Agent:
     def drive(self) -> Findings | None:
         """Makes vehicles drive until they come to another cell; returns what they find there, to be written into
         the map before they drive on. None when their time is over."""
-        self._driver.drive(self.vehicles, self.stopped)
+        self._driver.drive(self.stopped)
         if not self._driver.entered:
             return None
         sight = self._sensor.look(list(self._driver.entered))

@@ -53,7 +53,8 @@ class Driver:
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
         self._pulled = pulled and may_be_pulled(local_map.climb)
-        self._left_s: dict[str, float] = {}
+        self._left: list[tuple[Vehicle, float]] = []
+        """Vehicles that are still to be driven in this tick, and the seconds that each has left."""
         self._vehicles: list[Vehicle] = []
         self._rows = together([])
         """The rows of their motions."""
@@ -69,24 +70,22 @@ class Driver:
         if (driven := list(vehicles.values())) != self._vehicles:
             self._vehicles, self._rows = driven, together([vehicle.motion for vehicle in driven])
         comes = ~roll(self._rows, self._physics, max(seconds, 0.0))
-        self._left_s = dict.fromkeys(compress(vehicles, comes.tolist()), seconds)
+        self._left = [(vehicle, seconds) for vehicle in compress(driven, comes.tolist())]
         if self._dynamics is not None:
             self._dynamics.begin(seconds)
 
-    def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
+    def drive(self, stopped: Callable[[str], bool]) -> None:
         """Makes each with time left drive until it comes to another cell, or to the border of one that another has
         not left, or its time is over.
 
         stopped  whether a vehicle has to stand
         """
-        driving, self._left_s = self._left_s, {}
-        for id, left_s in driving.items():
-            vehicle = vehicles.get(id)
-            if vehicle is not None:
-                vehicle.decided = None
-            if vehicle is not None and (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
-                self._left_s[id] = left_s
-            if vehicle is not None and self._dynamics is None and not (motion := vehicle.motion).at_rest:
+        driving, self._left = self._left, []
+        for vehicle, left_s in driving:
+            vehicle.decided = None
+            if (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
+                self._left.append((vehicle, left_s))
+            if self._dynamics is None and not (motion := vehicle.motion).at_rest:
                 by = motion.cell if self._pulled else motion.head
                 motion.roll_on(by, self._climbing(motion), counts=by == motion.head)
 

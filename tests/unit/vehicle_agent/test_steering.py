@@ -92,7 +92,7 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
 
     def drive(seconds: float) -> None:
         driver.begin({"v": vehicle}, seconds)
-        driver.drive({"v": vehicle}, lambda _: False)
+        driver.drive(lambda _: False)
 
     drive(60.0)
     assert vehicle.cell == below
