@@ -126,6 +126,8 @@ class Agent:
         self._poses: dict[str | None, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
         self._empty = EmptyPlaces(self._trackings)
+        self._lost: set[str] = set()
+        """Targets that had no position at the last `decide`."""
         self._unseen: set[str] = set()
         """Unseen targets: their planners name places to search."""
         self._requests = 0
@@ -285,7 +287,7 @@ class Agent:
     def drive(self) -> Findings | None:
         """Makes vehicles drive until they come to another cell; returns what they find there, to be written into
         the map before they drive on. None when their time is over."""
-        self._driver.drive(self.vehicles, self.stopped)
+        self._driver.drive(self.stopped)
         if not self._driver.entered:
             return None
         sight = self._sensor.look(list(self._driver.entered))
@@ -354,10 +356,18 @@ class Agent:
             self._unseen.add(target)
             del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
+        if lost != self._lost:
+            self._lost = lost
+            self.decide_anew()
         driven: list[Vehicle] = []
-        paths = self.holdings.paths
+        paths, pushed, wishes = self.holdings.paths, self.holdings.pushed, self._wishes
         waiting = self._steering.waiting_ns
+        wishes.look_around(list(self.vehicles.values()))
         for vehicle in self.vehicles.values():
+            path, decided = paths[vehicle.id], vehicle.decided
+            same = decided is not None and decided[0] is path and decided[1] == vehicle.route.version
+            if same and vehicle.id not in pushed and wishes.is_kept(vehicle.id, now_ns):
+                continue
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
@@ -366,7 +376,7 @@ class Agent:
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
-            self._driver.wait(vehicle, now_ns)
+            waits = self._driver.waits(vehicle, now_ns)
             path = paths[vehicle.id]
             if len(path) > 1 and vehicle.motion.at_rest:
                 # Late grants may be closed by now, and would be held for ever.
@@ -382,9 +392,11 @@ class Agent:
             driven.append(vehicle)
             if len(path) == 1:
                 self.blocked_ticks += self._steering.blocked(vehicle, now_ns)
-            elif waiting:
+            else:
                 waiting.pop(vehicle.id, None)
-        self._wishes.make(driven, now_ns)
+                if not waits and not vehicle.motion.at_rest and vehicle.needs_nothing:
+                    vehicle.decided = path, vehicle.route.version
+        wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
             ids, cells, reasons = zip(*batch, strict=True)
@@ -400,6 +412,12 @@ class Agent:
             self._requests += 1
             actions.append(self.assignment.ask(self._requests, now_ns))
         return actions
+
+    def decide_anew(self, target: str | None = None) -> None:
+        """Something has changed by which `decide` goes, for all vehicles or those with a target."""
+        for vehicle in self.vehicles.values():
+            if target is None or vehicle.target == target:
+                vehicle.decided = None
 
     def _target_cell(self, target: str | None) -> int | None:
         if (goal := goal_of(target)) is not None:
@@ -452,6 +470,8 @@ class Agent:
     def _moved(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
+        if known is None or known.cell != pose.cell:
+            self.decide_anew(pose.target)
         found = pose.target in self._unseen
         self._unseen.discard(pose.target)
         if found or (known is not None and pose.jumps != known.jumps):

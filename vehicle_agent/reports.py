@@ -10,6 +10,7 @@ from itertools import islice
 from operator import contains
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
@@ -86,17 +87,12 @@ class FleetReport:
     def reports(self, places: Places, now_ns: int) -> Iterator[tuple[int, Fleet]]:
         """(region, message) of every region where vehicles are, or were at the last call."""
         self._seq += 1
-        regions = places.regions.tolist()
-        by_region: dict[int, list[int]] = {region: [] for region in self._regions}
-        for index, region in enumerate(regions):
-            by_region.setdefault(region, []).append(index)
-        self._regions = list(dict.fromkeys(regions))
-        for region, inside in by_region.items():
-            yield region, self._report(region, places, inside, now_ns)
+        before, self._regions = self._regions, list(dict.fromkeys(places.regions.tolist()))
+        for region in dict.fromkeys((*before, *self._regions)):
+            yield region, self._report(region, places, np.flatnonzero(places.regions == region), now_ns)
 
-    def _report(self, region: int, places: Places, inside: Sequence[int], now_ns: int) -> Fleet:
-        vehicles = [places.vehicles[index] for index in inside]
-        at = np.array(inside, np.intp)
+    def _report(self, region: int, places: Places, at: NDArray[np.intp], now_ns: int) -> Fleet:
+        vehicles = [places.vehicles[index] for index in at]
         named = [vehicle.target if vehicle.goal is None else None for vehicle in vehicles]
         first = [*islice(dict.fromkeys(target for target in named if target is not None), NO_TARGET)]
         targets: dict[str | None, int] = {target: number for number, target in enumerate(first)}

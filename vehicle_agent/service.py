@@ -304,6 +304,7 @@ class AgentService:
         if self._obeyed_version != orders.book.version:
             self._obeyed_version = orders.book.version
             self._planners_changed = True
+            agent.decide_anew()
             scenario, book = self._setup.scenario, orders.book
             agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
             agent.set_pace(

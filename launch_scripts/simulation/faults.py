@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
@@ -21,9 +21,9 @@ RELINK_S = 0.3
 """Seconds until a client has found its router again: the retry period, and a session's start."""
 OBSERVER = "recorder-0"
 """The node that writes the report. No fault touches it, or the report would be wrong."""
-MOST_WRONG_S = 11.5 * 3600
-"""No clock is further off, in any combination of steps: marks of a process whose clock is a day ahead of the
-reader's are refused, so of two that are half a day off to either side one would never accept the other's."""
+_STEPS_S = (-3600.0, 3600.0, -36_000.0, 36_000.0, 5.0, -5.0)
+"""Steps of a clock, one for each node. With its offset of an hour at most no clock is half a day off: marks of a
+process whose clock is a day ahead of the reader's are refused, so one of two would never accept the other's."""
 _STOPS_S = (0.02, 0.1, 0.4, 1.5, 3.0)
 """Longest stops of a process on a machine that is far too busy: from a slice of a scheduler to a page from disk."""
 _NS_PER_MS = 1_000_000
@@ -250,7 +250,7 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
         from_s = chance.uniform(0.1, 0.7) * quiet_s
         return from_s, min(from_s + lasts_s, quiet_s)
 
-    partitions, hangs, twins, clock_steps = [], [], [], []
+    partitions, hangs, twins, clock_steps = [], [], [], {}
     for _ in range(chance.randrange(4)):
         cut_off = chance.sample(names, chance.randint(1, max(1, len(names) // 3)))
         one_way = chance.random() < 0.4
@@ -267,9 +267,8 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
         twins += [twin] if name not in few_of_layer(scenario) else []
     for crash in crashes:
         if chance.random() < 0.3:
-            by_s = chance.choice((-3600.0, 3600.0, -43_200.0, 43_200.0, 5.0, -5.0))
-            clock_steps.append(ClockStep(crash.at_s, crash.node, by_s))
-    plan = FaultPlan(
+            clock_steps[crash.node] = ClockStep(crash.at_s, crash.node, chance.choice(_STEPS_S))
+    return FaultPlan(
         drop=chance.choice((0.0, 0.01, 0.1)),
         duplicate=chance.choice((0.0, 0.01, 0.1)),
         reorder=chance.choice((0.0, 0.01, 0.1)),
@@ -283,8 +282,8 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
         },
         hangs=tuple(hangs),
         twins=tuple(twins),
+        clock_steps=tuple(clock_steps.values()),
     )
-    return replace(plan, clock_steps=_within_half_a_day(clock_steps, plan.skews_ms))
 
 
 def few_of_layer(scenario: Scenario) -> list[str]:
@@ -293,15 +292,3 @@ def few_of_layer(scenario: Scenario) -> list[str]:
     for plan in plan_agents(scenario):
         layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")
     return [name for layer in layers.values() if len(layer) < FEWEST_FOR_MAJORITY for name in layer]
-
-
-def _within_half_a_day(steps: Sequence[ClockStep], skews_ms: Mapping[str, float]) -> tuple[ClockStep, ...]:
-    """Those steps which leave every clock within `MOST_WRONG_S`; others are shortened to that."""
-    wrong_s = {node: skew_ms / 1e3 for node, skew_ms in skews_ms.items()}
-    kept = []
-    for step in sorted(steps, key=lambda each: each.at_s):
-        before_s = wrong_s.get(step.node, 0.0)
-        after_s = max(-MOST_WRONG_S, min(MOST_WRONG_S, before_s + step.by_s))
-        wrong_s[step.node] = after_s
-        kept.append(replace(step, by_s=after_s - before_s))
-    return tuple(kept)

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import io
 from collections.abc import Iterator
 
 import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
+from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.wire.messages.traffic import Entry, Granted, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.service import AgentService
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.shard_leader import Leader
@@ -43,10 +43,11 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
     return msgspec.structs.replace(scenario, rovers=ROVERS if others else ()), terrain
 
 
-def simulation_of(name: str, seed: int) -> Simulation:
+def simulation_of(name: str, seed: int, trace: io.StringIO | None = None, slower: float = 1.0) -> Simulation:
     scenario, terrain = world(name, seed)
+    scenario = msgspec.structs.replace(scenario, time_scale=scenario.time_scale / slower)
     faults = random_plan(scenario, seed, SECONDS)
-    return Simulation(scenario, faults=faults, terrain=terrain)
+    return Simulation(scenario, faults=faults, terrain=terrain, trace=trace)
 
 
 WORLDS = pytest.mark.parametrize(
@@ -61,38 +62,29 @@ WORLDS = pytest.mark.parametrize(
 
 
 @WORLDS
-def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeypatch):
-    compared = kept_wishes = 0
-    make = CellRequests.make
+def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(name, seed, monkeypatch):
+    looked, logs, make, say = [0, 0], [io.StringIO(), io.StringIO()], CellRequests.make, Holdings._say_changed
+    run = 0
 
-    def make_twice(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
-        nonlocal compared, kept_wishes
-        before = dict(wishes._made_of)
+    def make_wishes(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
+        looked[run] += len(vehicles)
+        if run:
+            wishes.make_anew()
         make(wishes, vehicles, now_ns)
-        kept = dict(wishes.of)
-        kept_wishes += sum(before.get(id) is made_of for id, made_of in wishes._made_of.items())
-        wishes.make_anew()
-        make(wishes, vehicles, now_ns)
-        assert wishes.of == kept
-        compared += len(vehicles)
 
-    def compare_stands(node: Node) -> None:
-        if isinstance(node.service, AgentService):
-            agent = node.service.agent
-            by_shard: dict[int, list[object]] = {}
-            for id in agent.vehicles:
-                said = agent.holdings._say(id, agent.holdings._paths[id], agent.wishes[id])
-                for shard, told in said.stands.items():
-                    by_shard.setdefault(shard, []).append((id, told))
-            kept = {shard: [*stands.items()] for shard, stands in agent.holdings._stands.items() if stands}
-            assert kept == by_shard
+    def say_all(holdings: Holdings, wishes: dict[str, Wish]) -> None:
+        if run:
+            holdings._said.clear()
+        say(holdings, wishes)
 
-    monkeypatch.setattr(CellRequests, "make", make_twice)
-    simulation = simulation_of(name, seed)
-    simulation.after_tick.append(compare_stands)
-    simulation.run_until(SECONDS)
-    assert compared > 250
-    assert kept_wishes > 100
+    monkeypatch.setattr(CellRequests, "make", make_wishes)
+    monkeypatch.setattr(Holdings, "_say_changed", say_all)
+    simulation_of(name, seed, logs[0], slower=4.0).run_until(SECONDS)  # several ticks a cell
+    monkeypatch.setattr(Vehicle, "needs_nothing", property(lambda vehicle: False))
+    run = 1
+    simulation_of(name, seed, logs[1], slower=4.0).run_until(SECONDS)
+    assert logs[0].getvalue() == logs[1].getvalue()
+    assert 80 < looked[0] < looked[1]
 
 
 def made_anew(leader: Leader) -> Leader:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Sequence
-from itertools import chain
 
 import msgspec
 import numpy as np
@@ -14,7 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.route_columns import RouteStatus
-from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.motion import CELL, HEADING_RAD, Motion, places_m, rows_of
 from vehicle_agent.driving.route_follower import Follower
 
 _RETRY_NS = NS_PER_S // 5
@@ -109,6 +108,8 @@ class Vehicle:
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
     asked         the target of the open route request, None if there is none
     searching     whether its last route led to a cell where its unseen target may be
+    decided       the path and the version of the route for which its agent has decided what it needs: nothing else,
+                  while it only rolls on. None while that may change at any time
     """
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
@@ -124,6 +125,7 @@ class Vehicle:
         self.gone_since_ns = 0
         self.asked: str | None = None
         self.searching = False
+        self.decided: tuple[Sequence[int], int] | None = None
         self._need: Reason | None = None
         """Reason why it needs a route; None if it needs none."""
         self._retry_ns = _RETRY_NS
@@ -223,6 +225,14 @@ class Vehicle:
         self._ask_due_ns = now_ns + self._retry_ns
         return self._need
 
+    @property
+    def needs_nothing(self) -> bool:
+        """True if no time that passes lets `route_request` return a reason, while it rolls on."""
+        route = self.route
+        near_end = route.left <= PREFETCH_CELLS if route.partial else not route.left
+        goes = self.target is not None and self.goal is None and not self.in_reach
+        return goes and self._need is None and self.state is not VehicleState.STRANDED and not near_end
+
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
         """Begins the route, if it leads to the target and passes a cell of the vehicle's path."""
         if not given.pushed:
@@ -306,7 +316,8 @@ class Vehicle:
             self._retry_ns = min(2 * self._retry_ns, _LONGEST_RETRY_NS)
 
     def _settle(self) -> None:
-        """Derives the state from known facts."""
+        """Derives the state from known facts, one of which has changed."""
+        self.decided = None
         if self.target is None:
             return
         if self.in_reach:
@@ -334,10 +345,9 @@ class Places:
 
     def __init__(self, grid: GridSpec, vehicles: Iterable[Vehicle]) -> None:
         self.vehicles = list(vehicles)
-        motions = [vehicle.motion for vehicle in self.vehicles]
-        places = chain.from_iterable([motion.place_m() for motion in motions])
-        self.east_m, self.south_m = np.fromiter(places, np.float64, 2 * len(motions)).reshape(-1, 2).T
-        self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
-        self.cells: NDArray[np.int64] = np.array([motion.cell for motion in motions], np.int64)
+        rows = rows_of([vehicle.motion for vehicle in self.vehicles])
+        self.east_m, self.south_m = places_m(rows, grid)
+        self.heading_rad: NDArray[np.float64] = rows[:, HEADING_RAD]
+        self.cells: NDArray[np.int64] = rows[:, CELL].astype(np.int64)
         row, col = np.divmod(self.cells, grid.cols)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import pairwise
+from itertools import compress, pairwise
 
 from shared_map.terrain.step_climb import Climb, may_be_pulled
 from swarm.clock import NS_PER_S
@@ -13,7 +14,7 @@ from swarm.wire.messages.traffic import Entry
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.motion import Motion, Point
+from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, Point, roll, together
 
 
 class Driver:
@@ -44,8 +45,6 @@ class Driver:
     ) -> None:
         self.entered: dict[int, None] = {}
         self.driven: list[tuple[int, float]] = []
-        self._steps: dict[str, tuple[int, float]] = {}
-        """Vehicle -> (head of its step, seconds that it has driven of it), of steps that are measured."""
         self._measures = measures
         self._climb = local_map.climb
         self._physics = local_map.physics.reshape(-1)
@@ -54,7 +53,11 @@ class Driver:
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
         self._pulled = pulled and may_be_pulled(local_map.climb)
-        self._left_s: dict[str, float] = {}
+        self._left: list[tuple[Vehicle, float]] = []
+        """Vehicles that are still to be driven in this tick, and the seconds that each has left."""
+        self._vehicles: list[Vehicle] = []
+        self._rows = together([])
+        """The rows of their motions."""
         self.patience_ns = NS_PER_S
         self._waits: dict[str, tuple[Entry, int]] = {}
         """Vehicle -> the entry which waits for others, and since when nothing has changed."""
@@ -62,23 +65,29 @@ class Driver:
         """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
         measured."""
 
-    def begin(self, vehicles: Iterable[str], seconds: float) -> None:
-        """Gives each of these so much time."""
-        self._left_s = dict.fromkeys(vehicles, seconds)
+    def begin(self, vehicles: Mapping[str, Vehicle], seconds: float) -> None:
+        """Gives each of these so much time. Those which come to no end of a stretch in it have used it then."""
+        if (driven := list(vehicles.values())) != self._vehicles:
+            self._vehicles, self._rows = driven, together([vehicle.motion for vehicle in driven])
+        comes = ~roll(self._rows, self._physics, max(seconds, 0.0))
+        self._left = [(vehicle, seconds) for vehicle in compress(driven, comes.tolist())]
         if self._dynamics is not None:
             self._dynamics.begin(seconds)
 
-    def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
-        """Makes each drive until it comes to another cell, or to the border of one that another has not left, or
-        its time is over.
+    def drive(self, stopped: Callable[[str], bool]) -> None:
+        """Makes each with time left drive until it comes to another cell, or to the border of one that another has
+        not left, or its time is over.
 
         stopped  whether a vehicle has to stand
         """
-        driving, self._left_s = self._left_s, {}
-        for id, left_s in driving.items():
-            vehicle = vehicles.get(id)
-            if vehicle is not None and (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
-                self._left_s[id] = left_s
+        driving, self._left = self._left, []
+        for vehicle, left_s in driving:
+            vehicle.decided = None
+            if (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
+                self._left.append((vehicle, left_s))
+            if self._dynamics is None and not (motion := vehicle.motion).at_rest:
+                by = motion.cell if self._pulled else motion.head
+                motion.roll_on(by, self._climbing(motion), counts=by == motion.head)
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
@@ -98,28 +107,33 @@ class Driver:
                 # A vehicle with dynamics of its own has its full pace between two cells before and behind.
                 freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
                 if self._measures and freely:
-                    self._steps[vehicle.id] = (path[1], 0.0)
+                    motion.row[DRIVEN_S] = 0.0
             before = motion.cell
-            had_s, head = left_s, motion.head
+            had_s, head, measured_s = left_s, motion.head, motion.row.item(DRIVEN_S)
             length_m = motion.length_m - motion.border_m if self._pulled else motion.length_m
-            climbing = 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
+            climbing = self._climbing(motion)
             pace_s_per_m = self._physics.item(before if self._pulled else head) * climbing
             if self._dynamics is None:
                 entering = motion.entering
                 enters = entering is None or self._holdings.may_enter(vehicle.id, entering)
                 left_s = motion.advance(left_s, pace_s_per_m, enters=enters)
                 if not enters and left_s > 0.0:
-                    self._steps.pop(vehicle.id, None)
+                    motion.row[DRIVEN_S] = math.nan
                     return left_s  # in this tick another of ours may leave yet
             else:
                 path = self._holdings.open(vehicle.id)
                 passes = partial(self._passes, vehicle)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
-                    self._steps.pop(vehicle.id, None)
+                    measured_s = math.nan
             if self._measures:
-                measured_s = had_s - left_s if before == head or not self._pulled else 0.0
-                self._measure(vehicle, head, measured_s, length_m * climbing)
+                measured_s += had_s - left_s if before == head or not self._pulled else 0.0
+                if motion.at_rest:
+                    self._rolling.add(vehicle.id)
+                    if not math.isnan(measured_s):
+                        self.driven.append((head, measured_s / (length_m * climbing)))
+                else:
+                    motion.row[DRIVEN_S] = measured_s
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
@@ -133,21 +147,8 @@ class Driver:
         """Returns the point where a vehicle passes one of its next cells; None is the middle."""
         return vehicle.route.point(cell, self._cols) if self._pulled else None
 
-    def _measure(self, vehicle: Vehicle, head: int, seconds: float, length_m: float) -> None:
-        """Measures a part of the step to `head` that was driven, or its end; all of that is as long as `length_m`
-        on flat ground."""
-        if vehicle.motion.at_rest:
-            self._rolling.add(vehicle.id)
-        step = self._steps.get(vehicle.id)
-        if step is None:
-            return
-        if step[0] != head:  # it has turned back
-            del self._steps[vehicle.id]
-        elif vehicle.motion.at_rest:
-            del self._steps[vehicle.id]
-            self.driven.append((head, (step[1] + seconds) / length_m))
-        else:
-            self._steps[vehicle.id] = (head, step[1] + seconds)
+    def _climbing(self, motion: Motion) -> float:
+        return 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
 
     def end_path(self, vehicle: Vehicle) -> None:
         """Gives back what lies behind a step that the map does not allow any more."""
@@ -159,12 +160,13 @@ class Driver:
                 self._holdings.give_back(vehicle.id, index)
                 return
 
-    def wait(self, vehicle: Vehicle, now_ns: int) -> None:
-        """Gives back entries behind others that have not gone on for long, so that no circle of waiting lasts."""
+    def waits(self, vehicle: Vehicle, now_ns: int) -> bool:
+        """Returns True if a vehicle waits for others. Gives back entries behind those that have not gone on for
+        long, so that no circle of waiting lasts."""
         awaits = self._holdings.awaits(vehicle.id)
         if awaits is None:
             self._waits.pop(vehicle.id, None)
-            return
+            return False
         before, since_ns = self._waits.setdefault(vehicle.id, (awaits, now_ns))
         if before != awaits:  # another, or one of those before it has gone on
             self._waits[vehicle.id] = awaits, now_ns
@@ -172,6 +174,7 @@ class Driver:
             del self._waits[vehicle.id]
             vehicle.motion.turn_back()
             self._holdings.give_back(vehicle.id)
+        return True
 
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
         """Gives back all but the first cells, and the one that it drives into."""
@@ -187,5 +190,5 @@ def climbing_of(motion: Motion, climb: Climb, pulled: bool) -> float:
     """
     if not pulled:
         return climb.driven(motion.tail, motion.head)
-    (row0, col0), (row1, col1), _ = motion.stretch()
-    return climb.flown(motion.tail, motion.head, motion.length_m, row1 - row0, col1 - col0)
+    south, east = (motion.row[TO_ROW : TO_COL + 1] - motion.row[ROW : COL + 1]).tolist()
+    return climb.flown(motion.tail, motion.head, motion.length_m, south, east)

@@ -93,14 +93,19 @@ class CellRequests:
         self.of[vehicle] = _STAYS
         self._made_of.pop(vehicle, None)
 
+    def is_kept(self, vehicle: str, now_ns: int) -> bool:
+        """Returns True if the wish of a vehicle that is under way is good still, as far as ground, obstacles and
+        time have a part in it."""
+        kept = self._made_of.get(vehicle)
+        return kept is not None and kept[1] <= now_ns < kept[2]
+
     def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
         """Makes the wishes of these vehicles for which anything has changed. Called once in a tick, after all
-        changes of held cells."""
+        changes of held cells, and after `look_around`. The wishes of others are as they were."""
         holdings, steering = self._holdings, self._steering
         held = holdings.occupied()
         changed = held ^ self._held
         self._held = held
-        self._forget_near(vehicles)
         ways_out, known, beside = steering.ways_out, self._made_of, self._beside
         paths, pushed, since_all_ns = holdings.paths, holdings.pushed, self._since_ns
         for vehicle in vehicles:
@@ -134,7 +139,7 @@ class CellRequests:
             if wish != self.of.get(id):
                 self.of[id] = wish
 
-    def _forget_near(self, vehicles: Sequence[Vehicle]) -> None:
+    def look_around(self, vehicles: Sequence[Vehicle]) -> None:
         """Keeps no wish of a vehicle near which the ground has changed, or what obstacles close and threaten."""
         changed = [*self._changed, *self._obstacles.take_changed()]
         self._changed = []

@@ -16,10 +16,9 @@ import msgspec
 
 from launch_scripts.simulation.laws import BrokenLaw
 from launch_scripts.simulation.many_seeds import raised, try_seed
-from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulate import Simulation, run_to_end
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError
-from swarm.runtime.process import collected_rarely
 
 _PACKAGES = (
     "swarm",
@@ -135,14 +134,11 @@ def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     assert trial.scenario is not None
     simulation = Simulation(msgspec.structs.replace(trial.scenario, seed=trial.seed, seconds=trial.seconds))
     try:
-        with collected_rarely():
-            simulation.run_until(trial.seconds)
-            simulation.finish()
+        report = run_to_end(simulation).report
     except SwarmError:
         raise
     except Exception as error:
         return {}, [raised(error, simulation.now_s)]
-    report = simulation.report(trial.seconds)
     broken = {name: law for name, law in LAWS.items() if report.get(name)}
     return report, [BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in broken.items()]
 

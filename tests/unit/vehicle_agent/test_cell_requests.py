@@ -145,6 +145,7 @@ def test_whatever_changes_the_wishes_that_are_kept_are_those_that_would_be_made_
     for _ in range(300):
         before = dict(wishes._made_of)
         place.chance.choice(place.changes)()
+        wishes.look_around(place.vehicles)
         wishes.make(place.vehicles, place.now_ns)
         kept += sum(before.get(id) is made_of for id, made_of in wishes._made_of.items())
         told = dict(wishes.of)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.grid import GridSpec
-from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.motion import Motion, roll, together
 
 GRID = GridSpec(rows=5, cols=5, resolution_m=10.0)
 ACTS = st.lists(
@@ -39,6 +40,30 @@ def test_a_vehicle_is_in_its_tail_until_it_is_driven_to_the_border(
             motion.turn_back()
         assert motion.cell == (motion.tail if motion.done_m < motion.border_m else motion.head)
         assert motion.at_rest == (motion.tail == motion.head)
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 1.2), st.booleans()), max_size=40), st.floats(-0.4, 0.4))
+def test_motions_that_roll_together_are_where_each_would_be_that_is_driven_alone(ticks, aside):
+    """One in the middle, one at rest, and one beside it, whose stretch bends at the border."""
+    paces = np.linspace(0.05, 0.2, GRID.cells).astype(np.float32)
+    alone, rolled = [[Motion(GRID, cell) for cell in (6, 12, 17)] for _ in range(2)]
+    for motion in (*alone[::2], *rolled[::2]):
+        motion.set_out(motion.head + 1, (motion.head // 5 + aside, motion.head % 5 + 1.0))
+    rows = together(rolled)
+    for seconds, turns in ticks:
+        for motion in rolled:
+            if not motion.at_rest:
+                motion.roll_on(motion.head, 1.5, counts=True)
+        on = roll(rows, paces, seconds).tolist()
+        for one, other, rolls in zip(alone, rolled, on, strict=True):
+            one.advance(seconds, 1.5 * paces.item(one.head))
+            if not rolls:
+                other.advance(seconds, 1.5 * paces.item(other.head))
+            if turns:
+                one.turn_back()
+                other.turn_back()
+            assert (one.cell, one.at_rest, one.done_m) == (other.cell, other.at_rest, other.done_m)
+            assert one.place_m() == other.place_m()
 
 
 def test_a_vehicle_that_turns_back_heads_where_it_came_from_over_as_many_metres() -> None:

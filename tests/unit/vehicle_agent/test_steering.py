@@ -91,8 +91,8 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
     driver = Driver(LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL, climb), held, steering.passable, None)  # type: ignore[arg-type]
 
     def drive(seconds: float) -> None:
-        driver.begin(["v"], seconds)
-        driver.drive({"v": vehicle}, lambda _: False)
+        driver.begin({"v": vehicle}, seconds)
+        driver.drive(lambda _: False)
 
     drive(60.0)
     assert vehicle.cell == below
