@@ -35,7 +35,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
 )
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
@@ -104,7 +104,7 @@ class Planner:
         self._newest_mark_ns = newest_mark_ns
         self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
-        self.followers = Followers(watch.target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        self.followers = Followers(self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
         self._watch = watch
         # (target cell, map version) of the tree's last update.
@@ -484,19 +484,11 @@ class Planner:
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []
-        due: dict[int, list[tuple[str, Follower]]] = {}
-        for id, follower in self.followers.due(now_ns):
-            due.setdefault(follower.max_cells, []).append((id, follower))
         pushes: list[Action] = []
-        for max_cells, batch in due.items():
+        for (_, max_cells), batch in self.followers.due(now_ns).items():
             cells = [follower.cell for _, follower in batch]
             routes = self._pulled(self._read(cells, max_cells, now_ns))
-            for index, ((id, follower), outline) in enumerate(zip(batch, routes.outlines(), strict=True)):
-                follower.stale = False
-                if outline.status not in _WORTH_PUSHING or not self.followers.is_news(follower, outline):
-                    continue
-                route = routes[index]
-                self.followers.sent(follower, route, now_ns + self._push_ns)
+            for id, route in self.followers.pushed(batch, routes, now_ns + self._push_ns):
                 pushes.append(self._pushed(id, route, target_cell))
         self.counters.count("pushes", len(pushes))
         return pushes
@@ -552,7 +544,3 @@ class Planner:
             gap_p95=p95,
             gap_max=highest,
         )
-
-
-_WORTH_PUSHING = (RouteStatus.OK, RouteStatus.UNREACHABLE)
-"""A vehicle wants to know of a way, and that there is none any more."""
