@@ -159,6 +159,7 @@ def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
     groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
     world = PlacesWorld(flat(), groups, "red")
     world.tell({"a0-00": (1, 300), "a1-00": (2, 300)}, "red.a0.1")
+    world.run(0.5)
     world.tell({"a0-00": (1, 400), "a1-00": (2, 400)}, "red.a0.1")
     world.run(2.0)
     assert {each.vehicle for each in world.pushed} == {"a0-00"}
