@@ -18,7 +18,7 @@ from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import StrideSearch, StrideShelf
+from planner_service.tree.strides import FoundStrides
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -68,7 +68,6 @@ class Planner:
     watch           position of the target, kept by the caller. The planners of all classes share it
     stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
-    shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     vehicle_class   whose routes these are: what the cost map is for
     target_search   while the target is unseen. All classes share it
@@ -86,7 +85,6 @@ class Planner:
         route_cells: int = 0,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
-        shelf: StrideShelf | None = None,
         leads: bool = True,
         target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
@@ -102,7 +100,6 @@ class Planner:
         self._cost_map = cost_map
         self._stopwatch = stopwatch
         self._newest_mark_ns = newest_mark_ns
-        self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
@@ -185,7 +182,7 @@ class Planner:
         actions = self._keep_up(now_ns)
         self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
-            actions.append(FindStrides(self.tree.stride_job(self._shelf)))
+            actions.append(FindStrides(self.tree.stride_job()))
         self.followers.drop_silent(now_ns)
         if self.leads:
             actions.extend(self._pushes(now_ns))
@@ -224,9 +221,9 @@ class Planner:
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
 
-    def adopt_strides(self, search: StrideSearch) -> None:
+    def adopt_strides(self, found: FoundStrides) -> None:
         """Goes by what the worker found."""
-        self.tree.take_strides(search)
+        self.tree.take_strides(found)
 
     def must_wait(self, cells: Sequence[int]) -> bool:
         """Returns True if no tree answers these cells now, but one will once the search under way is adopted."""

@@ -232,7 +232,7 @@ class RouteFinder:
             grown = tree.full_job(self._target)()
             tree.adopt(grown, pace, self._target, [], self._version, [])
         if tree.wants_strides:
-            tree.take_strides(tree.stride_job().run())
+            tree.take_strides(tree.stride_job()())
 
 
 def _whole(row: Any, col: Any) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import StrideSearch
+from planner_service.tree.strides import FoundStrides
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_filter import readable_for_target
@@ -121,9 +121,6 @@ class PlannerService(PlanningProcess):
         self._served = False
         self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
-        self._stride_searches: dict[str, StrideSearch] = {}
-        """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
-        self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
         self._member.needs(f"a tree of {self._target}", lambda: self._planner.tree.ready or self._served_by_search)
 
@@ -151,7 +148,6 @@ class PlannerService(PlanningProcess):
             route_cells=scenario.vehicles.route_cells,
             stopwatch=self._stopwatch,
             newest_mark_ns=self._replica.take_newest_stamp_ns if is_ground else lambda: None,
-            shelf=self._prepared if is_ground else None,
             leads=False,
             target_search=self._search,
             vehicle_class=name,
@@ -191,8 +187,9 @@ class PlannerService(PlanningProcess):
                 self._on_sighted(sighted, now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns):
                 self._on_grown(tag, grown, took_ns, now_ns)
-            case WorkDone(tag=tag, result=StrideSearch() as search):
-                self._on_strides(tag, search)
+            case WorkDone(tag=tag, result=FoundStrides() as found):
+                if (asked_by := self._asked_by(tag)) is not None:
+                    asked_by.adopt_strides(found)
             case _:
                 super().handle(event, now_ns)
 
@@ -201,13 +198,6 @@ class PlannerService(PlanningProcess):
         if planner is not None:
             self._perform(planner, planner.adopt(grown, took_ns, now_ns), now_ns)
         self._answer(now_ns)
-
-    def _on_strides(self, tag: str, search: StrideSearch) -> None:
-        self._finding_strides = None
-        planner = self._asked_by(tag)
-        if search.network is not None and planner is not None:
-            del self._stride_searches[tag]
-            planner.adopt_strides(search)
 
     def tick(self, now_ns: int) -> None:
         self._take_collected(now_ns)
@@ -225,7 +215,6 @@ class PlannerService(PlanningProcess):
         self._obedience.tick(now_ns)
         self._forced = False
         self._answer(now_ns)
-        self._look_for_strides()
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
@@ -255,15 +244,6 @@ class PlannerService(PlanningProcess):
             name = heard.message.vehicle_class
             if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
                 self._planners.used(name, now_ns).on_chasers(heard.message, now_ns)
-
-    def _look_for_strides(self) -> None:
-        for tag in list(self._stride_searches):
-            if self._asked_by(tag) is None:
-                del self._stride_searches[tag]
-        if self._finding_strides is None and self._stride_searches:
-            self._finding_strides, search = next(iter(self._stride_searches.items()))
-            model_ns = self._planner.tree.times.model_ns
-            self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
 
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         if not self._listens or not self._sightings.receive(sighted, now_ns):
@@ -404,8 +384,8 @@ class PlannerService(PlanningProcess):
             match action:
                 case GrowTree(job):
                     self._worker.submit(self._tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
-                case FindStrides(search):
-                    self._stride_searches[self._tag(_STRIDES, name)] = search
+                case FindStrides(job):
+                    self._worker.submit(self._tag(_STRIDES, name), job, self._post, planner.tree.times.model_ns)
                 case PlannerStatus() if name != GROUND:
                     pass  # the planner of "ground" has published the same about the target
                 case PushedRoute() as pushed:

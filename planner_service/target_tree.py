@@ -26,7 +26,7 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.route_bounds import LowerBounds, read_routes
-from planner_service.tree.strides import StrideNetwork, StrideSearch, StrideShelf, StrideUpkeep
+from planner_service.tree.strides import FoundStrides, StrideNetwork, StrideUpkeep
 from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -228,13 +228,13 @@ class TargetTree:
         """Please run `stride_job` on a worker, and `take_strides` once it has found them."""
         return self.strategy.thins_far_cells and self._loaded and self._strides.wanted
 
-    def stride_job(self, shelf: StrideShelf | None = None) -> StrideSearch:
-        """See `StrideUpkeep.search`."""
-        return self._strides.search(self._costs, shelf)
+    def stride_job(self) -> Callable[[], FoundStrides]:
+        """See `StrideUpkeep.job`."""
+        return self._strides.job(self._costs)
 
-    def take_strides(self, search: StrideSearch) -> None:
+    def take_strides(self, found: FoundStrides) -> None:
         """Goes by the networks that were found."""
-        self._strides.take(self._costs, search)
+        self._strides.take(self._costs, found)
 
     def adopt(
         self,

@@ -1,10 +1,10 @@
-"""Networks of strides on which far cells are planned (section 3.3.3): found, shared, and rebuilt."""
+"""Networks of strides on which far cells are planned (section 3.3.3): found, and rebuilt."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,6 @@ STALE_SHARE = 16
 """Networks are rebuilt when cells have changed in one block of the least stride in this number
 (docs/design/windows-and-strides.md)."""
 
-_HEADER = 32
-"""Bytes: four numbers of eight."""
-_DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.uint8, np.uint8)
-
 
 class StrideNetwork:
     """Nodes, links and their ways, of every stride: what a coarse growth goes along.
@@ -38,12 +34,10 @@ class StrideNetwork:
     therefore never make it wrong, only less good.
 
     arrays  for kernels
-    size    padded cells of the map that it is of
     """
 
-    def __init__(self, arrays: Network, size: int) -> None:
+    def __init__(self, arrays: Network) -> None:
         self.arrays = arrays
-        self.size = size
         self._changed: Bools = np.empty(0, np.bool_)
         """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
 
@@ -56,80 +50,12 @@ class StrideNetwork:
         self._changed[(rows >> LEAST) * across + (cols >> LEAST)] = True
         return int(np.count_nonzero(self._changed)) * STALE_SHARE <= self._changed.size
 
-    def packed(self) -> Bytes:
-        """All of it as uint8, for a file."""
-        centre, doublings, first, other, price, begin, steps, paths = self.arrays
-        counts = np.array((centre.size, other.size, paths.size, self.size), np.int64)
-        parts = (counts, centre, first, other, price, begin, steps, doublings, paths)
-        return np.concatenate([part.view(np.uint8) for part in parts])
 
-    @classmethod
-    def unpacked(cls, packed: Bytes) -> StrideNetwork:
-        """Reads the output of `packed`, whose memory it shares."""
-        nodes, links, steps, size = packed[:_HEADER].view(np.int64).tolist()
-        sizes = (nodes, nodes + 1, links, links, links, links, nodes, steps)
-        lengths = [many * np.dtype(dtype).itemsize for many, dtype in zip(sizes, _DTYPES, strict=True)]
-        parts = np.split(packed[_HEADER:], np.cumsum(lengths)[:-1])
-        centre, first, other, price, begin, signed, doublings, paths = (
-            part.view(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)
-        )
-        return cls((centre, doublings, first, other, price, begin, signed, paths), size)
+class FoundStrides(NamedTuple):
+    """A network, and the cell costs of the map on which it was found."""
 
-
-class StrideShelf(Protocol):
-    """Shared store of the networks of the map before any mark, so that one planner of a machine finds them for
-    all."""
-
-    def load(self) -> Bytes | None:
-        """Returns the stored network, as `StrideNetwork.packed`; the caller may write to it."""
-        ...
-
-    def claim(self) -> bool:
-        """Returns True if the caller is the one to find them: true again at its next call, until `leave` or its
-        end."""
-        ...
-
-    def leave(self, packed: Bytes) -> None:
-        """Stores the found network for all."""
-        ...
-
-
-class StrideSearch:
-    """Finds the networks of a map, the least stride first, each from the ways of the one before.
-
-    A step finds those of one stride, so that a worker has time for other work between them. With a shelf, a step
-    may do nothing while another process is finding the same.
-
-    cost_grid  a snapshot
-    network    None until the search has ended
-    """
-
-    def __init__(self, cost_grid: CostGrid, shelf: StrideShelf | None = None) -> None:
-        self.cost_grid = cost_grid
-        self.network: StrideNetwork | None = None
-        self._shelf = shelf
-        self._strides: Iterator[StrideNetwork | None] | None = None
-
-    def step(self) -> StrideSearch:
-        """Come a step nearer to `network`, which is None now. Returns itself."""
-        if self._strides is None:
-            if self._shelf is not None:
-                packed = self._shelf.load()
-                if packed is not None:
-                    self.network = StrideNetwork.unpacked(packed)
-                if packed is not None or not self._shelf.claim():
-                    return self
-            self._strides = _find(self.cost_grid)
-        self.network = next(self._strides)
-        if self._shelf is not None and self.network is not None:
-            self._shelf.leave(self.network.packed())
-        return self
-
-    def run(self) -> StrideSearch:
-        """All steps at once; not for a search that may wait for another process."""
-        while self.network is None:
-            self.step()
-        return self
+    network: StrideNetwork
+    cell_cost: Floats
 
 
 class StrideUpkeep:
@@ -140,27 +66,24 @@ class StrideUpkeep:
 
     def __init__(self) -> None:
         self.network: StrideNetwork | None = None
-        self._searching = self._found_before = False
+        self._searching = False
 
     @property
     def wanted(self) -> bool:
         """Returns True if a search should begin."""
         return self.network is None and not self._searching
 
-    def search(self, cost_grid: CostGrid, shelf: StrideShelf | None) -> StrideSearch:
-        """The first search is on the map as it was before any mark, if that is shared, so that all planners of a
-        machine can take the same. Later ones, of networks that have become stale, are on the map as it is."""
+    def job(self, cost_grid: CostGrid) -> Callable[[], FoundStrides]:
+        """Returns a search for a worker, on the map as it is now."""
         self._searching = True
-        shared = None if self._found_before else cost_grid.shared
-        self._found_before = True
-        return StrideSearch(cost_grid.snapshot()) if shared is None else StrideSearch(shared, shelf)
+        snapshot = cost_grid.snapshot()
+        return lambda: FoundStrides(_find(snapshot), snapshot.cell_cost)
 
-    def take(self, cost_grid: CostGrid, search: StrideSearch) -> None:
+    def take(self, cost_grid: CostGrid, found: FoundStrides) -> None:
         """Uses the found network; later changes count as learnt."""
-        assert search.network is not None
         self._searching = False
-        self.network = search.network
-        self.learn(cost_grid, cost_grid.changes_since(search.cost_grid.cell_cost))
+        self.network = found.network
+        self.learn(cost_grid, cost_grid.changes_since(found.cell_cost))
 
     def learn(self, cost_grid: CostGrid, changes: Changes) -> None:
         """The map has changed."""
@@ -193,21 +116,19 @@ def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
     return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
 
 
-def _find(grid: CostGrid) -> Iterator[StrideNetwork | None]:
-    """Finds one stride at a time; the last item is the network."""
+def _find(grid: CostGrid) -> StrideNetwork:
+    """Finds the least stride first, each from the ways of the one before."""
     node = _all_cells(grid)
     centres: list[NDArray[np.uint32]] = []
     links: list[Links] = []
     side = max(grid.grid.rows, grid.grid.cols)
     most = max(LEAST, (side // MOST_SHARE).bit_length() - 1)
     for doublings in range(LEAST, most + 1):
-        if centres:
-            yield None
         below = centres[-1].astype(np.int64) if centres else np.empty(0, np.int64)
         centre, found = _find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
         centres.append(centre)
         links.append(found)
-    yield StrideNetwork(_joined(centres, links), grid.size)
+    return StrideNetwork(_joined(centres, links))
 
 
 def _find_stride(

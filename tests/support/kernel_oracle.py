@@ -8,7 +8,7 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import StrideNetwork, StrideSearch
+from planner_service.tree.strides import StrideNetwork, StrideUpkeep
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -30,9 +30,7 @@ def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
 
 def find_strides(cost_grid: CostGrid) -> StrideNetwork:
     """The networks of a map, at once."""
-    network = StrideSearch(cost_grid).run().network
-    assert network is not None
-    return network
+    return StrideUpkeep().job(cost_grid)().network
 
 
 def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:

@@ -91,13 +91,6 @@ def test_a_window_lies_inside_the_grid(tree: CostToGoTree, window: Window) -> No
         tree.grow_strides(window, network, 9)
 
 
-def test_strides_are_of_the_map_that_the_tree_lies_on(tree: CostToGoTree) -> None:
-    other = CostGrid(GridSpec(9, 9, 1.0), PlannerConfig())
-    other.load(np.ones((9, 9), np.float32))
-    with pytest.raises(ValueError, match="networks of 121 padded cells, the map has 110"):
-        tree.grow_strides(GRID.window, find_strides(other), 9)
-
-
 @pytest.mark.parametrize(("root", "window"), [(1, Window(0, 1, 4, 4)), (70, Window(0, 0, 4, 4))])
 def test_a_window_holds_the_old_root_and_the_new_one(tree: CostToGoTree, root: int, window: Window) -> None:
     with pytest.raises(OutsideGridError):
