@@ -23,7 +23,7 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
-COARSE = ("multi_resolution", "variable_range+multi_resolution", "auto")
+COARSE = ("multi_resolution", "variable_range+multi_resolution")
 
 
 def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
@@ -115,18 +115,15 @@ def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_w
             assert AHEAD * grid.distance_cells(since[wide], cell) < wide or wide == 8
 
 
-def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> None:
+def test_auto_grows_exactly_then_rotates_and_does_not_flap() -> None:
     auto = Auto()
     stages = []
-    for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
+    for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 6):
         auto.row(
             Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20, exact_ns=full_ms * 1e6)
         )
         stages.append(auto.stage)
-    assert stages == [
-        *("exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate"),
-        *("rotate", "coarsen", "coarsen", "coarsen", "rotate", "rotate", "exact"),
-    ]
+    assert stages == ["exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate", "rotate", "exact"]
 
 
 @pytest.mark.parametrize("rules", RULES)
