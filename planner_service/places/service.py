@@ -10,17 +10,15 @@ asked.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planner_service.followers import Followers
-from planner_service.goal_trees import GoalAnswer, GoalTrees
+from planner_service.goal_trees import GoalTrees
 from planner_service.planner import FOLLOWER_LEASE_NS, MOST_ROUTES, MOST_STEPS
 from planner_service.planning_process import PlanningProcess
 from planner_service.tree.cost_grid import CostGrid
@@ -40,14 +38,14 @@ from swarm.config.agents import (
 from swarm.config.explain import choice
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
-from swarm.grid import GridSpec, Window
+from swarm.grid import Window
 from swarm.liveness import job_of
 from swarm.runtime.fair_queue import FairQueue
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import LETHAL_START, NO_TARGET, OK, OUTSIDE, UNREACHABLE, RouteBatch, directions_of
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, is_own
 
 log = logging.getLogger(__name__)
@@ -64,10 +62,6 @@ _KEEPS_UP_NS = NS_PER_S
 """While a question goes on, its map is so old at most: else marks beside a goal would end no growth."""
 _CELL_NS = 25
 """Time that a simulation counts for a cell grown."""
-_STATUSES = {
-    "ok": OK, "unreachable": UNREACHABLE, "outside": OUTSIDE, "lethal_start": LETHAL_START,
-    "lethal_goal": UNREACHABLE, "growing": NO_TARGET,
-}  # fmt: skip
 
 
 @dataclass(slots=True, eq=False)
@@ -81,15 +75,20 @@ class _Question:
     asker: str
     request: PlaceRouteRequest
     asked_ns: int
-    found: list[GoalAnswer] = field(default_factory=list)
-    rests: list[float] = field(default_factory=list)
-    """s, what remains after the steps of each route that are given."""
+    found: list[Route] = field(default_factory=list)
+    lethal_goal: bool = False
     version: int = -1
     """Version of the map on which they were found."""
 
     @property
     def done(self) -> bool:
         return len(self.found) == len(self.request.cells)
+
+    @property
+    def routes(self) -> RouteBatch:
+        """The routes as they are known. Those which are still to be found have the status NO_TARGET."""
+        unknown = self.request.cells[len(self.found) :]
+        return RouteBatch.of(self.found + [Route(status=RouteStatus.NO_TARGET, start=cell) for cell in unknown])
 
 
 class _News(NamedTuple):
@@ -124,8 +123,7 @@ class _ClassTrees:
     def __init__(self, cost_map: CostMap, config: PlannerConfig, budget_bytes: int, route_cells: int) -> None:
         self.cost_map = cost_map
         self.followers = Followers(cost_map.grid, FOLLOWER_LEASE_NS, route_cells)
-        self._costs = CostGrid(cost_map.grid, config, cost_map.terrain.climb)
-        self.trees = GoalTrees(self._costs, budget_bytes)
+        self.trees = GoalTrees(CostGrid(cost_map.grid, config, cost_map.terrain.climb), budget_bytes)
         self._version = -1
         """Version of the map that the trees know."""
         self.kept_up_ns = 0
@@ -149,9 +147,9 @@ class _ClassTrees:
         changed: Sequence[Window] = ()
         cheaper = False
         if news is not None and self._version < 0:
-            self._costs.load(news.pace)
+            self.trees.costs.load(news.pace)
         elif news is not None:
-            changes = self._costs.apply(news.pace, news.windows)
+            changes = self.trees.costs.apply(news.pace, news.windows)
             self.trees.changed(changes)
             changed, cheaper = news.windows, bool((changes.after < changes.before).any())
         if news is not None:
@@ -161,66 +159,26 @@ class _ClassTrees:
     def _answer(self, question: _Question) -> int:
         request, grown = question.request, 0
         if question.version != self._version:
-            question.found, question.rests, question.version = [], [], self._version
-        most, walked = _most_steps(request), 0
+            question.found, question.version = [], self._version
+        most, walked = MOST_STEPS // max(len(request.cells), 1), 0
+        most = min(request.max_cells or most, most)
         while not question.done and grown + walked < SLICE_CELLS:
             start = request.cells[len(question.found)]
-            answer = self.trees.ask(request.to, start, SLICE_CELLS - grown)
+            answer = self.trees.ask(request.to, start, SLICE_CELLS - grown, most)
             grown += answer.grown_cells
-            if answer.status == "growing":
+            if answer.grows:
                 break
-            rest, walked = 0.0, walked + answer.cells.size
-            if most < answer.cells.size - 1:
-                rest = self.trees.ask(request.to, int(answer.cells[most]), SLICE_CELLS).cost_s
-                answer = replace(answer, cells=answer.cells[: most + 1].copy())
-            question.found.append(answer)
-            question.rests.append(rest)
+            walked += 1 + len(answer.route.directions)
+            question.found.append(answer.route)
+            question.lethal_goal = answer.lethal_goal
         return grown
 
-    def routes(self, question: _Question) -> RouteBatch:
-        """The routes as they are known. Those which are still to be found have the status NO_TARGET."""
-        return _batch(question.found, question.request.cells, question.rests, self._costs)
-
     def status(self, question: _Question) -> PlaceStatus:
-        if any(each.status == "lethal_goal" for each in question.found):
+        if question.found and question.lethal_goal:
             return "lethal_goal"
-        if not 0 <= question.request.to < self._costs.grid.cells:
+        if not 0 <= question.request.to < self.cost_map.grid.cells:
             return "outside_goal"
         return "ok" if question.done else "growing"
-
-
-def _most_steps(request: PlaceRouteRequest) -> int:
-    """Steps of each route: as many as are asked for, and fit into one answer."""
-    most = MOST_STEPS // max(len(request.cells), 1)
-    return min(request.max_cells or most, most)
-
-
-def _batch(found: list[GoalAnswer], cells: list[int], rests: list[float], costs: CostGrid) -> RouteBatch:
-    """The routes of some answers."""
-    grid: GridSpec = costs.grid
-    codes = [directions_of(each.cells, grid.cols) for each in found]
-    unknown = len(cells) - len(found)
-    codes += [b""] * unknown
-    lengths = [_length_m(each, costs) for each in codes]
-
-    def column(values: list[float], rest: float) -> NDArray[np.float64]:
-        return np.array([*values, *[rest] * unknown], np.float64)
-
-    return RouteBatch(
-        np.array([*(_STATUSES[each.status] for each in found), *[NO_TARGET] * unknown], np.uint8),
-        np.array(cells, np.int64),
-        np.frombuffer(b"".join(codes), np.uint8),
-        np.cumsum([len(each) for each in codes], dtype=np.int64),
-        column([each.cost_s for each in found], math.inf),
-        column([each.lower_bound_s if each.status == "ok" else 0.0 for each in found], 0.0),
-        np.array(lengths, np.float64),
-        column(rests, 0.0),
-    )
-
-
-def _length_m(codes: bytes, costs: CostGrid) -> float:
-    diagonal = np.count_nonzero(np.frombuffer(codes, np.uint8) & 1)
-    return float((len(codes) - diagonal + diagonal * costs.diagonal) * costs.grid.resolution_m)
 
 
 class PlacesService(PlanningProcess):
@@ -368,7 +326,7 @@ class PlacesService(PlanningProcess):
         self._go_on()
 
     def _reply(self, trees: _ClassTrees, question: _Question, event: Asked, now_ns: int) -> None:
-        request, routes = question.request, trees.routes(question)
+        request, routes = question.request, question.routes
         reply = PlaceRouteReply(
             to_cell=request.to,
             incarnation=self._incarnation,
@@ -430,7 +388,7 @@ class PlacesService(PlanningProcess):
         request, followers = question.request, trees.followers
         batch = [(id, follower) for id in request.vehicles if (follower := followers.get(id)) is not None]
         batch = [each for each in batch if each[1].goal == request.to]
-        routes = trees.routes(question)
+        routes = question.routes
         for id, route in followers.pushed(batch, routes, now_ns + self._push_ns) if batch else ():
             self._push(
                 PushedRoute(
