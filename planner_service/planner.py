@@ -18,7 +18,7 @@ from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import FoundStrides
+from planner_service.tree.strides import StrideNetwork
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -125,7 +125,7 @@ class Planner:
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
         climb = cost_map.terrain.climb
-        self._gaps = GapStatistics(self._grid, config, counters, climb)
+        self._gaps = GapStatistics(config, counters)
         pace, resolution_m = cost_map.pace_s_per_m, self._grid.resolution_m
         self._puller = Puller(pace, resolution_m, config, climb) if pulls(config, climb) else None
         self._status_due_ns = 0
@@ -217,11 +217,11 @@ class Planner:
         else:
             self.counters.count("growths_late")
             self._exact_ns = snapshot_ns
-        self._gaps.adopted(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+        self._gaps.adopted(self.tree, now_ns)
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
 
-    def adopt_strides(self, found: FoundStrides) -> None:
+    def adopt_strides(self, found: StrideNetwork) -> None:
         """Goes by what the worker found."""
         self.tree.take_strides(found)
 
@@ -338,7 +338,7 @@ class Planner:
         if update.kind in ("full", "bounded", "exact"):
             self._exact_ns = now_ns
             self._record_growth(took_ns - update.repair_ns, update.kind)
-            self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+            self._gaps.record_growth(self.tree, self.followers, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)

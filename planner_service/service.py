@@ -16,7 +16,7 @@ from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import FoundStrides
+from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_filter import readable_for_target
@@ -187,7 +187,7 @@ class PlannerService(PlanningProcess):
                 self._on_sighted(sighted, now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns):
                 self._on_grown(tag, grown, took_ns, now_ns)
-            case WorkDone(tag=tag, result=FoundStrides() as found):
+            case WorkDone(tag=tag, result=StrideNetwork() as found):
                 if (asked_by := self._asked_by(tag)) is not None:
                     asked_by.adopt_strides(found)
             case _:

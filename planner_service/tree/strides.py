@@ -1,8 +1,7 @@
-"""Networks of strides on which far cells are planned (section 3.3.3): found, and rebuilt."""
+"""Networks of strides on which far cells are planned (section 3.3.3), and how they are found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,9 +10,9 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import stride_network
 from planner_service.kernels.stride_growth import Network
-from planner_service.tree.cost_changes import Cells, Changes
+from planner_service.tree.cost_changes import Cells
 from planner_service.tree.cost_grid import CostGrid
-from shared_map.array_files import Bools, Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 
 LEAST = 4
 """Doublings of the least stride that has a network: 16 cells. Shorter strides are single steps, near the target: a
@@ -22,12 +21,9 @@ FINE = 8
 """Strides below the least one serve this multiple of the narrowest window: there all cells are searched."""
 MOST_SHARE = 8
 """The largest stride is at most such a share of the map's side (docs/design/windows-and-strides.md)."""
-STALE_SHARE = 16
-"""Networks are rebuilt when cells have changed in one block of the least stride in this number
-(docs/design/windows-and-strides.md)."""
 
 
-class StrideNetwork:
+class StrideNetwork(NamedTuple):
     """Nodes, links and their ways, of every stride: what a coarse growth goes along.
 
     Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. Marks
@@ -36,59 +32,7 @@ class StrideNetwork:
     arrays  for kernels
     """
 
-    def __init__(self, arrays: Network) -> None:
-        self.arrays = arrays
-        self._changed: Bools = np.empty(0, np.bool_)
-        """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
-
-    def learn(self, cost_grid: CostGrid, changes: Changes) -> bool:
-        """Cells have changed. False once the networks should be rebuilt."""
-        across = (cost_grid.stride >> LEAST) + 1
-        if not self._changed.size:
-            self._changed = np.zeros(((cost_grid.size // cost_grid.stride >> LEAST) + 1) * across, np.bool_)
-        rows, cols = np.divmod(changes.cells, cost_grid.stride)
-        self._changed[(rows >> LEAST) * across + (cols >> LEAST)] = True
-        return int(np.count_nonzero(self._changed)) * STALE_SHARE <= self._changed.size
-
-
-class FoundStrides(NamedTuple):
-    """A network, and the cell costs of the map on which it was found."""
-
-    network: StrideNetwork
-    cell_cost: Floats
-
-
-class StrideUpkeep:
-    """The networks of one tree, from search to search.
-
-    network  None until found, and again once too much has changed
-    """
-
-    def __init__(self) -> None:
-        self.network: StrideNetwork | None = None
-        self._searching = False
-
-    @property
-    def wanted(self) -> bool:
-        """Returns True if a search should begin."""
-        return self.network is None and not self._searching
-
-    def job(self, cost_grid: CostGrid) -> Callable[[], FoundStrides]:
-        """Returns a search for a worker, on the map as it is now."""
-        self._searching = True
-        snapshot = cost_grid.snapshot()
-        return lambda: FoundStrides(_find(snapshot), snapshot.cell_cost)
-
-    def take(self, cost_grid: CostGrid, found: FoundStrides) -> None:
-        """Uses the found network; later changes count as learnt."""
-        self._searching = False
-        self.network = found.network
-        self.learn(cost_grid, cost_grid.changes_since(found.cell_cost))
-
-    def learn(self, cost_grid: CostGrid, changes: Changes) -> None:
-        """The map has changed."""
-        if self.network is not None and changes.cells.size and not self.network.learn(cost_grid, changes):
-            self.network = None
+    arrays: Network
 
 
 def one_stride(cost_grid: CostGrid, stride: int) -> tuple[NDArray[np.uint32], Links]:
@@ -116,8 +60,8 @@ def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
     return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
 
 
-def _find(grid: CostGrid) -> StrideNetwork:
-    """Finds the least stride first, each from the ways of the one before."""
+def find_strides(grid: CostGrid) -> StrideNetwork:
+    """Finds the network of a map: the least stride first, each from the ways of the one before."""
     node = _all_cells(grid)
     centres: list[NDArray[np.uint32]] = []
     links: list[Links] = []

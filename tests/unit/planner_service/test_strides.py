@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import find_strides
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Move, random_pace
 
@@ -21,7 +20,7 @@ from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec
 
 COARSE = ("multi_resolution", "variable_range+multi_resolution")
 
@@ -78,19 +77,6 @@ def test_far_from_the_target_strides_hold_where_windows_alone_drift() -> None:
         gaps[has_strides] = float((routes.cost_s[some] / optimum[some]).mean())
     assert gaps[True] < 1.03
     assert gaps[False] > 1.1
-
-
-def test_networks_are_found_anew_once_cells_have_changed_all_over_the_map() -> None:
-    ground = CostGrid(GridSpec(128, 128, 1.0), PlannerConfig())
-    pace = np.ones((128, 128), np.float32)
-    ground.load(pace)
-    network = find_strides(ground)
-    pace[60:70, 60:70] = np.inf
-    assert network.learn(ground, ground.apply(pace, [Window(60, 60, 70, 70)]))
-    pace[60:70, 60:70] = 3.0
-    assert network.learn(ground, ground.apply(pace, [Window(60, 60, 70, 70)]))
-    pace[:] = 2.0
-    assert not network.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
 
 
 @given(st.integers(0, 2**31), st.integers(1, 60))

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.kernel_oracle import find_strides
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_bounds import LowerBounds
+from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
