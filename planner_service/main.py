@@ -49,7 +49,6 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.worker(worker),
             boundary.function("stopwatch", time.thread_time_ns, int),
             boundary.function("all kernels", lambda: kernels.complete, bool),
-            boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
             boundary.external(prepared, PREPARED_COSTS),
         )
 

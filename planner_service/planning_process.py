@@ -30,7 +30,8 @@ class PlanningProcess:
 
     groups         those whose marks it may know; None if all
     served         topics that the leader serves, and the fields of their keys
-    class_kernels  whether those of all classes may be called by now, not only of "ground"; if not given, they may
+    all_kernels    whether all may be called by now, not only those for whole trees of "ground"; if not given, they
+                   may
     """
 
     def __init__(
@@ -42,13 +43,13 @@ class PlanningProcess:
         worker: Worker,
         groups: frozenset[str] | None,
         served: Mapping[Topic, dict[str, str]],
-        class_kernels: Callable[[], bool] | None,
+        all_kernels: Callable[[], bool] | None,
     ) -> None:
         scenario = setup.scenario
         self._scenario, self._job, self._incarnation = scenario, job_of(setup.id), setup.incarnation
         self._bus, self._post, self._worker = bus, post, worker
         self._served_topics = served
-        self._class_kernels = class_kernels or (lambda: True)
+        self._all_kernels = all_kernels or (lambda: True)
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters

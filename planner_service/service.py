@@ -70,8 +70,6 @@ class PlannerService(PlanningProcess):
 
     stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
                   model is used
-    all_kernels   whether all kernels may be called by now, not only those for whole trees; if not given, they may
-    class_kernels whether those for whole trees of all classes may, not only of "ground"; if not given, they may
     """
 
     def __init__(
@@ -83,16 +81,14 @@ class PlannerService(PlanningProcess):
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
         all_kernels: Callable[[], bool] | None = None,
-        class_kernels: Callable[[], bool] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
         scenario, self._target = setup.scenario, job_of(setup.id)
         self._heard_groups = readable_for_target(scenario, self._target)
         key = {"target": self._target}
         served = dict.fromkeys((ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST), key)
-        super().__init__(setup, terrain, bus, post, worker, self._heard_groups, served, class_kernels)
+        super().__init__(setup, terrain, bus, post, worker, self._heard_groups, served, all_kernels)
         self._stopwatch, self._prepared = stopwatch, prepared
-        self._all_kernels = all_kernels or (lambda: True)
         # Position of the target.
         self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
         self._untracked = self._target in scenario.untracked
@@ -112,7 +108,7 @@ class PlannerService(PlanningProcess):
         hidden = hidden_target(scenario, self._target, setup.incarnation)
         self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
         self._planner = self._new_planner(GROUND, self._cost_maps[GROUND], tree)
-        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._class_kernels)
+        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._all_kernels)
         self._obeyed_version = 0
         self._removed = False
         """True if its target was removed: then it serves no queries."""

@@ -191,11 +191,11 @@ class PlacesService(PlanningProcess):
         bus: Bus,
         post: Post,
         worker: Worker,
-        class_kernels: Callable[[], bool] | None = None,
+        all_kernels: Callable[[], bool] | None = None,
     ) -> None:
         job, groups = job_of(setup.id), readable_groups(setup.scenario, job_of(setup.id))
         served = {PLACE_ROUTE: {"places": job}}
-        super().__init__(setup, terrain, bus, post, worker, groups, served, class_kernels)
+        super().__init__(setup, terrain, bus, post, worker, groups, served, all_kernels)
         self._push_ns = int(setup.scenario.planner.push_s * NS_PER_S)
         self._foreign = {
             asker_of("agent", plan.id): plan.group.name
@@ -264,7 +264,7 @@ class PlacesService(PlanningProcess):
             self._refuse(event, f"{event.asker} is of group {self._foreign[event.asker]}: ask its own places")
         elif len(request.cells) > MOST_ROUTES:
             self._refuse(event, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
-        elif name != GROUND and not self._class_kernels():
+        elif name != GROUND and not self._all_kernels():
             self._refuse(event, f"the kernels for class {name} are still being compiled")
         else:
             self._wait(_Question(event, event.asker, request, now_ns))
@@ -371,7 +371,7 @@ class PlacesService(PlanningProcess):
                 self._trees(heard.message.vehicle_class).followers.on_chasers(heard.message, now_ns)
         for name, trees in self._classes.items():
             trees.followers.drop_silent(now_ns)
-            if not self._leads or (name != GROUND and not self._class_kernels()):
+            if not self._leads or (name != GROUND and not self._all_kernels()):
                 continue
             if len(trees.followers) and trees.cost_map.dirty and not self._waiting:
                 self._wait(_Question(None, self._job, PlaceRouteRequest(to=0, vehicle_class=name), now_ns))

@@ -98,7 +98,6 @@ def test_what_a_planner_reads_of_clock_and_kernels_is_an_input(
     live = {
         "stopwatch": time.thread_time_ns,
         "all kernels": lambda: next(calls) > 40,
-        "kernels of classes": lambda: True,
         "modules of zones": lambda: True,
     }
     function, outside = Recording.function, Recording.external
