@@ -88,7 +88,7 @@ class GoalTrees:
         self._growth = PartialGrowth(costs)
         self._offsets = step_offsets(costs.stride).astype(np.int64)
         self._lengths = np.array((1.0, costs.diagonal))
-        """Of a straight and a diagonal step."""
+        """Lengths of a straight and of a diagonal step."""
         self._in_hand: _Kept | None = None
         # By goal, in the order of their last asks.
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
