@@ -38,7 +38,6 @@ BENCHMARKS = {
     "gap": "bench.planning.strategies",
     "scale": "bench.planning.strategies",
     "certificates": "bench.planning.certificates",
-    "pulled": "bench.planning.pulled",
     "terrain": "bench.terrain",
     "compaction": "bench.wire.map_work",
     "wire": "bench.wire.beside_zenoh",

@@ -248,20 +248,6 @@ def test_garbage_on_the_wire_changes_nothing(payload: bytes, topic: Topic) -> No
     assert swarm.buses["planner-t-1"].counts["payloads_dropped"] == 1
 
 
-def test_the_same_events_give_the_same_messages_byte_for_byte() -> None:
-    def run() -> list[tuple[int, str, str, str, bytes]]:
-        swarm = Swarm(rough(2), "auto", cpu_budget=RENEWS)
-        for n in range(20):
-            swarm.cells["t"] = GRID.cell(20, 10 + n)
-            swarm.report(("v", GRID.cell(20, 0)), ("w", GRID.cell(20, 49)))
-            swarm.mark(n * 31)
-            swarm.ear.routes(n, n + 1, force=n % 3 == 0, vehicles=["x", "y"])
-            swarm.run(0.1)
-        return swarm.deliveries
-
-    assert run() == run()
-
-
 def test_questions_that_waited_for_a_tree_are_answered_in_bounded_work_a_tick_and_agents_first() -> None:
     """400 expensive questions of ten sessions wait for the first tree, and then one of a vehicle."""
     swarm = Swarm()
