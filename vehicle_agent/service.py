@@ -266,7 +266,9 @@ class AgentService:
         paths = agent.holdings.paths
         self._tell_goals(now_ns)
         chasing = [
-            (id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items() if vehicle.goal is None
+            (id, vehicle.target, paths[id][: agent.holdings.keeps + 1])
+            for id, vehicle in agent.vehicles.items()
+            if vehicle.goal is None
         ]
         for chasers in parts.chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
