@@ -30,7 +30,7 @@ _OCCUPIED = 0.9
 _LEAST_GAIN = 0.01
 """Advantage of the route's next cell over staying, at least, in cells."""
 FAR_CELLS = 8
-"""A vehicle with this number of cells ahead, or fewer, requests as many more: half of what a statement has room for."""
+"""A vehicle with no more cells than these ahead requests as many more: half of what a statement has room for."""
 _UNDER_WAY = Wish()
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
