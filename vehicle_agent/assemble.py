@@ -39,6 +39,7 @@ from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
+from vehicle_agent.traffic.steering import FAR_CELLS
 
 _ACTS = 5
 """Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them."""
@@ -91,7 +92,7 @@ class AgentParts:
         near = scenario.map.interest == "near"
         self.sync = MapSync(self.replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
         self.zones = ZonesAround(self.replica, self.maps)
-        lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
+        lead_cells = max(scenario.vehicles.reserve_cells, FAR_CELLS) + FAR_CELLS + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * range_m)
         self.near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))

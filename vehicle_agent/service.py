@@ -268,7 +268,8 @@ class AgentService:
         self._report(columns, now_ns)
         paths = agent.holdings.paths
         self._tell_goals(now_ns)
-        chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
+        kept = agent.holdings.keeps + 1
+        chasing = [(id, vehicle.target, paths[id][:kept]) for id, vehicle in agent.vehicles.items()]
         for chasers in parts.chasers.reports(chasing, now_ns):
             if chasers.target is None:
                 self._bus.publish(SENT, chasers, places=self._places_job, author=self._author)

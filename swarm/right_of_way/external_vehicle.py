@@ -9,13 +9,11 @@ from itertools import pairwise
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, Known, Left
 
-MOST_AHEAD = 16
-"""Cells ahead of itself that an external vehicle is granted at most."""
 _PATIENCE_NS = 3 * NS_PER_S
 """For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31

@@ -18,6 +18,8 @@ _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
 """A host that has not heard a shard's leader for so long speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
+MOST_AHEAD = 16
+"""Cells ahead that one statement may request."""
 _MOST_CELLS = 1 << 12
 """Cells whose shard is remembered: more than the vehicles of one host have near them."""
 
@@ -54,7 +56,7 @@ class _View:
     leader    of the last grant, and the time when that was received
     heard     the newest host state of ours that the table in use takes into account
     seen      vehicle -> its entries in the table in use
-    followed  other host -> entries of ours behind which its vehicles wait, by the same table
+    followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
     left      other host -> those of these that are over, as we told it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
     others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
@@ -86,6 +88,7 @@ class _Said(msgspec.Struct, frozen=True):
 
     wish: Wish
     path: list[int]
+    held: list[Number]
     stands: dict[int, _Told]
 
 
@@ -94,6 +97,7 @@ class Holdings:
 
     vehicles  those of the host; None for all that bear its name
 
+    keeps       cells ahead that a vehicle keeps though others wait for them
     generation  which generation of the host this is; 0 before `begin`
     shards      those that concern the host now: it speaks to their members and listens to their tables
     replaced    a later generation of this host has spoken: this one must end
@@ -105,6 +109,7 @@ class Holdings:
         self._shards = shards
         self._shard_of = lru_cache(_MOST_CELLS)(shards.of)
         self._agent = agent
+        self.keeps = MOST_AHEAD
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
         self.end()
@@ -126,6 +131,8 @@ class Holdings:
         self._stands: dict[int, dict[str, _Told]] = {}
         """Shard -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
+        self._followed: set[Number] = set()
+        """Entries of ours behind which others wait."""
         self._seq = 0
 
     def begin(self, generation: int, dead: Sequence[int]) -> None:
@@ -291,6 +298,11 @@ class Holdings:
         self._seen_anew.update(changed, [id for id in before if before[id] != view.seen.get(id)])
         for vehicle in changed & self._paths.keys():
             self._set_path(vehicle)
+        self._followed = {number for view in self._views.values() for number in chain(*view.followed.values())}
+        for vehicle in ours.keys() & self._paths.keys() if granted.followed else ():
+            far = [entry.number for entry in self._entries.paths[vehicle][self.keeps + 1 :]]
+            if not self._followed.isdisjoint(far):
+                self.give_back(vehicle, self.keeps + 1 + [number in self._followed for number in far].index(True))
         return self._place()
 
     def hear_left(self, left: Left) -> list[str]:
@@ -349,7 +361,7 @@ class Holdings:
             for host, numbers in view.followed.items():
                 told, told_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
-                if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
+                if host != self._agent and left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
@@ -362,7 +374,7 @@ class Holdings:
             if (
                 before is not None
                 and before.wish is wish
-                and before.path is path
+                and (before.path is path or self._is_no_news(before, path))
                 and not (anew and vehicle in anew)
             ):
                 continue
@@ -379,6 +391,13 @@ class Holdings:
             for vehicle in self._paths:
                 for shard, told in known[vehicle].stands.items():
                     self._stands.setdefault(shard, {})[vehicle] = told
+
+    def _is_no_news(self, said: _Said, path: list[int]) -> bool:
+        """Returns True if a vehicle has only driven on, out of cells for which none waits, and has as many ahead as
+        it keeps."""
+        left = len(said.path) - len(path)
+        drove = left > 0 and len(path) > self.keeps and said.path[left:] == path
+        return drove and self._followed.isdisjoint(said.held[:left])
 
     def _say_all_again(self) -> None:
         """Statements of all shards may change."""
@@ -432,9 +451,9 @@ class Holdings:
         held = [entry.number for entry in self._entries.paths[vehicle]]
         for shard in near:
             holds = held if len(near) == 1 else [number for number in held if shard_of(number[0]) == shard]
-            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms)
+            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms, self.keeps)
             stands[shard] = stand, (vehicle, path[0], holds, ahead, better)
-        return _Said(wish, path, stands)
+        return _Said(wish, path, held, stands)
 
     def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leaves the shards where we hold and want nothing, once their tables show that they know it."""

@@ -13,7 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table
-from vehicle_agent.traffic.shard_leader import Leader
+from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
 
 LEASE_NS = 3 * HEARTBEAT_NS
 """A leader that is silent for so long may be replaced, later where answers take long. Until then its members refuse
@@ -31,8 +31,6 @@ SLOW_NS = 3 * NS_PER_S // 10
 """Above this round trip a link is reported as slow: an election then takes longer than on a fast link."""
 _ASKED_KEPT = 16
 """Tables and claims of which it is kept when they were sent."""
-_TABLES_KEPT = 16
-"""More than may be on the way at once: an older one is never asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +315,7 @@ class Member:
             self._ask(table.stamp, now_ns)
             if table is not self.stored:
                 self.stored = table
-                self._told = [*self._told[-_TABLES_KEPT:], table]
+                self._told = [*self._told[-TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
             # A table on file with both others needs no more than its number: at rest tables were a fifth of all
             # bytes.
