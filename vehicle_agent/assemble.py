@@ -101,7 +101,8 @@ class AgentParts:
         layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
         side = scenario.map.plot_regions * REGION_CELLS
-        plots = Plots(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
+        others, proven = spawns.keys() - beside.keys(), scenario.network.tls is not None
+        plots = Plots(grid, list(beside), side, layer=int(self.flies), others=others, proven=proven)
         tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
         core = RightOfWay(
             setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns

@@ -13,7 +13,8 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
    back while the first is still used. Entries of the same vehicle, of an earlier life, do not count.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
 4. An entry that was left, given back or passed over is never used again by this host.
-5. A host acts on tables for its own life only, and in their order.
+5. A host acts on tables for its own life only, and in their order. It takes an entry only from the first table
+   that can list it: later its statements may have released the number.
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
    have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
    the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, at the end of the
@@ -83,7 +84,8 @@ class HostEntries:
     def hear_granted(self, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]) -> set[str]:
         """A usable table of a plot names these entries of our vehicles. Returns the vehicles of which the path has
         other entries now."""
-        if life != self.life or stamp <= self.knows.get(plot, BEFORE_ALL):
+        known = self.knows.get(plot, BEFORE_ALL)
+        if life != self.life or stamp <= known:
             return set()
         self.knows[plot] = stamp
         over = self.over.setdefault(plot, set())
@@ -96,7 +98,7 @@ class HostEntries:
                 if entry.number in at:
                     index = at[entry.number]
                     path[index] = self._waiting(entry, path[index].after)
-                elif entry.number not in over and self._follows(vehicle, path, entry):
+                elif entry.number[1:] > known and self._follows(vehicle, path, entry):
                     path.append(self._waiting(entry, entry.after))
                     longer.add(vehicle)
                 else:

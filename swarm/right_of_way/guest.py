@@ -12,7 +12,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Known, Left
+from swarm.wire.messages.traffic import Granted, Known, Left, Word
 
 MOST_AHEAD = 16
 """Cells ahead of itself that a guest is granted at most."""
@@ -156,8 +156,8 @@ class Guest:
         self._host.holdings.enter(self.vehicle, self._cell)
         return [SaveLives(self._lives)]
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> bool:
-        """A warden's word to us. Returns True if the vehicle has entered by it."""
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> bool:
+        """A warden's grant, or a member's word on one. Returns True if the vehicle has entered by it."""
         return bool(self._host.hear_granted(granted, now_ns))
 
     def hear_left(self, left: Left) -> bool:
@@ -249,7 +249,7 @@ class Removal:
         self._host.begin(sorted(self._lives)[1 - LIVES_KEPT :], chance)
         self._host.holdings.end_at_once()
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> None:
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> None:
         self._host.hear_granted(granted, now_ns)
 
     def tick(self, now_ns: int) -> list[Tell]:

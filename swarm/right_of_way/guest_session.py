@@ -25,8 +25,8 @@ from swarm.right_of_way.incarnations import MemoryLives
 from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
-from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left, Word
+from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING, WORD
 
 _NOBODY_NS = 10 * NS_PER_S
 """Time without a reply after which a guest is informed of it."""
@@ -84,15 +84,15 @@ class GuestService:
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role=_ROLE)
-        self._bus.subscribe(GRANTED, self._post, host=self.name)
-        self._bus.subscribe(LEFT, self._post, host=self.name)
+        for topic in (GRANTED, WORD, LEFT):
+            self._bus.subscribe(topic, self._post, host=self.name)
         self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
         self._began_ns = now_ns
         self._ask(now_ns)
 
     def stop(self) -> None:
-        self._bus.unsubscribe(GRANTED, host=self.name)
-        self._bus.unsubscribe(LEFT, host=self.name)
+        for topic in (GRANTED, WORD, LEFT):
+            self._bus.unsubscribe(topic, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
         """Asks for the cell on which the vehicle stands. Raises as `Guest.enter`."""
@@ -115,7 +115,7 @@ class GuestService:
     def on_guest_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about the right of way of this guest."""
         match event:
-            case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
+            case Heard(message=(Granted() | Word()) as granted) if granted.host == self.name:
                 if self.guest is not None:
                     self.guest.hear_granted(granted, now_ns)
             case Heard(topic=topic, message=Left() as left) if topic is LEFT and left.host == self.name:
@@ -160,7 +160,7 @@ class GuestService:
             if self.name in known.agents:
                 self._warn_once((f"{self.name} is an agent of this run's scenario: a guest needs another name",))
                 return
-            plots = Plots(self._grid, known.agents, known.plot_cells)
+            plots = Plots(self._grid, known.agents, known.plot_cells, proven=self._bus.proves_names)
             self.guest = Guest(plots, self.name, self._lives.lives)
             for peer in self._tokens:
                 self.guest.hear_token(peer, up=True)
@@ -399,6 +399,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     clock = MonotonicClock()
     bus.watch_alive(inbox.post)
     bus.subscribe(GRANTED, inbox.post, host=name)
+    bus.subscribe(WORD, inbox.post, host=name)
     bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
     removal: Removal | None = None
     begun, due_ns = False, 0
@@ -411,7 +412,8 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 if name in known.agents:
                     raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")
                 if removal is None or (not begun and known.plot_cells > removal.plots.side):
-                    removal = Removal(Plots(grid, known.agents, known.plot_cells), name)
+                    plots = Plots(grid, known.agents, known.plot_cells, proven=bus.proves_names)
+                    removal = Removal(plots, name)
                 if known.plot_cells == removal.plots.side:
                     removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
@@ -421,7 +423,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 begun = True
             case AskEnded() if not begun:
                 bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
-            case Heard(message=Granted() as granted) if removal is not None:
+            case Heard(message=(Granted() | Word()) as granted) if removal is not None:
                 removal.hear_granted(granted, now_ns)
             case _:
                 pass

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import blake2b
 from itertools import chain, takewhile
 
 import msgspec
@@ -12,7 +13,7 @@ import msgspec
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Entry, Granted, Left, Number, Stand, Standing
+from swarm.wire.messages.traffic import Entry, Granted, Left, Number, Stand, Standing, Word
 
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
@@ -39,6 +40,13 @@ _NO_WISH = Wish()
 _NO_STANDS: Mapping[str, _Told] = {}
 
 
+def part_of(life: int, grants: Mapping[str, Sequence[Entry]]) -> int:
+    """Returns a digest of what a table grants to one life of a host. 62 bits fit into a message, and a thief of a
+    name has a fraction of a second to find other grants with the same digest."""
+    said = msgspec.msgpack.encode((life, sorted(grants.items())))
+    return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
+
+
 @dataclass(frozen=True, slots=True)
 class Tell:
     """Send a standing to these members of its plot."""
@@ -59,6 +67,8 @@ class _View:
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet    the first standing from which on we want nothing here; None while we do
+    words    member -> its newest word, where names are proven; a grant is its warden's word
+    pending  warden -> its newest grant, until a majority has the same on file, and its digest
     told     the last statement about our vehicles, and its time
     same     whether the next statement is known to be the same
     """
@@ -72,6 +82,8 @@ class _View:
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
+    words: dict[str, Word] = field(default_factory=dict)
+    pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
     same: bool = False
@@ -246,6 +258,10 @@ class Holdings:
         """The vehicles that have entries in a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []
 
+    def is_pending(self, plot: int) -> bool:
+        """Returns True if a grant of a plot waits for words of its members."""
+        return plot in self._views and bool(self._views[plot].pending)
+
     def heard_ns(self, plot: int) -> int:
         """Time when a plot's warden was heard last; 0 if none was."""
         return self._views[plot].heard_ns if plot in self._views else 0
@@ -269,6 +285,56 @@ class Holdings:
         if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < knows:
             return []
         view.warden, view.heard_ns = granted.agent, now_ns
+        if not self._plots.proven:
+            return self._take(view, granted)
+        part = part_of(granted.life, granted.grants)
+        if granted.agent not in view.pending or granted.stamp >= view.pending[granted.agent][0].stamp:
+            view.pending[granted.agent] = granted, part
+        word = Word(
+            plot=granted.plot,
+            host=self._agent,
+            agent=granted.agent,
+            epoch=granted.epoch,
+            seq=granted.seq,
+            part=part,
+            promised=granted.epoch,
+        )
+        return self.hear_word(word)
+
+    def hear_word(self, word: Word) -> list[str]:
+        """A member has something on file for us: use the grants that a majority has. Returns the vehicles that have
+        found their place."""
+        if word.agent not in self._plots.members(word.plot):
+            return []
+        if word.asks:
+            self.watch([word.plot])
+        view = self._views.get(word.plot)
+        if view is None or (word.agent in view.words and word.stamp < view.words[word.agent].stamp):
+            return []
+        view.words[word.agent] = word
+        self._pass_over(word.plot, view)
+        placed: list[str] = []
+        for warden, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
+            same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
+            if same >= self._plots.majority:
+                del view.pending[warden]
+                placed += self._take(view, granted)
+        return placed
+
+    def _pass_over(self, plot: int, view: _View) -> None:
+        """Takes nothing more of epochs older than one which an honest member has promised. A member that has an
+        older table on file can then omit what only that one grants."""
+        promised = sorted((word.promised for word in view.words.values()), reverse=True)[self._plots.liars :][:1]
+        knows = self._entries.knows.get(plot)
+        if promised and knows is not None and knows[0] < promised[0] <= knows[0] + FURTHEST_EPOCH:
+            self._entries.knows[plot] = promised[0], 0
+            view.same = False
+
+    def _take(self, view: _View, granted: Granted) -> list[str]:
+        """Acts on a grant that counts."""
+        knows = self._entries.knows.get(granted.plot, BEFORE_ALL)
+        if granted.stamp < knows:
+            return []
         self.newest = max(self.newest, granted.life)
         if granted.life > self.life and not self.replaced:
             self.replaced = True
@@ -397,7 +463,7 @@ class Holdings:
 
     def _listeners(self, plot: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[plot]
-        if view.warden and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+        if not self._plots.proven and view.warden and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
             return (view.warden,)
         return self._plots.members(plot)
 

@@ -11,7 +11,7 @@ from swarm.liveness import Peer, Roster
 from swarm.right_of_way.holdings import Holdings, Tell, Wish
 from swarm.right_of_way.incarnations import first_life, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Left
+from swarm.wire.messages.traffic import Granted, Left, Word
 
 LIVES_KEPT = 32
 """Numbers of lives on file, as many as a `Standing` has room for."""
@@ -60,7 +60,8 @@ class Host:
         if self._told_by.issuperset(self.plots.agents):
             return True
         every = map(self.plots.members, self.plots.all)
-        return all(len(self._told_by.intersection(of)) > len(of) - self.plots.majority for of in every)
+        enough = self.plots.liars - self.plots.majority
+        return all(len(self._told_by.intersection(of)) > len(of) + enough for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
         """Begins a new life, once those who could be asked have answered. Returns the lives to keep on file;
@@ -73,9 +74,13 @@ class Host:
         self.holdings.begin(life, dead)
         return [*dead[1 - LIVES_KEPT :], life]
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """A warden's word to us. Returns the vehicles that have found their place."""
-        if not self.holdings.life or granted.plot not in self.holdings.plots:
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> list[str]:
+        """A warden's grant, or a member's word on one. Returns the vehicles that have found their place."""
+        if not self.holdings.life or granted.plot not in self.plots.all:
+            return []
+        if isinstance(granted, Word):
+            return self.holdings.hear_word(granted)
+        if granted.plot not in self.holdings.plots:
             return []
         placed = self.holdings.hear_granted(granted, now_ns)
         if self.holdings.heard_ns(granted.plot) == now_ns:

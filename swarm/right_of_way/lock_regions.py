@@ -14,6 +14,8 @@ _LAYERS = 2
 """The ground and the air."""
 FEWEST_FOR_MAJORITY = 3
 """Members of a plot; a layer of fewer agents has one for each plot."""
+_FEWEST_FOR_A_LIAR = 4
+"""Members of a plot of which one may lie: any two groups of three share two, and one of these is honest."""
 
 
 def fitting_regions(rows: int, cols: int, agents: int) -> int:
@@ -34,7 +36,8 @@ class Plots:
     with the same side agree.
 
     The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998). With
-    fewer than three agents there is one member: a majority of two would need both to be alive.
+    fewer than three agents there is one member: a majority of two would need both to be alive. Where names are
+    proven there are four, if the layer has four agents: then one of them may lie (docs/design/right-of-way.md).
 
     Ground and air are two layers, with plots and agents of their own: no vehicle in one requests, holds or waits
     for anything in the other.
@@ -44,7 +47,10 @@ class Plots:
             mean more messages
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no guest may take their names
+    proven  certificates prove who sends a message; all processes of a run agree on it
 
+    majority  members that have to have a table on file before it counts
+    liars     members of a plot that may lie without harm
     all    the numbers of the layer's plots. Plots of different sizes have different numbers, so a statement about a
            plot of another size is ignored and cannot release cells
     spare  how many agents may use another plot size while agents with this size act as members (for plots larger
@@ -60,8 +66,11 @@ class Plots:
         side: int = REGION_CELLS,
         layer: int = 0,
         others: Collection[str] = (),
+        *,
+        proven: bool = False,
     ) -> None:
         self.grid = grid
+        self.proven = proven
         self.agents = tuple(agents)
         self.side = side
         self._cells, self._cols = grid.cells, grid.cols
@@ -78,7 +87,11 @@ class Plots:
                 f"map.plot_regions is {side // REGION_CELLS}: a grid of {grid.rows} x {grid.cols} cells is too"
                 " narrow for plots larger than a region"
             )
-        self.majority = 2 if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
+        self._seats = FEWEST_FOR_MAJORITY if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
+        if proven and len(self.agents) >= _FEWEST_FOR_A_LIAR:
+            self._seats = _FEWEST_FOR_A_LIAR
+        self.majority = self._seats // 2 + 1
+        self.liars = int(self._seats == _FEWEST_FOR_A_LIAR)
         self.spare = FEWEST_FOR_MAJORITY - 1 if self.majority > 1 else 0
 
     def of(self, cell: int) -> int:
@@ -100,7 +113,7 @@ class Plots:
         members = self._members.get(plot)
         if members is None:
             by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
-            members = self._members[plot] = tuple(by_hash[: FEWEST_FOR_MAJORITY if self.majority > 1 else 1])
+            members = self._members[plot] = tuple(by_hash[: self._seats])
         return members
 
     def warden(self, plot: int, epoch: int) -> str:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table
+from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table, Word
 from vehicle_agent.traffic.warden import Warden
+from vehicle_agent.traffic.witness import Witness
 
 LEASE_NS = 3 * BEAT_NS
 """A warden that is silent for so long may be replaced, later where answers take long. Until then its members refuse
@@ -59,7 +60,7 @@ class Refused:
     text: str
 
 
-MemberAction = Save | AskPromises | Refused | Table | Stored | Granted
+MemberAction = Save | AskPromises | Refused | Table | Stored | Granted | Word
 
 
 class RoundTrips:
@@ -122,6 +123,7 @@ class Member:
         self._me = me
         self._fleets = fleets
         self._members = plots.members(self.plot)
+        self._witness = Witness(me) if plots.proven else None
         self._others = tuple(member for member in self._members if member != me)
         self._rank = self._members.index(me)
         self._claimed = 0
@@ -131,7 +133,8 @@ class Member:
         self._led_until_ns = now_ns  # the warden that we know of is in charge at least so long
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
-        self._acked_ns = now_ns
+        self._acked_ns = dict.fromkeys(self._others, now_ns)
+        """Other member -> when it acknowledged our claim or table last."""
         self._told: list[Table] = []
         """Tables published as warden, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
@@ -175,8 +178,10 @@ class Member:
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
             start_ns = max(_START_NS, self._trips.bound_ns(self._others) + self._tick_ns)
             self._due_ns = max(self._due_ns, now_ns + (start_ns if led else 0) + self._turn_ns())
-            self._acked_ns = now_ns
+            self._acked_ns = dict.fromkeys(self._others, now_ns)
         self._wanted_ns = now_ns
+        if self._witness is not None:
+            self._witness.hear_standing(standing, now_ns)
         if self.warden is not None:
             self.warden.take_standing(standing, now_ns)
 
@@ -199,8 +204,11 @@ class Member:
         self._led(now_ns, table.agent)
         actions: list[MemberAction] = []
         if table.stamp > self.stored.stamp:
+            if not self._accepts(table):
+                return self._words(now_ns)
             self.promised, self.stored = table.epoch, table
             actions.append(Save(self.promised, self.stored))
+            actions += self._words(now_ns)
         if table.stamp == self.stored.stamp:
             self._said = min(self._said, (table.epoch, table.seq - 1))  # a repeated table is acknowledged again
             if self._plots.warden(self.plot, table.epoch + 1) == self._me:
@@ -210,6 +218,13 @@ class Member:
     def _say(self, now_ns: int) -> Stored:
         self._said, self._said_ns = self.stored.stamp, now_ns
         return self.on_file
+
+    def _accepts(self, table: Table) -> bool:
+        return self._witness is None or self._witness.accepts(self.stored, table)
+
+    def _words(self, now_ns: int) -> list[MemberAction]:
+        """Returns our words to hosts, where these need more than the warden's."""
+        return [] if self._witness is None else [*self._witness.words(self.stored, self.promised, now_ns)]
 
     def _say_late(self, now_ns: int) -> list[MemberAction]:
         """Returns the reply of the member that is second after the warden about its file. With the warden the first
@@ -253,10 +268,10 @@ class Member:
         if self.warden is None:
             return []
         if stored.epoch == self.warden.epoch:
-            self._acked_ns = now_ns
+            self._acked_ns[stored.agent] = now_ns
             if stored.seq and stored.agent == self._plots.warden(self.plot, stored.epoch + 1):  # replies at once
                 self._answered(stored.agent, (stored.epoch, stored.seq), now_ns)
-            return self._on_file(self.warden, stored.seq, now_ns)
+            return [] if self._witness is not None else self._on_file(self.warden, stored.seq, now_ns)
         if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
         return []
@@ -289,7 +304,7 @@ class Member:
         if wanted and self.warden is not None and self._claim_above <= self.warden.epoch:
             return self._lead(self.warden, now_ns)
         if not wanted or (self.warden is None and now_ns < self._due_ns):
-            return self._say_late(now_ns)
+            return [*self._say_late(now_ns), *self._words(now_ns)]
         return self._claim(now_ns)
 
     def _claim(self, now_ns: int) -> list[MemberAction]:
@@ -306,7 +321,8 @@ class Member:
         return actions
 
     def _lead(self, warden: Warden, now_ns: int) -> list[MemberAction]:
-        if self._others and now_ns - self._acked_ns > self._lease_ns:
+        acked_ns = sorted(self._acked_ns.values(), reverse=True)[: self._plots.majority - 1]
+        if acked_ns and now_ns - acked_ns[-1] > self._lease_ns:
             self.warden = None  # no messages arrive in one direction: leave it to the others
             self._led(now_ns, self._me)
             return []
@@ -321,19 +337,23 @@ class Member:
                 actions.append(Save(self.promised, table))
             # A table on file with both others needs no more than its number: at rest tables were a fifth of all
             # bytes.
-            answered = now_ns - self._acked_ns < 2 * BEAT_NS
+            answered = all(now_ns - acked_ns < 2 * BEAT_NS for acked_ns in self._acked_ns.values())
             known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
             actions.append(self.on_file if known and answered else table)
-            if self._plots.majority == 1:
+            if self._witness is not None:
+                actions += warden.granted(table, now_ns)  # the hosts count the members' words
+            elif self._plots.majority == 1:
                 actions += self._on_file(warden, table.seq, now_ns)
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
-        if self.warden is None and len(self._promises) >= self._plots.majority:
-            newest = max(self._promises.values(), key=lambda table: table.stamp)
-            self.warden = Warden(self._plots, self._me, self._claimed, newest, self._fleets)
+        known = sorted(self._promises.values(), key=lambda table: table.stamp, reverse=True)
+        while known and not self._accepts(known[0]):
+            del known[0]  # a lie, or a statement of a host is missed
+        if self.warden is None and len(known) >= self._plots.majority:
+            self.warden = Warden(self._plots, self._me, self._claimed, known[0], self._fleets)
             self._told = []
-            self._acked_ns = now_ns
+            self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the warden has resigned must not restart it.
             self._claimed, self._promises = 0, {}
 

@@ -152,6 +152,31 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
         return self.epoch, self.seq
 
 
+class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
+    """A member of a plot has on file what the warden grants to one host. Sent where certificates prove names: there
+    a grant counts with the words of a majority.
+
+    agent       the member
+    epoch, seq  of the newest table on its file
+    part        digest of what the table grants to the host
+    promised    the member stores no table of a lower epoch
+    asks        the member lacks a statement of the host about entries that a later table omits
+    """
+
+    plot: Plot
+    host: Id
+    agent: Id
+    epoch: Natural
+    seq: Natural
+    part: Natural
+    promised: Natural
+    asks: bool = False
+
+    @property
+    def stamp(self) -> Stamp:
+        return self.epoch, self.seq
+
+
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
     """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
     for good, so no order, loss or repetition matters."""

@@ -1,0 +1,142 @@
+"""A member's witness, where certificates prove names: it tells hosts what its file grants them, and stores no table
+that takes an entry from a host which did not give it back.
+
+With both, one liar among four members makes no two vehicles of others meet (docs/design/right-of-way.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from swarm.config.agents import agent_of
+from swarm.right_of_way.entries import BEFORE_ALL
+from swarm.right_of_way.holdings import part_of
+from swarm.right_of_way.host import LIVES_KEPT
+from swarm.right_of_way.incarnations import BEAT_NS
+from swarm.wire.messages.traffic import Number, Stamp, Standing, Table, Word
+from vehicle_agent.traffic.cell_orders import Orders
+from vehicle_agent.traffic.warden import SILENT_NS
+
+
+def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
+    """Returns number -> its vehicle, and the life of its host; None if a number is there twice."""
+    of = [(agent_of(vehicle), vehicle, numbers) for vehicle, numbers in table.grants.items()]
+    each = [(table.hosts.get(host, BEFORE_ALL)[0], vehicle, numbers) for host, vehicle, numbers in of]
+    each += [(fence.life, vehicle, numbers) for fence in table.fences for vehicle, numbers in fence.entries.items()]
+    found = {number: (vehicle, life) for life, vehicle, numbers in each for number in numbers}
+    return found if len(found) == sum(len(numbers) for _, _, numbers in each) else None
+
+
+@dataclass(slots=True)
+class _Host:
+    """Statements of one host.
+
+    spoke_ns  time of the last one
+    newest    (life, sequence) of the newest
+    lives     life -> the newest table that it knows, and the entries that it holds
+    ended     lives that have ended
+    told      the last word to it, and its time
+    """
+
+    spoke_ns: int
+    newest: Stamp = BEFORE_ALL
+    lives: dict[int, tuple[Stamp, frozenset[Number]]] = field(default_factory=dict)
+    ended: set[int] = field(default_factory=set)
+    told: object = None
+    told_ns: int = 0
+
+    def hear(self, standing: Standing, now_ns: int) -> None:
+        self.spoke_ns = now_ns
+        self.ended.update(standing.dead)
+        if standing.ended:
+            self.ended.add(standing.life)
+        if (standing.life, standing.seq) > self.newest:
+            self.newest = standing.life, standing.seq
+            held = frozenset(number for stand in standing.vehicles for number in stand.holds)
+            self.lives[standing.life] = standing.knows, held
+            for old in sorted(self.lives)[:-LIVES_KEPT]:
+                del self.lives[old]
+
+    def is_over(self, number: Number, life: int) -> bool:
+        """Returns True if this host said that an entry of a life of it is over. Life 0 is the run's start, of which
+        the entries belong to the first life that a table counts."""
+        if life in self.ended:
+            return True
+        lives = self.lives.values() if not life else [self.lives[life]] if life in self.lives else ()
+        return any(number[1:] <= knows and number not in held for knows, held in lives)
+
+
+class Witness:
+    """Knowledge of one member about a plot."""
+
+    def __init__(self, me: str) -> None:
+        self._me = me
+        self._hosts: dict[str, _Host] = {}
+        self._of: Table | None = None
+        self._orders: Orders | None = None
+        self._doubted: set[str] = set()
+        """Hosts of which a statement is missed."""
+
+    def hear_standing(self, standing: Standing, now_ns: int) -> None:
+        self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
+
+    def accepts(self, old: Table, new: Table) -> bool:
+        """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
+        what it adds comes after all that remains in its cell, and it counts no statement that was not made. Hosts
+        of which a statement is missed are asked for it by the next words."""
+        was, lists = _listed(old), _listed(new)
+        if was is None or lists is None:
+            return False
+        self._doubted = {
+            host
+            for host, said in new.hosts.items()
+            if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
+        }
+        # A vehicle of which all lives have ended before a table counted one begins in its cell again.
+        begins = {(number[0], each[0]): number for number, each in lists.items() if number not in was}
+        last: dict[int, Number] = {}
+        for number, (vehicle, life) in was.items():
+            found, host = lists.get(number), agent_of(vehicle)
+            if found == (vehicle, life) or (found is not None and not life and found[0] == vehicle):
+                last[number[0]] = max(number, last.get(number[0], number))
+            elif host not in self._hosts:
+                self._doubted.add(host)
+            elif not life and self._hosts[host].ended and (number[0], vehicle) in begins:
+                last[number[0]] = max(number, last.get(number[0], number))
+            elif not self._hosts[host].is_over(number, life):
+                self._doubted.add(host)
+        added = [(number, each) for number, each in lists.items() if was.get(number) != each]
+        ordered = all(
+            number > last.get(number[0], ()) or (number in was and was[number][0] == vehicle)
+            for number, (vehicle, _) in added
+        )
+        return ordered and not self._doubted
+
+    def words(self, stored: Table, promised: int, now_ns: int) -> Iterator[Word]:
+        """Returns our words to the hosts that have spoken lately, and to those of which a statement is missed, if
+        they are new or a beat old."""
+        if self._of is not stored or self._orders is None:
+            self._of, self._orders = stored, Orders(stored)
+        for name in self._doubted:
+            self._hosts.setdefault(name, _Host(now_ns - SILENT_NS - 1))
+        for name, host in self._hosts.items():
+            asks = name in self._doubted
+            if now_ns - host.spoke_ns > SILENT_NS and not asks:
+                continue
+            life, _ = stored.hosts.get(name, BEFORE_ALL)
+            part = part_of(life, self._orders.granted(name))
+            says = stored.epoch, part, promised, asks
+            if says == host.told and 0 <= now_ns - host.told_ns < BEAT_NS:
+                continue
+            host.told, host.told_ns = says, now_ns
+            yield Word(
+                plot=stored.plot,
+                host=name,
+                agent=self._me,
+                epoch=stored.epoch,
+                seq=stored.seq,
+                part=part,
+                promised=promised,
+                asks=asks,
+            )
