@@ -347,10 +347,12 @@ class Member:
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
+        if self.warden is not None or len(self._promises) < self._plots.majority:
+            return
         known = sorted(self._promises.values(), key=lambda table: table.stamp, reverse=True)
-        while known and not self._accepts(known[0]):
-            del known[0]  # a lie, or a statement of a host is missed
-        if self.warden is None and len(known) >= self._plots.majority:
+        while self._witness is not None and known and self._witness.contradicts(known[0]):
+            del known[0]  # stored by a member which a thief told another table
+        if known and self._accepts(known[0]):
             self.warden = Warden(self._plots, self._me, self._claimed, known[0], self._fleets)
             self._told = []
             self._acked_ns = dict.fromkeys(self._others, now_ns)

@@ -108,10 +108,21 @@ class Witness:
                 self._doubted.add(host)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
         ordered = all(
-            number > last.get(number[0], ()) or (number in was and was[number][0] == vehicle)
+            (number > last.get(number[0], ()) and number[1:] <= new.stamp) or was.get(number, ("",))[0] == vehicle
             for number, (vehicle, _) in added
         )
         return ordered and not self._doubted
+
+    def contradicts(self, table: Table) -> bool:
+        """Returns True if a host held an entry which a table omits, by a statement no older than the one that the
+        table counts: no majority has it on file."""
+        lists = _listed(table) or {}
+        return any(
+            not held.issubset(lists)
+            for name, host in self._hosts.items()
+            for knows, held in [host.lives.get(host.newest[0], (BEFORE_ALL, frozenset()))]
+            if table.hosts.get(name, BEFORE_ALL) <= host.newest
+        )
 
     def words(self, stored: Table, promised: int, now_ns: int) -> Iterator[Word]:
         """Returns our words to the hosts that have spoken lately, and to those of which a statement is missed, if
