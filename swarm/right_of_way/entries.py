@@ -12,7 +12,7 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
    back while the first is still used. Entries of the same vehicle, of an earlier life, do not count.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
-4. An entry that was left, given back or passed over is never used again by this host.
+4. An entry that was left, given back, passed over or disclaimed is never used again by this host.
 5. A host acts on tables for its own life only, and in their order. It takes an entry only from the first table
    that can list it: later its statements may have released the number.
 6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
@@ -45,6 +45,7 @@ class HostEntries:
     paths     vehicle -> its entries in driving order, its own cell first
     placed    vehicles that are on the first cell of their paths; the others are nowhere
     over      plot -> numbers that this life has left, given back or passed over, and its table still lists
+    disclaimed  plot -> numbers that no table has granted yet, and that are over by our word to a member
     heard     (number, host) of which that host has said that it is over; entries of paths know it
     knows     plot -> the newest table acted on
     """
@@ -57,6 +58,7 @@ class HostEntries:
     paths: dict[str, list[Entry]] = field(default_factory=dict)
     placed: set[str] = field(default_factory=set)
     over: dict[int, set[Number]] = field(default_factory=dict)
+    disclaimed: dict[int, set[Number]] = field(default_factory=dict)
     heard: dict[tuple[Number, str], None] = field(default_factory=dict)
     knows: dict[int, Stamp] = field(default_factory=dict)
 
@@ -90,6 +92,7 @@ class HostEntries:
         self.knows[plot] = stamp
         over = self.over.setdefault(plot, set())
         over.intersection_update(entry.number for entries in grants.values() for entry in entries)
+        no_more = self.disclaimed.get(plot, set())
         longer = set()
         for vehicle, entries in grants.items():
             path = self.paths.get(vehicle, [])
@@ -98,7 +101,9 @@ class HostEntries:
                 if entry.number in at:
                     index = at[entry.number]
                     path[index] = self._waiting(entry, path[index].after)
-                elif entry.number[1:] > known and self._follows(vehicle, path, entry):
+                elif (
+                    entry.number[1:] > known and entry.number not in no_more and self._follows(vehicle, path, entry)
+                ):
                     path.append(self._waiting(entry, entry.after))
                     longer.add(vehicle)
                 else:
@@ -166,6 +171,18 @@ class HostEntries:
         for entry in self.paths[vehicle]:
             found.setdefault(self.plot_of(entry.cell), []).append(entry.number)
         return found
+
+    def disclaim(self, plot: int, numbers: Iterable[Number]) -> list[Number]:
+        """Returns those of some numbers that we do not hold and never take. The entries of the run's start are ours
+        until a table says otherwise."""
+        no_more, knows = self.disclaimed.setdefault(plot, set()), self.knows.get(plot, BEFORE_ALL)
+        no_more.difference_update([number for number in no_more if number[1:] <= knows])
+        held = {entry.number for path in self.paths.values() for entry in path}
+        ours = [number for number in numbers if number not in held and self.plot_of(number[0]) == plot]
+        new = [number for number in ours if number[1] and number[1:] > knows]
+        if len(no_more) + len(new) <= _MOST_HEARD:
+            no_more.update(new)
+        return [number for number in ours if number in no_more or number[1:] <= knows]
 
     def holds(self, plot: int) -> dict[str, list[Number]]:
         """Returns vehicle -> its entries in a plot: all others that its newest table lists are over."""

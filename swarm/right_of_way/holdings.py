@@ -63,6 +63,7 @@ class _View:
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> its entries in the table in use
     followed  other host -> entries of ours behind which its vehicles wait, by the same table
+    asked    member -> entries that it lacks our word about
     left     other host -> those of these that are over, as we told it last, and when
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
@@ -78,6 +79,7 @@ class _View:
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
+    asked: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
@@ -297,7 +299,6 @@ class Holdings:
             epoch=granted.epoch,
             seq=granted.seq,
             part=part,
-            promised=granted.epoch,
         )
         return self.hear_word(word)
 
@@ -312,7 +313,7 @@ class Holdings:
         if view is None or (word.agent in view.words and word.stamp < view.words[word.agent].stamp):
             return []
         view.words[word.agent] = word
-        self._pass_over(word.plot, view)
+        view.asked[word.agent] = word.lacks
         placed: list[str] = []
         for warden, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
             same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
@@ -320,15 +321,6 @@ class Holdings:
                 del view.pending[warden]
                 placed += self._take(view, granted)
         return placed
-
-    def _pass_over(self, plot: int, view: _View) -> None:
-        """Takes nothing more of epochs older than one which an honest member has promised. A member that has an
-        older table on file can then omit what only that one grants."""
-        promised = sorted((word.promised for word in view.words.values()), reverse=True)[self._plots.liars :][:1]
-        knows = self._entries.knows.get(plot)
-        if promised and knows is not None and knows[0] < promised[0] <= knows[0] + FURTHEST_EPOCH:
-            self._entries.knows[plot] = promised[0], 0
-            view.same = False
 
     def _take(self, view: _View, granted: Granted) -> list[str]:
         """Acts on a grant that counts."""
@@ -410,9 +402,12 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for plot, view in self._views.items():
             over = self._entries.over.get(plot, set())
-            for host, numbers in view.followed.items():
+            said = {host: [number for number in of if number in over] for host, of in view.followed.items()}
+            for member, lacks in view.asked.items():
+                if lacks:
+                    said[member] = [*said.get(member, ()), *self._entries.disclaim(plot, lacks)]
+            for host, left in said.items():
                 told, told_ns = view.left.get(host, (None, 0))
-                left = [number for number in numbers if number in over]
                 if left and (left != told or not 0 <= now_ns - told_ns < BEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)

@@ -40,6 +40,18 @@ def test_no_two_vehicles_of_others_meet(seed: int) -> None:
 
 
 @pytest.mark.seeds(6)
+def test_vehicles_of_others_go_on_once_the_name_is_revoked(seed: int) -> None:
+    chance = random.Random(f"thief/{seed}")
+    world = ThiefWorld(seed, *chance.choice(SHAPES), Faults(quiet_s=LIES_S))
+    world.run(LIES_S)
+    world.revoke()
+    before = dict(world.moves)
+    world.run(12.0)
+    assert world.collisions == []
+    assert sum(world.moves.values()) > sum(before.values()) + 20
+
+
+@pytest.mark.seeds(6)
 def test_without_a_thief_all_move_although_members_judge_each_table(seed: int) -> None:
     chance = random.Random(f"proven/{seed}")
     faults = random_faults(chance, LIES_S)

@@ -32,7 +32,7 @@ class Thief(Process):
             elif isinstance(action, Stored) and self.chance.random() < 0.3:
                 super().perform([replace(action, seq=action.seq + self.chance.choice((-1, 1, 100)))])
             elif isinstance(action, Word) and self.chance.random() < 0.3:
-                super().perform([replace(action, seq=action.seq + 5, promised=action.promised + 8, asks=True)])
+                super().perform([replace(action, seq=action.seq + 5, asks=True, lacks=self.any_of(action))])
             else:
                 super().perform([action])
 
@@ -91,6 +91,11 @@ class Thief(Process):
         assert plots.of(stolen[0]) == table.plot
         return replace(table, grants={id: path for id, path in grants.items() if path}, hosts=hosts)
 
+    def any_of(self, word: Word) -> list[Number]:
+        """Entries of a host that it may not have heard of yet."""
+        grants = self.rights._members[word.plot].stored.grants.items()
+        return [path[-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
+
     def tell(self, table: Table) -> None:
         """Different members and hosts are told different tables of one number, each with the words that go with
         it."""
@@ -116,7 +121,7 @@ class Thief(Process):
             plot=table.plot, host=host, agent=self.agent, life=life, heard=1 << 30, grants=grants, **stamp
         )
         part = part_of(life, grants)
-        yield Word(plot=table.plot, host=host, agent=self.agent, part=part, promised=table.epoch, **stamp)
+        yield Word(plot=table.plot, host=host, agent=self.agent, part=part, **stamp)
 
 
 class ThiefWorld(TrafficWorld):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table, Word
+from swarm.wire.messages.traffic import Granted, Left, Stamp, Standing, Stored, Table, Word
 from vehicle_agent.traffic.warden import Warden
 from vehicle_agent.traffic.witness import Witness
 
@@ -185,6 +185,10 @@ class Member:
         if self.warden is not None:
             self.warden.take_standing(standing, now_ns)
 
+    def hear_left(self, left: Left) -> None:
+        if self._witness is not None:
+            self._witness.hear_left(left)
+
     # --- what members say -----------------------------------------------------------------------------------
 
     @property
@@ -224,7 +228,7 @@ class Member:
 
     def _words(self, now_ns: int) -> list[MemberAction]:
         """Returns our words to hosts, where these need more than the warden's."""
-        return [] if self._witness is None else [*self._witness.words(self.stored, self.promised, now_ns)]
+        return [] if self._witness is None else [*self._witness.words(self.stored, now_ns)]
 
     def _say_late(self, now_ns: int) -> list[MemberAction]:
         """Returns the reply of the member that is second after the warden about its file. With the warden the first

@@ -14,9 +14,12 @@ from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import LIVES_KEPT
 from swarm.right_of_way.incarnations import BEAT_NS
-from swarm.wire.messages.traffic import Number, Stamp, Standing, Table, Word
+from swarm.wire.messages.traffic import Left, Number, Stamp, Standing, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.warden import SILENT_NS
+
+_MOST_LACKED = 64
+"""Entries that one word asks for; the next asks for more."""
 
 
 def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
@@ -36,6 +39,7 @@ class _Host:
     newest    (life, sequence) of the newest
     lives     life -> the newest table that it knows, and the entries that it holds
     ended     lives that have ended
+    gone      entries that it said to have left, or never to take
     told      the last word to it, and its time
     """
 
@@ -43,6 +47,7 @@ class _Host:
     newest: Stamp = BEFORE_ALL
     lives: dict[int, tuple[Stamp, frozenset[Number]]] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
+    gone: set[Number] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
 
@@ -61,7 +66,7 @@ class _Host:
     def is_over(self, number: Number, life: int) -> bool:
         """Returns True if this host said that an entry of a life of it is over. Life 0 is the run's start, of which
         the entries belong to the first life that a table counts."""
-        if life in self.ended:
+        if life in self.ended or number in self.gone:
             return True
         lives = self.lives.values() if not life else [self.lives[life]] if life in self.lives else ()
         return any(number[1:] <= knows and number not in held for knows, held in lives)
@@ -75,11 +80,16 @@ class Witness:
         self._hosts: dict[str, _Host] = {}
         self._of: Table | None = None
         self._orders: Orders | None = None
-        self._doubted: set[str] = set()
-        """Hosts of which a statement is missed."""
+        self._lacks: dict[str, list[Number]] = {}
+        """Host of which a statement is missed -> entries that it may have left."""
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
+
+    def hear_left(self, left: Left) -> None:
+        """A host answers what we asked."""
+        if left.agent in self._lacks:
+            self._hosts[left.agent].gone.update(set(left.entries).intersection(self._lacks[left.agent]))
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
@@ -88,8 +98,8 @@ class Witness:
         was, lists = _listed(old), _listed(new)
         if was is None or lists is None:
             return False
-        self._doubted = {
-            host
+        self._lacks = {
+            host: []
             for host, said in new.hosts.items()
             if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
         }
@@ -101,17 +111,17 @@ class Witness:
             if found == (vehicle, life) or (found is not None and not life and found[0] == vehicle):
                 last[number[0]] = max(number, last.get(number[0], number))
             elif host not in self._hosts:
-                self._doubted.add(host)
+                self._lacks.setdefault(host, []).append(number)
             elif not life and self._hosts[host].ended and (number[0], vehicle) in begins:
                 last[number[0]] = max(number, last.get(number[0], number))
             elif not self._hosts[host].is_over(number, life):
-                self._doubted.add(host)
+                self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
         ordered = all(
             (number > last.get(number[0], ()) and number[1:] <= new.stamp) or was.get(number, ("",))[0] == vehicle
             for number, (vehicle, _) in added
         )
-        return ordered and not self._doubted
+        return ordered and not self._lacks
 
     def contradicts(self, table: Table) -> bool:
         """Returns True if a host held an entry which a table omits, by a statement no older than the one that the
@@ -124,20 +134,20 @@ class Witness:
             if table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 
-    def words(self, stored: Table, promised: int, now_ns: int) -> Iterator[Word]:
+    def words(self, stored: Table, now_ns: int) -> Iterator[Word]:
         """Returns our words to the hosts that have spoken lately, and to those of which a statement is missed, if
         they are new or a beat old."""
         if self._of is not stored or self._orders is None:
             self._of, self._orders = stored, Orders(stored)
-        for name in self._doubted:
+        for name in self._lacks:
             self._hosts.setdefault(name, _Host(now_ns - SILENT_NS - 1))
         for name, host in self._hosts.items():
-            asks = name in self._doubted
-            if now_ns - host.spoke_ns > SILENT_NS and not asks:
+            lacks = self._lacks.get(name)
+            if now_ns - host.spoke_ns > SILENT_NS and lacks is None:
                 continue
             life, _ = stored.hosts.get(name, BEFORE_ALL)
             part = part_of(life, self._orders.granted(name))
-            says = stored.epoch, part, promised, asks
+            says = stored.epoch, part, lacks
             if says == host.told and 0 <= now_ns - host.told_ns < BEAT_NS:
                 continue
             host.told, host.told_ns = says, now_ns
@@ -148,6 +158,6 @@ class Witness:
                 epoch=stored.epoch,
                 seq=stored.seq,
                 part=part,
-                promised=promised,
-                asks=asks,
+                asks=lacks is not None,
+                lacks=(lacks or [])[:_MOST_LACKED],
             )

@@ -159,8 +159,8 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     agent       the member
     epoch, seq  of the newest table on its file
     part        digest of what the table grants to the host
-    promised    the member stores no table of a lower epoch
-    asks        the member lacks a statement of the host about entries that a later table omits
+    asks        the member lacks a statement of the host, without which it stores no later table
+    lacks       entries of the host that such a table omits: the host says `Left` of those that it does not hold
     """
 
     plot: Plot
@@ -169,8 +169,8 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     epoch: Natural
     seq: Natural
     part: Natural
-    promised: Natural
     asks: bool = False
+    lacks: Held = []
 
     @property
     def stamp(self) -> Stamp:
