@@ -68,8 +68,9 @@ class _View:
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet    the first standing from which on we want nothing here; None while we do
-    words    member -> its newest word, where names are proven; a grant is its warden's word
-    pending  warden -> its newest grant, until a majority has the same on file, and its digest
+    words    member -> its last word, where names are proven; a grant is its warden's word. An older one that comes
+             late does no harm: no entry is taken that a used table could have granted
+    pending  warden -> its last grant, until a majority has the same on file, and its digest
     told     the last statement about our vehicles, and its time
     same     whether the next statement is known to be the same
     """
@@ -290,8 +291,7 @@ class Holdings:
         if not self._plots.proven:
             return self._take(view, granted)
         part = part_of(granted.life, granted.grants)
-        if granted.agent not in view.pending or granted.stamp >= view.pending[granted.agent][0].stamp:
-            view.pending[granted.agent] = granted, part
+        view.pending[granted.agent] = granted, part
         word = Word(
             plot=granted.plot,
             host=self._agent,
@@ -310,7 +310,7 @@ class Holdings:
         if word.asks:
             self.watch([word.plot])
         view = self._views.get(word.plot)
-        if view is None or (word.agent in view.words and word.stamp < view.words[word.agent].stamp):
+        if view is None:
             return []
         view.words[word.agent] = word
         view.asked[word.agent] = word.lacks

@@ -172,10 +172,6 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     asks: bool = False
     lacks: Held = []
 
-    @property
-    def stamp(self) -> Stamp:
-        return self.epoch, self.seq
-
 
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
     """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
