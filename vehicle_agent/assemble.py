@@ -102,7 +102,8 @@ class AgentParts:
         layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
         side = scenario.map.shard_regions * REGION_CELLS
-        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
+        others, proven = spawns.keys() - beside.keys(), scenario.network.tls is not None
+        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=others, proven=proven)
         tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
         core = RightOfWay(
             setup.id, shards, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import blake2b
 from itertools import chain, takewhile
 
 import msgspec
@@ -12,7 +13,7 @@ import msgspec
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand
+from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand, Word
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
 """A host that has not heard a shard's leader for so long speaks to all members of the shard."""
@@ -41,6 +42,13 @@ _NO_WISH = Wish()
 _NO_STANDS: Mapping[str, _Told] = {}
 
 
+def part_of(generation: int, grants: Mapping[str, Sequence[Entry]]) -> int:
+    """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and a thief
+    of a name has a fraction of a second to find other grants with the same digest."""
+    said = msgspec.msgpack.encode((generation, sorted(grants.items())))
+    return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
+
+
 @dataclass(frozen=True, slots=True)
 class Tell:
     """Send a host state to these members of its shard."""
@@ -57,10 +65,14 @@ class _View:
     heard     the newest host state of ours that the table in use takes into account
     seen      vehicle -> its entries in the table in use
     followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
+    asked     member -> entries that it lacks our word about
     left      other host -> those of these that are over, as we told it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
     others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet     the first host state from which on we want nothing here; None while we do
+    words     member -> its last word, where names are proven; a grant is its leader's word. An older one that comes
+              late does no harm: no entry is taken that a used table could have granted
+    pending   leader -> its last grant, until a majority has the same on file, and its digest
     told      the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
     """
@@ -70,10 +82,13 @@ class _View:
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
+    asked: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
+    words: dict[str, Word] = field(default_factory=dict)
+    pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
     same: bool = False
@@ -253,6 +268,10 @@ class Holdings:
         """The vehicles that have entries in a shard, as far as its table in use tells."""
         return list(self._views[shard].seen) if shard in self._views else []
 
+    def is_pending(self, shard: int) -> bool:
+        """Returns True if a grant of a shard waits for words of its members."""
+        return shard in self._views and bool(self._views[shard].pending)
+
     def heard_ns(self, shard: int) -> int:
         """Time when a shard's leader was heard last; 0 if none was."""
         return self._views[shard].heard_ns if shard in self._views else 0
@@ -276,6 +295,45 @@ class Holdings:
         if granted.agent != self._shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
         view.leader, view.heard_ns = granted.agent, now_ns
+        if not self._shards.proven:
+            return self._take(view, granted)
+        part = part_of(granted.generation, granted.grants)
+        view.pending[granted.agent] = granted, part
+        word = Word(
+            shard=granted.shard,
+            host=self._agent,
+            agent=granted.agent,
+            epoch=granted.epoch,
+            seq=granted.seq,
+            part=part,
+        )
+        return self.hear_word(word)
+
+    def hear_word(self, word: Word) -> list[str]:
+        """A member has something on file for us: use the grants that a majority has. Returns the vehicles that have
+        found their place."""
+        if word.agent not in self._shards.members(word.shard):
+            return []
+        if word.asks:
+            self.watch([word.shard])
+        view = self._views.get(word.shard)
+        if view is None:
+            return []
+        view.words[word.agent] = word
+        view.asked[word.agent] = word.lacks
+        placed: list[str] = []
+        for leader, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
+            same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
+            if same >= self._shards.majority:
+                del view.pending[leader]
+                placed += self._take(view, granted)
+        return placed
+
+    def _take(self, view: _View, granted: Granted) -> list[str]:
+        """Acts on a grant that counts."""
+        knows = self._entries.knows.get(granted.shard, BEFORE_ALL)
+        if granted.stamp < knows:
+            return []
         self.newest = max(self.newest, granted.generation)
         if granted.generation > self.generation and not self.replaced:
             self.replaced = True
@@ -358,9 +416,12 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for shard, view in self._views.items():
             over = self._entries.over.get(shard, set())
-            for host, numbers in view.followed.items():
+            said = {host: [number for number in of if number in over] for host, of in view.followed.items()}
+            for member, lacks in view.asked.items():
+                if lacks:
+                    said[member] = [*said.get(member, ()), *self._entries.disclaim(shard, lacks)]
+            for host, left in said.items():
                 told, told_ns = view.left.get(host, (None, 0))
-                left = [number for number in numbers if number in over]
                 if host != self._agent and left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
@@ -418,7 +479,7 @@ class Holdings:
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]
-        if view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+        if not self._shards.proven and view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
             return (view.leader,)
         return self._shards.members(shard)
 

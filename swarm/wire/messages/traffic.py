@@ -155,6 +155,27 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
         return self.epoch, self.seq
 
 
+class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
+    """A member of a shard has on file what the leader grants to one host. Sent where certificates prove names:
+    there a grant counts with the words of a majority.
+
+    agent       the member
+    epoch, seq  of the newest table on its file
+    part        digest of what the table grants to the host
+    asks        the member lacks a statement of the host, without which it stores no later table
+    lacks       entries of the host that such a table omits: the host says `Left` of those that it does not hold
+    """
+
+    shard: Shard
+    host: Id
+    agent: Id
+    epoch: Natural
+    seq: Natural
+    part: Natural
+    asks: bool = False
+    lacks: Held = []
+
+
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
     """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
     for good, so no order, loss or repetition matters."""
