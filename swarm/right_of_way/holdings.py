@@ -416,13 +416,14 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for shard, view in self._views.items():
             over = self._entries.over.get(shard, set())
-            said = {host: [number for number in of if number in over] for host, of in view.followed.items()}
+            others = {host: of for host, of in view.followed.items() if host != self._agent}
+            said = {host: [number for number in of if number in over] for host, of in others.items()}
             for member, lacks in view.asked.items():
                 if lacks:
                     said[member] = [*said.get(member, ()), *self._entries.disclaim(shard, lacks)]
             for host, left in said.items():
                 told, told_ns = view.left.get(host, (None, 0))
-                if host != self._agent and left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
+                if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
