@@ -305,9 +305,8 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
 def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
     """The whole first band, as stored; NaN where there is no height."""
     if dataset.height * dataset.width > MAX_CELLS:
-        raise TerrainError(
-            f"{what} has undeclared voids ({', '.join(f'{v:g}' for v in voids)}): gdal_edit.py -a_nodata"
-        )
+        listed = ", ".join(f"{void:g}" for void in voids)
+        raise TerrainError(f"{what} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one")
     heights: Floats = dataset.read(1).astype(np.float32)
     heights[dataset.read_masks(1) == 0] = np.nan
     return without(heights, voids)

@@ -79,7 +79,7 @@ class Placing:
             self._box = self._extent()
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
-        self._reach: Box | None = None
+        self._reach = np.full(4, np.nan)
         self._touched, self._features, self._corners = False, 0, 0
 
     @property
@@ -104,13 +104,13 @@ class Placing:
     def check_touched(self) -> None:
         """Raises TerrainError if the layer holds no feature, or none that was placed is on the terrain."""
         what = self.layer.what
-        if self._reach is None:
+        if np.isnan(self._reach).any():
             raise TerrainError(f"{what} holds no feature")
         if not self._touched:
-            hint = "are x and y in reverse?" if self._reversed(np.array([self._reach]))[0] else "is crs right?"
+            hint = "are x and y in reverse?" if self._reversed(self._reach[None])[0] else "is crs right?"
             raise TerrainError(
-                f"{what} does not touch the terrain: it reaches from {_shown(self._reach)}, the terrain from"
-                f" {_shown(self._box)} in {self.crs}; {hint}"
+                f"{what} does not touch the terrain: it reaches from {_shown(*self._reach)}, the terrain from"
+                f" {_shown(*self._box)} in {self.crs}; {hint}"
             )
 
     def _on(self, bounds: Floats64) -> NDArray[np.bool_]:
@@ -134,7 +134,7 @@ class Placing:
             wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
             for n in np.flatnonzero(wrong)[:1]:
                 raise TerrainError(
-                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(tuple(bounds[n]))}, which"
+                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(*bounds[n])}, which"
                     f" are no degrees, as {self.crs} has them; set crs"
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
@@ -149,9 +149,8 @@ class Placing:
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
             if len(bounds):
-                reach = (*bounds[:, :2].min(axis=0), *bounds[:, 2:].max(axis=0))
-                before = reach if self._reach is None else self._reach
-                self._reach = (*np.minimum(before[:2], reach[:2]), *np.maximum(before[2:], reach[2:]))
+                reach, before = shapely.total_bounds(features.shapes), self._reach
+                self._reach = np.concatenate((np.fmin(before[:2], reach[:2]), np.fmax(before[2:], reach[2:])))
             self._check_bounds(features, bounds)
             near = self._on(bounds)
             self._touched |= bool(near.any())
@@ -214,8 +213,8 @@ def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainErr
     return unusable(what, features.id(features.of[shape]), why)
 
 
-def _shown(box: Box) -> str:
-    return f"{box[0]:.7g}, {box[1]:.7g} to {box[2]:.7g}, {box[3]:.7g}"
+def _shown(west: float, south: float, east: float, north: float) -> str:
+    return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
 
 def _jumps(geometry: Any) -> bool:

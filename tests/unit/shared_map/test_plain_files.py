@@ -132,7 +132,7 @@ def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; its header says 4"),
+        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; expected 3 rows of 4"),
         (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
         (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
         (MAP.replace("height 3", "height many"), "no MovingAI map"),
@@ -180,7 +180,7 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
     [
         (YAML, b"P9 1 1 255\n\0\0\0", "no PGM, PNG or BMP"),
         (YAML, b"P5 100 100 255\n\0\0", "is truncated"),
-        (YAML, b"P5 99999 99999 255\n\0", "its header says more pixels than are read"),
+        (YAML, b"P5 99999 99999 255\n\0", "is truncated or no PGM.*decompression bomb"),
         (YAML, b"P5 a b 255\n\0", "invalid literal"),
         (YAML, b"P2 2 1 255\n1 x\n", "no PGM"),
         (YAML, b"P5 2 1 0\n\0\0", "maxval must be greater than 0"),
@@ -198,7 +198,7 @@ def test_a_bad_ros_map_is_refused_with_a_sentence(tmp_path: Path, yaml: str, ima
 
 
 def test_a_missing_image_is_said(tmp_path: Path) -> None:
-    with pytest.raises(TerrainError, match=r"m.yaml names the image m.pgm, but there is no file"):
+    with pytest.raises(TerrainError, match=r"cannot read image .*m\.pgm: No such file"):
         load(tmp_path / "m.yaml", YAML)
 
 
