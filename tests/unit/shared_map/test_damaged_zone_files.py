@@ -192,7 +192,12 @@ def waypoints(*rows: tuple[int, float, Any]) -> str:
 
 LATLON = [[y, x] for x, y in CORNERS]
 DISC = {"circle": {"center": MIDDLE[::-1].tolist(), "radius": 40.0}, "inclusion": False}
+FEATURE = json.dumps({"type": "Feature", "properties": {}, "geometry": shapely.geometry.mapping(
+    in_crs(AREA, UTM, "EPSG:4326"))})  # fmt: skip
 SAME = {
+    "lines of geojson": FEATURE.replace("[[[", "[\n[[") + "\n",
+    "geojson lines": f"{FEATURE}\n{FEATURE}\n",
+    "geojson sequence": f"\x1e{FEATURE}\n\x1e{FEATURE}\n",
     "kml": kml(f"<Folder><name>a</name>{placemark(RING)}</Folder>"),
     "kml with spaces": kml(placemark(RING.replace(",", ", "))),
     "open kml": kml(placemark(RING.rpartition(" ")[0])),
@@ -202,6 +207,7 @@ SAME = {
     "waypoints": waypoints(*((5002, 4, corner) for corner in CORNERS)),
 }
 DAMAGED = {
+    "lines cut off": f"{FEATURE}\n{FEATURE[:-9]}",
     "kml of words": kml(placemark(RING.replace(f"{CORNERS[1][0]:.10f}", "east"))),
     "kml of one number": kml(placemark(RING + " 9.0")),
     "kml without corners": kml(placemark("")),

@@ -25,12 +25,6 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
     return load_source(TerrainConfig(source=str(path), **settings), seed=1)
 
 
-def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
-    source = load(tmp_path / "a.asc", ASC)
-    np.testing.assert_array_equal(source.elevation_m, np.array([[1, 2, 3], [4, np.nan, 6]], np.float32))
-    assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -55,21 +49,6 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
 def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str | bytes, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
         load(tmp_path / "a.asc", text)
-
-
-def test_an_ascii_grid_in_degrees_is_put_on_metres_when_told(tmp_path: Path) -> None:
-    text = ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47")
-    source = load(tmp_path / "a.asc", text.replace("-9999 6", "5 6"), crs="EPSG:4326")
-    assert 80 < source.grid.resolution_m < 100
-
-
-def test_arrays_come_from_npz_with_resolution(tmp_path: Path) -> None:
-    heights = np.arange(20.0).reshape(4, 5)
-    np.savez(tmp_path / "a.npz", elevation=heights, resolution_m=30.0)
-    source = load(tmp_path / "a.npz")
-    np.testing.assert_array_equal(source.elevation_m, heights)
-    assert source.grid.resolution_m == 30
-    assert load(tmp_path / "a.npz", resolution_m=60.0).elevation_m.shape == (2, 2)
 
 
 def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
@@ -98,8 +77,6 @@ def test_an_hgt_is_known_by_its_length(tmp_path: Path) -> None:
     source = load(tmp_path / "N46E009.hgt", heights.tobytes())
     assert 70 < source.grid.resolution_m < 93
     assert np.nanmedian(source.elevation_m) == 700
-    with pytest.raises(TerrainError, match=r"truncated or no \.hgt: it has 1000 bytes"):
-        load(tmp_path / "N46E010.hgt", b"\0" * 1000)
 
 
 def test_a_png_needs_a_scale(tmp_path: Path) -> None:
@@ -178,6 +155,7 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("yaml", "image", "words"),
     [
+        (YAML.replace("m.pgm", "n.pgm"), b"", r"cannot read image .*n\.pgm: No such file"),
         (YAML, b"P9 1 1 255\n\0\0\0", "no PGM, PNG or BMP"),
         (YAML, b"P5 100 100 255\n\0\0", "is truncated"),
         (YAML, b"P5 99999 99999 255\n\0", "is truncated or no PGM.*decompression bomb"),
@@ -195,14 +173,3 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
 def test_a_bad_ros_map_is_refused_with_a_sentence(tmp_path: Path, yaml: str, image: bytes, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
         ros(tmp_path, yaml, image)
-
-
-def test_a_missing_image_is_said(tmp_path: Path) -> None:
-    with pytest.raises(TerrainError, match=r"cannot read image .*m\.pgm: No such file"):
-        load(tmp_path / "m.yaml", YAML)
-
-
-def test_resampling_a_map_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "m.pgm").write_bytes(b"P5 2 1 255\n\xff\xff")
-    with pytest.raises(TerrainError, match="cannot be resampled without closing gaps"):
-        load(tmp_path / "m.yaml", YAML, resolution_m=0.2)
