@@ -416,9 +416,9 @@ def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> tuple[Float
 
 def _is_lossy(dataset: Any) -> bool:
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
-    packed = structure.get("COMPRESSION", "").upper()
-    return (
-        dataset.driver == "JPEG"
-        or packed in ("JPEG", "YCBCR JPEG")
-        or structure.get("COMPRESSION_REVERSIBILITY", "").upper().startswith("LOSSY")
-    )
+    said = [
+        dataset.driver,
+        *structure.get("COMPRESSION", "").split(),
+        structure.get("COMPRESSION_REVERSIBILITY", ""),
+    ]
+    return any(word.upper().startswith(("JPEG", "LOSSY")) for word in said)

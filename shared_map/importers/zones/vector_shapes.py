@@ -6,20 +6,17 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from rasterio._err import CPLE_BaseError
-from rasterio.errors import RasterioError
 from rasterio.transform import from_origin
 from rasterio.warp import transform as to_crs
 
-from shared_map.importers.georeference import bounds_in, crs_name, system_named, systems_of
+from shared_map.importers.georeference import bounds_in, crs_name, reprojecting, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -75,7 +72,7 @@ class Placing:
             own = system_named(layer.crs, layer.what)
         self._target, self._crs = systems_of(grid, own, crs, layer.what, "crs")
         self._margin_cells = margin_m / grid.resolution_m + 2.0
-        with self._reprojecting():
+        with reprojecting(self.layer.what, self._crs, self._target):
             self._box = self._extent()
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
@@ -182,22 +179,11 @@ class Placing:
         if self._crs is not None and self._crs != self._target:
             unit_m = _DEG_M if self._degrees else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
-        with self._reprojecting():
+        with reprojecting(self.layer.what, self._crs, self._target):
             shapes = shapely.transform(shapes, lambda points: self._to_cells(points, -shift))
         for n in of[~np.isfinite(shapely.bounds(shapes)).all(axis=1)]:
             raise unusable(self.layer.what, features.id(n), "it has no place in the terrain's system")
         return shapes, of
-
-    @contextmanager
-    def _reprojecting(self) -> Iterator[None]:
-        """Makes what PROJ says of systems that do not go together a TerrainError."""
-
-        try:
-            yield
-        except (RasterioError, CPLE_BaseError) as error:
-            raise TerrainError(
-                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system"
-            ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
 
