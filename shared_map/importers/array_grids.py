@@ -227,7 +227,6 @@ def read_ros(path: Path) -> LevelMap:
 
 
 def _yaml(path: Path) -> Any:
-
     try:
         return yaml.safe_load(read_text(path, FileKind.ROS_MAP))
     except (yaml.YAMLError, ValueError, RecursionError) as error:

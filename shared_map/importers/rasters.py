@@ -145,7 +145,6 @@ def _of_colours(dataset: Any, what: str) -> Contents:
 
 
 def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
-
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     # A first look at the middle of a file: most height models are ruled out by it.
     window = middle_of(dataset, _LOOK_CELLS)
@@ -416,9 +415,5 @@ def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> tuple[Float
 
 def _is_lossy(dataset: Any) -> bool:
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
-    said = [
-        dataset.driver,
-        *structure.get("COMPRESSION", "").split(),
-        structure.get("COMPRESSION_REVERSIBILITY", ""),
-    ]
-    return any(word.upper().startswith(("JPEG", "LOSSY")) for word in said)
+    said = f"{dataset.driver} {structure.get('COMPRESSION')} {structure.get('COMPRESSION_REVERSIBILITY')}"
+    return any(word.startswith(("JPEG", "LOSSY")) for word in said.upper().split())

@@ -76,7 +76,6 @@ def burn(
 
 
 def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, what: str) -> Window:
-
     box = shapely.bounds(shapes)
     west, north, east, south = box[:, 0] - halves, box[:, 1] - halves, box[:, 2] + halves, box[:, 3] + halves
     if ((east - west + 1) * (south - north + 1)).sum() > _MOST_BURNT_CELLS:
@@ -108,7 +107,6 @@ def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray
 def _rasterize(
     shapes: NDArray[Any], values: NDArray[np.float64], out: Floats, window: Window, *, everywhere: bool
 ) -> None:
-
     pairs = [(part, value) for shape, value in zip(shapes, values.tolist(), strict=True) for part in _parts(shape)]
     if not pairs:
         return

@@ -86,7 +86,6 @@ class Placing:
 
     def _extent(self) -> Box:
         """The terrain with its margin, in the layer's coordinates; degrees go on beyond 180."""
-
         grid, out = self.grid, self._margin_cells * self.grid.resolution_m
         rows, cols = grid.rows + 2 * self._margin_cells, grid.cols + 2 * self._margin_cells
         west, north = grid.west_m - out, grid.north_m + out
@@ -142,7 +141,6 @@ class Placing:
 
     def place(self, features: Features) -> Shapes:
         """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
-
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
             if len(bounds):
@@ -186,7 +184,6 @@ class Placing:
         return shapes, of
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
-
         xs, ys = points[:, 0] + shift, points[:, 1]
         if self._crs is not None and self._crs != self._target and len(points):
             moved = to_crs(self._crs, self._target, xs, ys)
