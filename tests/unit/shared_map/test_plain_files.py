@@ -14,6 +14,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
 ASC = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\nNODATA_value -9999\n1 2 3\n4 -9999 6\n"
+GRASS = "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\n"
 MAP = "type octile\nheight 3\nwidth 4\nmap\n..@T\nGS.W\nO...\n"
 YAML = "image: m.pgm  # the picture\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
@@ -42,6 +43,16 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
             ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
             "looks like degrees",
         ),
+        (ASC.replace("xllcorner", "xllcenter"), "its header needs xllcorner and yllcorner"),
+        (
+            GRASS + "multiplier: 0.01\n1 2 3\n4 5 6",
+            "a multiplier",
+        ),
+        (ASC.replace("cellsize 50", "cellsize -50"), "a cell -50 x -50, expected a size above 0"),
+        (ASC.replace("cellsize 50", "dx 50\ndy 0"), "a cell 50 x 0, expected"),
+        (GRASS.replace("north: 20", "north: -20") + "1 2 3\n4 5 6", "a cell 10 x -10, expected"),
+        ("DSAA\n3 2\n60 0\n0 30\n1 6\n1 2 3\n4 5 6", "a cell -30 x 30, expected"),
+        ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
         (b"\xff\xfe\x00", "is truncated or no raster"),
         ("", "is truncated or no raster"),
     ],
