@@ -57,7 +57,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     Parameters
     ----------
     path : Path
-        Whatever rasterio reads. What is not in bytes is stretched from its 2nd to its 98th percentile.
+        Any raster. Values which are not bytes are stretched from its 2nd to its 98th percentile.
     grid : GridSpec
         Of the terrain.
     given_crs : str or None

@@ -55,7 +55,7 @@ class Placing:
     grid : GridSpec
     layer : Layer
     crs : str or None
-        What the scenario says that its system is; "local" is that of a terrain without a place.
+        Its system, as the scenario has it; "local" is that of a terrain without a place.
     margin_m : float
         So far outside the grid shapes are still of use.
 

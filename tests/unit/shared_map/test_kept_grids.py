@@ -17,10 +17,12 @@ from rasterio.control import GroundControlPoint
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from support.effort import few
+from support.zone_shapes import painted
 
 from shared_map.importers.sources import Source, load_source
-from swarm.config.ground import TerrainConfig
+from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
+from swarm.grid import GridSpec
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 UTM = "EPSG:32632"
@@ -113,6 +115,14 @@ def test_any_importer_keeps_a_square_metric_grid(
     if ending != "npz":
         assert source.grid.west_m == pytest.approx(WEST, abs=side_m / 100)
         assert source.grid.north_m == pytest.approx(NORTH, abs=side_m / 100)
+
+
+@pytest.mark.parametrize("ending", [each for each in WRITERS if each != "npz"])
+def test_a_zone_of_factors_is_read_by_any_importer(tmp_path: Path, ending: str) -> None:
+    WRITERS[ending](tmp_path / f"pace.{ending}", 10.0)
+    zone = ZoneConfig(kind="factor", file=str(tmp_path / f"pace.{ending}"), crs=UTM)
+    pace, _ = painted([zone], GridSpec(ROWS, COLS, 10.0, WEST, NORTH, UTM))
+    np.testing.assert_allclose(pace, HEIGHTS / 10, rtol=0, atol=1e-4)
 
 
 HEAD = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n"
