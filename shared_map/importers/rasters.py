@@ -152,7 +152,10 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
     gappy = {key: [*table.grounds, *table.nothing] for key, table in TABLES.items() if table.gappy}
     if not has_palette and not any(np.isin(values, codes).all() for codes in gappy.values()):
         return Contents()
-    sample = land_cover.sampled_codes(dataset, what)
+    try:
+        sample = land_cover.sampled_codes(dataset, what)
+    except TerrainError:  # real numbers
+        return Contents()
     codes = np.unique(sample)
     if not 0 < codes.size <= _MOST_CODES:
         return Contents()

@@ -313,6 +313,11 @@ def test_heights_in_whole_metres_are_heights(tmp_path: Path) -> None:
     for name, heights in (("low", np.rint(hills(1, 43) + 1)), ("tens", np.rint(hills(1, 20)) * 10)):
         path = written(tmp_path / f"{name}.tif", heights, "uint8")
         np.testing.assert_array_equal(load(path).elevation_m, heights.astype(np.float32))
+    for middle in (np.nan, 10.0):  # the part that is looked at first has no heights, or a lake's
+        heights = hills(1, 300)
+        heights[20:-20, 20:-20] = middle
+        path = written(tmp_path / "real.tif", heights)
+        np.testing.assert_array_equal(load(path).elevation_m, heights)
 
 
 def test_a_palette_of_unknown_codes_is_asked_for(tmp_path: Path) -> None:
