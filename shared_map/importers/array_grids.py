@@ -163,10 +163,8 @@ def read_map(path: Path) -> LevelMap:
     factor = np.empty((rows, cols), np.float32)
     row = 0
     for row, line in enumerate(filter(str.strip, lines), 1):
-        if row > rows:
-            raise TerrainError(f"terrain {path} has more rows than its header says, {rows}")
-        if len(line) != cols:
-            raise TerrainError(f"terrain {path}, line {row + 4}: {len(line)} cells; its header says {cols}")
+        if row > rows or len(line) != cols:
+            raise TerrainError(f"terrain {path}, line {row + 4}: {len(line)} cells; expected {rows} rows of {cols}")
         factor[row - 1] = letters[np.frombuffer(line.encode("ascii"), np.uint8)]
         if (unknown := np.isnan(factor[row - 1])).any():
             col = int(unknown.argmax())
@@ -210,8 +208,6 @@ def read_ros(path: Path) -> LevelMap:
         raise TerrainError(f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image instead")
     if free > occupied:
         raise TerrainError(f"terrain {path}: thresholds are {free:g}, {occupied:g}; expected free <= occupied")
-    if not image.is_file():
-        raise TerrainError(f"terrain {path} names the image {found.image}, but there is no file {image}")
     pixels, brightest = _grey(image)
     if found.negate:
         pixels = brightest - pixels
@@ -231,14 +227,10 @@ def read_ros(path: Path) -> LevelMap:
 
 
 def _yaml(path: Path) -> Any:
-
     try:
         return yaml.safe_load(read_text(path, FileKind.ROS_MAP))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "context_mark", None) or getattr(error, "problem_mark", None)
-        where = "" if mark is None else f", line {mark.line + 1}"
-        why = str(getattr(error, "problem", None) or error).splitlines()[0][:200]
-        raise TerrainError(f"terrain {path}{where}: no YAML: {why}") from error
+        raise TerrainError(f"terrain {path}: no YAML: {' '.join(str(error).split())[:LONGEST_REASON]}") from error
 
 
 def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
@@ -263,8 +255,6 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
             if image.mode in ("L", "I", "I;16"):
                 return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
             colours = np.asarray(image.convert("RGBA"), np.float32)
-    except Image.DecompressionBombError as error:
-        raise TerrainError(f"image {path}: its header says more pixels than are read: {error}") from error
-    except (OSError, ValueError, OverflowError, SyntaxError) as error:
+    except (OSError, ValueError, OverflowError, SyntaxError, Image.DecompressionBombError) as error:
         raise TerrainError(f"image {path} is truncated or no PGM, PNG or BMP: {str(error)[:200]}") from error
     return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan)), 255

@@ -7,11 +7,14 @@ rasterio is imported where it is used: agents never need it.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import rasterio
-from rasterio.errors import CRSError
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import CRSError, RasterioError
 from rasterio.transform import array_bounds
 from rasterio.warp import transform as to_crs
 from rasterio.warp import transform_bounds
@@ -175,6 +178,16 @@ def crs_name(crs: Any) -> str:
     """Returns the name of a rasterio CRS for people: EPSG:32632, or the beginning of its text."""
     text = "a local system" if is_local(crs) else _system(crs)
     return text if len(text) < 60 else text[:57] + "..."
+
+
+@contextmanager
+def reprojecting(what: str, crs: Any, target: Any) -> Iterator[None]:
+    """Makes what PROJ says of systems that do not go together a TerrainError."""
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(f"{what} is in {names[0]}, from which no way leads to {names[1]}") from error
 
 
 def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float, float, float]:

@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import rasterio
-from rasterio._err import CPLE_BaseError
-from rasterio.errors import RasterioError
 from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import Resampling
 
-from shared_map.importers.georeference import METRES, bounds_in, crs_name, pixel_m, systems_of
+from shared_map.importers.georeference import METRES, bounds_in, pixel_m, reprojecting, systems_of
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -99,13 +97,8 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
 
 def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
     """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
-    try:
+    with reprojecting(what, crs, target):
         west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target)
-    except (RasterioError, CPLE_BaseError) as error:
-        names = crs_name(crs), crs_name(target)
-        raise TerrainError(
-            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
-        ) from error
     grid_east = grid.west_m + grid.cols * grid.resolution_m
     grid_south = grid.north_m - grid.rows * grid.resolution_m
     wide = min(east, grid_east) - max(west, grid.west_m)

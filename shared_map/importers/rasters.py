@@ -145,7 +145,6 @@ def _of_colours(dataset: Any, what: str) -> Contents:
 
 
 def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
-
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     # A first look at the middle of a file: most height models are ruled out by it.
     window = middle_of(dataset, _LOOK_CELLS)
@@ -153,7 +152,10 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
     gappy = {key: [*table.grounds, *table.nothing] for key, table in TABLES.items() if table.gappy}
     if not has_palette and not any(np.isin(values, codes).all() for codes in gappy.values()):
         return Contents()
-    sample = land_cover.sampled_codes(dataset, what)
+    try:
+        sample = land_cover.sampled_codes(dataset, what)
+    except TerrainError:  # real numbers
+        return Contents()
     codes = np.unique(sample)
     if not 0 < codes.size <= _MOST_CODES:
         return Contents()
@@ -305,9 +307,8 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
 def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
     """The whole first band, as stored; NaN where there is no height."""
     if dataset.height * dataset.width > MAX_CELLS:
-        raise TerrainError(
-            f"{what} has undeclared voids ({', '.join(f'{v:g}' for v in voids)}): gdal_edit.py -a_nodata"
-        )
+        listed = ", ".join(f"{void:g}" for void in voids)
+        raise TerrainError(f"{what} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one")
     heights: Floats = dataset.read(1).astype(np.float32)
     heights[dataset.read_masks(1) == 0] = np.nan
     return without(heights, voids)
@@ -417,9 +418,5 @@ def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> tuple[Float
 
 def _is_lossy(dataset: Any) -> bool:
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
-    packed = structure.get("COMPRESSION", "").upper()
-    return (
-        dataset.driver == "JPEG"
-        or packed in ("JPEG", "YCBCR JPEG")
-        or structure.get("COMPRESSION_REVERSIBILITY", "").upper().startswith("LOSSY")
-    )
+    said = f"{dataset.driver} {structure.get('COMPRESSION')} {structure.get('COMPRESSION_REVERSIBILITY')}"
+    return any(word.startswith(("JPEG", "LOSSY")) for word in said.upper().split())

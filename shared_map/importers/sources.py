@@ -99,7 +99,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     if config.cover is not None:
         from shared_map.importers.cover.land_cover import with_cover
 
-        source = with_cover(source, config, progress)
+        source = with_cover(source, Path(config.cover), config, progress)
     return source
 
 

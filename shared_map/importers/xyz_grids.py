@@ -201,7 +201,6 @@ class _Axis(NamedTuple):
 
 
 def _points(layout: _Layout) -> Numbers:
-
     what, total = layout.what, 0
     xs = ys = np.zeros(0)
     for part in _numbers(layout):

@@ -155,7 +155,6 @@ class Learner:
         columns : float32 (cells, 11), `Features.columns`
         kinds : uint8 (cells,), TerrainClass
         """
-
         of_class = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
         some = [at[np.linspace(0, len(at) - 1, min(len(at), MOST_OF_A_CLASS)).astype(np.intp)] for at in of_class]
         kept = np.concatenate(some)

@@ -64,12 +64,10 @@ class Cover:
     notes: tuple[str, ...]
 
 
-def with_cover(source: Source, config: TerrainConfig, progress: Progress) -> Source:
+def with_cover(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """The source with the classes of `terrain.cover`: they win over the photo's, but for its roads, which maps of
     land cover lack, and over level ground."""
-    if config.cover is None:
-        return source
-    cover = read_cover(Path(config.cover), source.grid, config, progress)
+    cover = read_cover(path, source.grid, config, progress)
     known = cover.known & (source.classes != TerrainClass.ROAD)
     wet = known & (source.classes == TerrainClass.WATER) & (cover.classes != TerrainClass.WATER)
     wet &= np.isfinite(cover.factor)

@@ -57,7 +57,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     Parameters
     ----------
     path : Path
-        Whatever rasterio reads. What is not in bytes is stretched from its 2nd to its 98th percentile.
+        Any raster. Values which are not bytes are stretched from its 2nd to its 98th percentile.
     grid : GridSpec
         Of the terrain.
     given_crs : str or None
@@ -74,11 +74,8 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     what = f"photo {path}"
     with opened(path, "photo") as dataset:
         placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
-        notes = [str(path)]
-        if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
-            notes.append(
-                f"photo: {dataset.height} x {dataset.width} pixels, covers {placed.share:.1%} of the terrain"
-            )
+        size = f"{dataset.height} x {dataset.width} pixels"
+        notes = [str(path), f"photo: {size}, covers {placed.share:.1%} of the terrain"]
         return _read(placed, notes, progress)
 
 

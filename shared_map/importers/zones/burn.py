@@ -76,7 +76,6 @@ def burn(
 
 
 def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, what: str) -> Window:
-
     box = shapely.bounds(shapes)
     west, north, east, south = box[:, 0] - halves, box[:, 1] - halves, box[:, 2] + halves, box[:, 3] + halves
     if ((east - west + 1) * (south - north + 1)).sum() > _MOST_BURNT_CELLS:
@@ -91,30 +90,23 @@ def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, w
 
 def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
     """Polygons as they are, lines and points as areas, long ones in pieces; and of which shape each is a part."""
-    of = np.arange(len(shapes))
-    long = np.flatnonzero((halves > 0) & (shapely.get_num_coordinates(shapes) > _PIECE)) if len(shapes) else of
-    if len(long):
-        pieces, owners = [], []
-        for n in long.tolist():
-            points = shapely.get_coordinates(shapes[n])
+    pieces, of = [], []
+    for n, shape in enumerate(shapes):
+        parts, points = [shape], shapely.get_coordinates(shape)
+        if halves[n] > 0 and len(points) > _PIECE:
             starts = range(0, len(points) - 1, _PIECE)
-            pieces += [shapely.LineString(points[start : start + _PIECE + 1]) for start in starts]
-            owners += [n] * len(starts)
-        short = np.setdiff1d(of, long)
-        of = np.concatenate([short, np.array(owners, np.intp)])
-        by_owner = np.argsort(of, kind="stable")
-        shapes = np.concatenate([shapes[short], np.array(pieces, object)])[by_owner]
-        of = of[by_owner]
-    lines = halves[of] > 0
-    widened = shapes.copy()
-    widened[lines] = shapely.buffer(shapes[lines], halves[of][lines])
-    return widened, of
+            parts = [shapely.LineString(points[start : start + _PIECE + 1]) for start in starts]
+        pieces += parts
+        of += [n] * len(parts)
+    widened, owners = np.array(pieces, object), np.array(of, np.intp)
+    lines = halves[owners] > 0
+    widened[lines] = shapely.buffer(widened[lines], halves[owners][lines])
+    return widened, owners
 
 
 def _rasterize(
     shapes: NDArray[Any], values: NDArray[np.float64], out: Floats, window: Window, *, everywhere: bool
 ) -> None:
-
     pairs = [(part, value) for shape, value in zip(shapes, values.tolist(), strict=True) for part in _parts(shape)]
     if not pairs:
         return

@@ -6,20 +6,17 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from rasterio._err import CPLE_BaseError
-from rasterio.errors import RasterioError
 from rasterio.transform import from_origin
 from rasterio.warp import transform as to_crs
 
-from shared_map.importers.georeference import bounds_in, crs_name, system_named, systems_of
+from shared_map.importers.georeference import bounds_in, crs_name, reprojecting, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -58,7 +55,7 @@ class Placing:
     grid : GridSpec
     layer : Layer
     crs : str or None
-        What the scenario says that its system is; "local" is that of a terrain without a place.
+        Its system, as the scenario has it; "local" is that of a terrain without a place.
     margin_m : float
         So far outside the grid shapes are still of use.
 
@@ -75,11 +72,11 @@ class Placing:
             own = system_named(layer.crs, layer.what)
         self._target, self._crs = systems_of(grid, own, crs, layer.what, "crs")
         self._margin_cells = margin_m / grid.resolution_m + 2.0
-        with self._reprojecting():
+        with reprojecting(self.layer.what, self._crs, self._target):
             self._box = self._extent()
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
-        self._reach: Box | None = None
+        self._reach = np.full(4, np.nan)
         self._touched, self._features, self._corners = False, 0, 0
 
     @property
@@ -89,7 +86,6 @@ class Placing:
 
     def _extent(self) -> Box:
         """The terrain with its margin, in the layer's coordinates; degrees go on beyond 180."""
-
         grid, out = self.grid, self._margin_cells * self.grid.resolution_m
         rows, cols = grid.rows + 2 * self._margin_cells, grid.cols + 2 * self._margin_cells
         west, north = grid.west_m - out, grid.north_m + out
@@ -104,13 +100,13 @@ class Placing:
     def check_touched(self) -> None:
         """Raises TerrainError if the layer holds no feature, or none that was placed is on the terrain."""
         what = self.layer.what
-        if self._reach is None:
+        if np.isnan(self._reach).any():
             raise TerrainError(f"{what} holds no feature")
         if not self._touched:
-            hint = "are x and y in reverse?" if self._reversed(np.array([self._reach]))[0] else "is crs right?"
+            hint = "are x and y in reverse?" if self._reversed(self._reach[None])[0] else "is crs right?"
             raise TerrainError(
-                f"{what} does not touch the terrain: it reaches from {_shown(self._reach)}, the terrain from"
-                f" {_shown(self._box)} in {self.crs}; {hint}"
+                f"{what} does not touch the terrain: it reaches from {_shown(*self._reach)}, the terrain from"
+                f" {_shown(*self._box)} in {self.crs}; {hint}"
             )
 
     def _on(self, bounds: Floats64) -> NDArray[np.bool_]:
@@ -134,7 +130,7 @@ class Placing:
             wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
             for n in np.flatnonzero(wrong)[:1]:
                 raise TerrainError(
-                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(tuple(bounds[n]))}, which"
+                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(*bounds[n])}, which"
                     f" are no degrees, as {self.crs} has them; set crs"
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
@@ -145,13 +141,11 @@ class Placing:
 
     def place(self, features: Features) -> Shapes:
         """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
-
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
             if len(bounds):
-                reach = (*bounds[:, :2].min(axis=0), *bounds[:, 2:].max(axis=0))
-                before = reach if self._reach is None else self._reach
-                self._reach = (*np.minimum(before[:2], reach[:2]), *np.maximum(before[2:], reach[2:]))
+                reach, before = shapely.total_bounds(features.shapes), self._reach
+                self._reach = np.concatenate((np.fmin(before[:2], reach[:2]), np.fmax(before[2:], reach[2:])))
             self._check_bounds(features, bounds)
             near = self._on(bounds)
             self._touched |= bool(near.any())
@@ -183,25 +177,13 @@ class Placing:
         if self._crs is not None and self._crs != self._target:
             unit_m = _DEG_M if self._degrees else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
-        with self._reprojecting():
+        with reprojecting(self.layer.what, self._crs, self._target):
             shapes = shapely.transform(shapes, lambda points: self._to_cells(points, -shift))
         for n in of[~np.isfinite(shapely.bounds(shapes)).all(axis=1)]:
             raise unusable(self.layer.what, features.id(n), "it has no place in the terrain's system")
         return shapes, of
 
-    @contextmanager
-    def _reprojecting(self) -> Iterator[None]:
-        """Makes what PROJ says of systems that do not go together a TerrainError."""
-
-        try:
-            yield
-        except (RasterioError, CPLE_BaseError) as error:
-            raise TerrainError(
-                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system"
-            ) from error
-
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
-
         xs, ys = points[:, 0] + shift, points[:, 1]
         if self._crs is not None and self._crs != self._target and len(points):
             moved = to_crs(self._crs, self._target, xs, ys)
@@ -214,8 +196,8 @@ def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainErr
     return unusable(what, features.id(features.of[shape]), why)
 
 
-def _shown(box: Box) -> str:
-    return f"{box[0]:.7g}, {box[1]:.7g} to {box[2]:.7g}, {box[3]:.7g}"
+def _shown(west: float, south: float, east: float, north: float) -> str:
+    return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
 
 def _jumps(geometry: Any) -> bool:

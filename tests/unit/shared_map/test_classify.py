@@ -184,15 +184,6 @@ def test_a_line_is_a_road_if_it_is_long_and_bright_on_both_sides() -> None:
     assert not (by_rules(photo, level, 90.0) == TerrainClass.ROAD).any()  # no road is that wide
 
 
-def test_bands_do_not_show(davos: tuple[Source, Labels], monkeypatch: pytest.MonkeyPatch) -> None:
-    source, _ = davos
-    assert source.photo is not None
-    expected = by_rules(source.photo, source.elevation_m, 10.0)
-    monkeypatch.setattr("shared_map.terrain.row_bands.BAND_ROWS", 10_000)
-    monkeypatch.setattr("shared_map.terrain.row_bands.bands", lambda rows, band_rows=0: [(0, rows)])
-    np.testing.assert_array_equal(by_rules(source.photo, source.elevation_m, 10.0), expected)
-
-
 def labels_file(folder: Path, text: str) -> Labels:
     (folder / "l.toml").write_text(text)
     return read_labels(folder / "l.toml", GridSpec(20, 30, 10.0))

@@ -100,16 +100,6 @@ def test_a_tile_of_the_web_lies_where_its_path_says(tmp_path: Path) -> None:
     assert np.nanmax(source.elevation_m) == pytest.approx(1500, abs=5)
 
 
-def test_transparent_cells_are_voids(tmp_path: Path) -> None:
-    ground = hills(1, 900)
-    alpha = np.full((1, SIDE, SIDE), 255, np.uint8)
-    alpha[:, :20] = 0
-    image = np.concatenate([encoded(ground, "terrarium"), alpha])
-    found = load(tile(tmp_path / "a.png", image, "PNG"), resolution_m=20.0)
-    assert np.isnan(found.elevation_m[:20]).all()
-    assert not np.isnan(found.elevation_m[20:]).any()
-
-
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_only_the_right_encoding_is_plausible(encoding: str) -> None:
     shown = np.ones((SIDE, SIDE), np.bool_)

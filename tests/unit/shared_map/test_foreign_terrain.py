@@ -11,9 +11,6 @@ from support.height_models import SIDE, hills, is_water, load, written
 
 from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
-from swarm.errors import TerrainError
-
-# --- what else must not be silently wrong -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -52,64 +49,18 @@ def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: P
     np.testing.assert_array_equal(source.elevation_m, ground)
 
 
-def test_heights_in_centimetres_and_what_a_map_in_feet_does_not_say(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("cm", 0.01), ("[m]", 1), ("US_survey_foot", 1200 / 3937), ("ft (US)", 1200 / 3937)]
+)
+def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, metres: float) -> None:
     import rasterio
 
-    path = written(tmp_path / "cm.tif", hills(2, 500) * 100)
+    path = written(tmp_path / "a.tif", hills(2, 500) / metres)
     with rasterio.open(path, "r+") as file:
-        file.units = ("cm",)
-    assert load(path).elevation_m.max() == pytest.approx(500, rel=1e-3)
+        file.units = (unit,)
+    np.testing.assert_allclose(load(path).elevation_m, hills(2, 500), atol=1e-3)
     notes = load(written(tmp_path / "ft.tif", hills(2, 500), crs="EPSG:2264")).notes
     assert any("terrain.height_scale = 0.3048" in note for note in notes)
-
-
-# --- kinds of files -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "driver", "dtype"),
-    [
-        ("a.img", "HFA", "float32"),
-        ("a.bil", "EHdr", "int16"),
-        ("a.flt", "EHdr", "float32"),
-        ("a.anything", "GTiff", "float32"),
-        ("without_ending", "GTiff", "int16"),
-        ("a.nc", "netCDF", "float32"),
-    ],
-)
-def test_rasters_of_many_kinds_are_read(tmp_path: Path, name: str, driver: str, dtype: str) -> None:
-    import rasterio
-    from rasterio.shutil import copy
-
-    plain = written(tmp_path / "plain.tif", np.round(hills(1, 500)), dtype)
-    copy(plain, tmp_path / name, driver=driver)
-    source = load(tmp_path / name)
-    np.testing.assert_allclose(source.elevation_m, load(plain).elevation_m)
-    assert rasterio.open(tmp_path / name).shape == (SIDE, SIDE)
-
-
-def test_a_raster_in_a_zip_is_read_and_a_bad_zip_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    import zipfile
-
-    plain = written(tmp_path / "plain.tif", hills(1, 500))
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.write(plain, "inside/dem.tif")
-        archive.writestr("readme.txt", "heights")
-    np.testing.assert_array_equal(load(tmp_path / "a.zip").elevation_m, load(plain).elevation_m)
-    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
-        archive.write(plain, "a.tif")
-        archive.write(plain, "b.tif")
-    with pytest.raises(TerrainError, match="holds 2 files of the kinds"):
-        load(tmp_path / "two.zip")
-    (tmp_path / "no.zip").write_bytes(b"PK no")
-    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
-        load(tmp_path / "no.zip")
-    (tmp_path / "cut.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-40000])
-    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
-        load(tmp_path / "cut.zip")
-    (tmp_path / "text").write_text("hello")
-    with pytest.raises(TerrainError, match="a file without ending is unknown"):
-        load(tmp_path / "text")
 
 
 # --- photos that are none -----------------------------------------------------------------------------------

@@ -17,10 +17,12 @@ from rasterio.control import GroundControlPoint
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from support.effort import few
+from support.zone_shapes import painted
 
 from shared_map.importers.sources import Source, load_source
-from swarm.config.ground import TerrainConfig
+from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
+from swarm.grid import GridSpec
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 UTM = "EPSG:32632"
@@ -44,6 +46,11 @@ def write_raster(path: Path, side_m: float, **profile: object) -> None:
     place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m)}
     with rasterio.open(path, "w", **{**size, **place, **profile}) as file:
         file.write(numbers, 1)
+
+
+def write_netcdf(path: Path, side_m: float, kind: str) -> None:
+    write_raster(path.with_suffix(".tif"), side_m)
+    copy(path.with_suffix(".tif"), path, driver="netCDF", FORMAT=kind)
 
 
 def write_esri(path: Path, side_m: float) -> None:
@@ -82,6 +89,9 @@ WRITERS: dict[str, Callable[[Path, float], None]] = {
     "tif": lambda path, side_m: write_raster(path, side_m),
     "img": lambda path, side_m: write_raster(path, side_m, driver="HFA"),
     "bil": lambda path, side_m: write_raster(path, side_m, driver="EHdr"),
+    "nc": lambda path, side_m: write_netcdf(path, side_m, "NC"),
+    "4.nc": lambda path, side_m: write_netcdf(path, side_m, "NC4"),
+    "anything": lambda path, side_m: write_raster(path, side_m, driver="GTiff"),
     "asc": write_esri,
     "grass.asc": write_grass,
     "grd": write_surfer,
@@ -98,7 +108,7 @@ def test_any_importer_keeps_a_square_metric_grid(
 ) -> None:
     path = tmp_path_factory.mktemp("kept") / f"dem.{ending}"
     WRITERS[ending](path, side_m)
-    source = load(path, crs=None if ending in ("tif", "img", "bil", "npz") else UTM)
+    source = load(path, crs=None if ending in ("tif", "img", "bil", "nc", "4.nc", "anything", "npz") else UTM)
     assert source.grid.shape == HEIGHTS.shape
     assert source.grid.resolution_m == pytest.approx(side_m, rel=1e-6)
     np.testing.assert_allclose(source.elevation_m, HEIGHTS, rtol=0, atol=1e-4)
@@ -107,7 +117,14 @@ def test_any_importer_keeps_a_square_metric_grid(
         assert source.grid.north_m == pytest.approx(NORTH, abs=side_m / 100)
 
 
-GRASS = "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\n"
+@pytest.mark.parametrize("ending", [each for each in WRITERS if each != "npz"])
+def test_a_zone_of_factors_is_read_by_any_importer(tmp_path: Path, ending: str) -> None:
+    WRITERS[ending](tmp_path / f"pace.{ending}", 10.0)
+    zone = ZoneConfig(kind="factor", file=str(tmp_path / f"pace.{ending}"), crs=UTM)
+    pace, _ = painted([zone], GridSpec(ROWS, COLS, 10.0, WEST, NORTH, UTM))
+    np.testing.assert_allclose(pace, HEIGHTS / 10, rtol=0, atol=1e-4)
+
+
 HEAD = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n"
 
 
@@ -126,65 +143,17 @@ HEAD = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n"
 )  # fmt: skip
 def test_a_grid_as_text_is_read_in_all_its_versions(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.asc").write_bytes(text.encode())
+    (tmp_path / "a.prj").write_text(rasterio.CRS.from_string(UTM).to_wkt())
     source = load(tmp_path / "a.asc")
+    assert source.grid.crs == UTM
     np.testing.assert_array_equal(source.elevation_m, np.array([[1.5, 2, np.nan], [4, 5, 6]], np.float32))
     assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
-
-
-def test_a_system_beside_a_text_with_a_mark_of_its_order_counts(tmp_path: Path) -> None:
-    (tmp_path / "a.asc").write_bytes(("\ufeff" + HEAD + "1.5 2 3 4 5 6").encode())
-    (tmp_path / "a.prj").write_text(rasterio.CRS.from_string(UTM).to_wkt())
-    assert load(tmp_path / "a.asc").grid.crs == UTM
-
-
-def test_whole_numbers_of_surfer_have_its_void(tmp_path: Path) -> None:
-    (tmp_path / "a.grd").write_text("DSAA\n3 2\n1000 1060\n2000 2030\n1 6\n1 2 3\n4 5 6")
-    np.testing.assert_array_equal(load(tmp_path / "a.grd").elevation_m, [[4, 5, 6], [1, 2, 3]])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (HEAD.replace("xllcorner", "xllcenter") + "1 2 3 4 5 6", "its header needs xllcorner and yllcorner"),
-        (
-            GRASS + "multiplier: 0.01\n1 2 3\n4 5 6",
-            "a multiplier",
-        ),
-        (HEAD.replace("cellsize 50", "cellsize -50") + "1 2 3 4 5 6", "a cell -50 x -50, expected a size above 0"),
-        (HEAD.replace("cellsize 50", "dx 50\ndy 0") + "1 2 3 4 5 6", "a cell 50 x 0, expected"),
-        (GRASS.replace("north: 20", "north: -20") + "1 2 3\n4 5 6", "a cell 10 x -10, expected"),
-        ("DSAA\n3 2\n60 0\n0 30\n1 6\n1 2 3\n4 5 6", "a cell -30 x 30, expected"),
-        ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
-    ],
-)
-def test_headers_which_gdal_reads_in_part_are_refused(tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "a.asc").write_text(text)
-    with pytest.raises(TerrainError, match=words):
-        load(tmp_path / "a.asc")
 
 
 def test_a_line_of_tabs_longer_than_a_piece_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared_map.importers.raster_files._TEXT_PIECE_BYTES", 16)
     (tmp_path / "a.asc").write_text(HEAD + "\t".join(["1.25"] * 5 + ["123456789.5"]))
     assert load(tmp_path / "a.asc").elevation_m[0].tolist() == [1.25] * 3
-
-
-def test_a_virtual_raster_names_known_kinds_only(tmp_path: Path) -> None:
-    (tmp_path / "wms.xml").write_text("<GDAL_WMS></GDAL_WMS>")
-    source = '<SimpleSource><SourceFilename relativeToVRT="1">wms.xml</SourceFilename></SimpleSource>'
-    band = f'<VRTRasterBand dataType="Byte" band="1">{source}</VRTRasterBand>'
-    (tmp_path / "a.vrt").write_text(f'<VRTDataset rasterXSize="2" rasterYSize="2">{band}</VRTDataset>')
-    with pytest.raises(TerrainError, match=r"wms\.xml is no raster"):
-        load(tmp_path / "a.vrt")
-
-
-def test_fractions_far_behind_the_beginning_of_a_text_are_kept(tmp_path: Path) -> None:
-    """GDAL takes the first 100 kB for all of a text."""
-    numbers = np.full((300, 300), 1234567.0)
-    numbers[-1, -1] = 0.25
-    text = "\n".join(" ".join(f"{number:g}" for number in row) for row in numbers)
-    (tmp_path / "a.asc").write_text("ncols 300\nnrows 300\nxllcorner 0\nyllcorner 0\ncellsize 5\n" + text)
-    assert load(tmp_path / "a.asc").elevation_m[-1, -1] == np.float32(0.25)
 
 
 @pytest.mark.parametrize("side", [1.0, 1 / 3600])
@@ -215,25 +184,6 @@ def test_control_points_place_a_raster(tmp_path: Path) -> None:
     assert float(np.nanmean(source.elevation_m)) == pytest.approx(float(HEIGHTS.mean()), abs=0.5)
 
 
-@pytest.mark.parametrize(
-    ("ending", "scale", "profile", "words"),
-    [
-        ("tif", 100, {}, r"has heights of 2.* to 3.* m: of centimetres set"),
-        ("hgt", 1, {"driver": "GTiff"}, "says by its name where it lies, such as N46E008.hgt"),
-    ],
-)
-def test_a_refusal_states_what_was_found(
-    tmp_path: Path, ending: str, scale: float, profile: dict[str, Any], words: str
-) -> None:
-    path = tmp_path / f"dem.{ending}"
-    if ending == "hgt":
-        path.write_bytes(bytes(2 * 1201 * 1201))
-    else:
-        write_raster(path, 10.0, numbers=HEIGHTS * np.float32(scale), **profile)
-    with pytest.raises(TerrainError, match=words):
-        load(path)
-
-
 @pytest.mark.parametrize("ending", ["tif", "asc", "npz", "xyz", "yaml", "geojson"])
 def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
     os.mkfifo(tmp_path / f"dem.{ending}")
@@ -246,13 +196,6 @@ def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
     source = load(tmp_path / "a.tif")
     np.testing.assert_array_equal(source.elevation_m, -HEIGHTS)
     assert "the file states depths; heights are their negatives" in source.notes
-
-
-@pytest.mark.parametrize("kind", ["NC", "NC4"])
-def test_both_versions_of_netcdf_are_read(tmp_path: Path, kind: str) -> None:
-    write_raster(tmp_path / "a.tif", 10.0)
-    copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT=kind)
-    np.testing.assert_array_equal(load(tmp_path / "a.nc").elevation_m, HEIGHTS)
 
 
 KINDS = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]

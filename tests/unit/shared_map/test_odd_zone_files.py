@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,62 +17,6 @@ from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-
-BOX = {"type": "Polygon", "coordinates": [[[9.001, 46.94], [9.004, 46.94], [9.004, 46.95], [9.001, 46.94]]]}
-
-
-def collection(*geometries: Any) -> str:
-    return json.dumps(
-        {
-            "type": "FeatureCollection",
-            "features": [{"type": "Feature", "properties": {}, "geometry": g} for g in geometries],
-        }
-    )
-
-
-REFUSED = {
-    "empty": ("", "neither GeoJSON, GeoPackage, Shapefile"),
-    "words": ("not a map at all", "neither GeoJSON, GeoPackage, Shapefile"),
-    "other json": ('{"a": 1}', "is damaged"),
-    "cut off": (collection(BOX)[:-40], "is damaged"),
-    "deep": ('{"type": "FeatureCollection", "features":' + "[" * 100_000, "is damaged"),
-    "elsewhere": (
-        collection({"type": "Point", "coordinates": [100.0, 20.0]}),
-        r"reaches from 100, 20 to 100, 20, the terrain from 8\.9\S+, 46\.\S+ to 9\.\S+, 46\.\S+ in",
-    ),
-    "metres": (collection({"type": "Point", "coordinates": [500_100.0, 5_199_900.0]}), "which are no degrees"),
-    "huge": (collection({"type": "Point", "coordinates": [1e300, -1e300]}), "which are no degrees"),
-    "no number": (
-        collection({"type": "Point", "coordinates": [1e300, -1e300]}).replace("1e+300", "1e999"),
-        "is damaged",
-    ),
-    "sqlite": (
-        "SQLite format 3\0" + "x" * 5000,
-        "is SQLite, but no GeoPackage, perhaps SpatiaLite; it is not read",
-    ),
-    "geopackage": ("SQLite format 3\0".ljust(68, "x") + "GPKG" + "x" * 5000, "is damaged"),
-    "shapefile": ("\0\0\x27\x0a" + "\xff" * 500, "is damaged"),
-    "zip": ("PK\3\4" + "x" * 200, "is damaged or no .zip"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_file_that_cannot_be_read_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
-    text, reason = REFUSED[name]
-    for ending in (".geojson", ".gpkg", ".shp", ".zip", ""):
-        path = tmp_path / f"a{ending}"
-        path.write_bytes(text.encode("latin-1"))
-        for kind in ("forbidden", "road", "factor"):
-            factor = 2.0 if kind == "factor" else None
-            with pytest.raises(TerrainError) as told:
-                painted([ZoneConfig(kind=kind, name="quarry", file=str(path), factor=factor, width_m=3.0)])
-            names = str(told.value).startswith(f"cost.zones[0]: zone 'quarry' {path}")
-            assert names or "cannot read zone" in str(told.value)
-            assert "\n" not in str(told.value)
-            assert len(str(told.value)) < 500
-    zone = ZoneConfig(kind="factor", file=str(tmp_path / "a.geojson"), factor=2.0)
-    with pytest.raises(TerrainError, match=reason):
-        painted([zone])
 
 
 def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
 ASC = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\nNODATA_value -9999\n1 2 3\n4 -9999 6\n"
+GRASS = "north: 20\nsouth: 0\neast: 30\nwest: 0\nrows: 2\ncols: 3\n"
 MAP = "type octile\nheight 3\nwidth 4\nmap\n..@T\nGS.W\nO...\n"
 YAML = "image: m.pgm  # the picture\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
@@ -23,12 +24,6 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return load_source(TerrainConfig(source=str(path), **settings), seed=1)
-
-
-def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
-    source = load(tmp_path / "a.asc", ASC)
-    np.testing.assert_array_equal(source.elevation_m, np.array([[1, 2, 3], [4, np.nan, 6]], np.float32))
-    assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +43,16 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
             ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
             "looks like degrees",
         ),
+        (ASC.replace("xllcorner", "xllcenter"), "its header needs xllcorner and yllcorner"),
+        (
+            GRASS + "multiplier: 0.01\n1 2 3\n4 5 6",
+            "a multiplier",
+        ),
+        (ASC.replace("cellsize 50", "cellsize -50"), "a cell -50 x -50, expected a size above 0"),
+        (ASC.replace("cellsize 50", "dx 50\ndy 0"), "a cell 50 x 0, expected"),
+        (GRASS.replace("north: 20", "north: -20") + "1 2 3\n4 5 6", "a cell 10 x -10, expected"),
+        ("DSAA\n3 2\n60 0\n0 30\n1 6\n1 2 3\n4 5 6", "a cell -30 x 30, expected"),
+        ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
         (b"\xff\xfe\x00", "is truncated or no raster"),
         ("", "is truncated or no raster"),
     ],
@@ -55,21 +60,6 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
 def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str | bytes, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
         load(tmp_path / "a.asc", text)
-
-
-def test_an_ascii_grid_in_degrees_is_put_on_metres_when_told(tmp_path: Path) -> None:
-    text = ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47")
-    source = load(tmp_path / "a.asc", text.replace("-9999 6", "5 6"), crs="EPSG:4326")
-    assert 80 < source.grid.resolution_m < 100
-
-
-def test_arrays_come_from_npz_with_resolution(tmp_path: Path) -> None:
-    heights = np.arange(20.0).reshape(4, 5)
-    np.savez(tmp_path / "a.npz", elevation=heights, resolution_m=30.0)
-    source = load(tmp_path / "a.npz")
-    np.testing.assert_array_equal(source.elevation_m, heights)
-    assert source.grid.resolution_m == 30
-    assert load(tmp_path / "a.npz", resolution_m=60.0).elevation_m.shape == (2, 2)
 
 
 def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
@@ -98,8 +88,6 @@ def test_an_hgt_is_known_by_its_length(tmp_path: Path) -> None:
     source = load(tmp_path / "N46E009.hgt", heights.tobytes())
     assert 70 < source.grid.resolution_m < 93
     assert np.nanmedian(source.elevation_m) == 700
-    with pytest.raises(TerrainError, match=r"truncated or no \.hgt: it has 1000 bytes"):
-        load(tmp_path / "N46E010.hgt", b"\0" * 1000)
 
 
 def test_a_png_needs_a_scale(tmp_path: Path) -> None:
@@ -132,7 +120,7 @@ def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; its header says 4"),
+        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; expected 3 rows of 4"),
         (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
         (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
         (MAP.replace("height 3", "height many"), "no MovingAI map"),
@@ -178,9 +166,10 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("yaml", "image", "words"),
     [
+        (YAML.replace("m.pgm", "n.pgm"), b"", r"cannot read image .*n\.pgm: No such file"),
         (YAML, b"P9 1 1 255\n\0\0\0", "no PGM, PNG or BMP"),
         (YAML, b"P5 100 100 255\n\0\0", "is truncated"),
-        (YAML, b"P5 99999 99999 255\n\0", "its header says more pixels than are read"),
+        (YAML, b"P5 99999 99999 255\n\0", "is truncated or no PGM.*decompression bomb"),
         (YAML, b"P5 a b 255\n\0", "invalid literal"),
         (YAML, b"P2 2 1 255\n1 x\n", "no PGM"),
         (YAML, b"P5 2 1 0\n\0\0", "maxval must be greater than 0"),
@@ -195,14 +184,3 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
 def test_a_bad_ros_map_is_refused_with_a_sentence(tmp_path: Path, yaml: str, image: bytes, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
         ros(tmp_path, yaml, image)
-
-
-def test_a_missing_image_is_said(tmp_path: Path) -> None:
-    with pytest.raises(TerrainError, match=r"m.yaml names the image m.pgm, but there is no file"):
-        load(tmp_path / "m.yaml", YAML)
-
-
-def test_resampling_a_map_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "m.pgm").write_bytes(b"P5 2 1 255\n\xff\xff")
-    with pytest.raises(TerrainError, match="cannot be resampled without closing gaps"):
-        load(tmp_path / "m.yaml", YAML, resolution_m=0.2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
+from scipy.io import netcdf_file
 from support.height_models import written
 
 from shared_map.importers.cover.photos import read_photo
@@ -44,13 +47,6 @@ def said(source: Source, words: str) -> bool:
 
 
 # --- GeoTIFF ------------------------------------------------------------------------------------------------
-
-
-def test_a_metric_geotiff_is_taken_as_it_is(tmp_path: Path) -> None:
-    source = load(write(tmp_path / "a.tif", heights()))
-    np.testing.assert_array_equal(source.elevation_m, heights())
-    assert (source.grid.rows, source.grid.cols, source.grid.resolution_m) == (40, 50, 20)
-    assert (source.grid.west_m, source.grid.north_m, source.grid.crs) == (500_000, 5_200_000, "EPSG:32632")
 
 
 def test_degrees_are_put_on_square_metres(tmp_path: Path) -> None:
@@ -195,6 +191,49 @@ def promise_in_16384(folder: Path) -> dict[str, Any]:
     return {"source": path}
 
 
+def vrt(folder: Path, source: str, times: int = 1, name: str = "a.vrt") -> dict[str, Any]:
+    """A raster which another file paints, several times over."""
+    painted = f'<SimpleSource><SourceFilename relativeToVRT="1">{source}</SourceFilename></SimpleSource>' * times
+    place = "<SRS>EPSG:32632</SRS><GeoTransform>500000,20,0,5200000,0,-20</GeoTransform>"
+    band = f'<VRTRasterBand dataType="Float32" band="1">{painted}</VRTRasterBand>'
+    head = '<VRTDataset rasterXSize="50" rasterYSize="40">'
+    (folder / name).write_text(f"{head}{place}{band}</VRTDataset>")
+    return {"source": folder / name}
+
+
+def fifo(folder: Path) -> str:
+    os.mkfifo(folder / "pipe")
+    return "pipe"
+
+
+def packed(folder: Path, *names: str, method: int = zipfile.ZIP_DEFLATED) -> dict[str, Any]:
+    with zipfile.ZipFile(folder / "a.zip", "w", method) as archive:
+        for name in names:
+            archive.write(dem(folder)["source"], name)
+    return {"source": folder / "a.zip"}
+
+
+def spoilt(made: dict[str, Any]) -> dict[str, Any]:
+    content = bytearray(made["source"].read_bytes())
+    content[40:140] = bytes(7 * n % 256 for n in range(100))
+    made["source"].write_bytes(content)
+    return made
+
+
+def blank(folder: Path, name: str, content: bytes) -> dict[str, Any]:
+    (folder / name).write_bytes(content)
+    return {"source": folder / name}
+
+
+def two_variables(folder: Path) -> dict[str, Any]:
+    with netcdf_file(folder / "a.nc", "w") as file:
+        for axis in ("y", "x"):
+            file.createDimension(axis, 40)
+        for name in ("height", "snow"):
+            file.createVariable(name, "f4", ("y", "x"))[:] = 1.0
+    return {"source": folder / "a.nc"}
+
+
 NOISE = np.random.default_rng(1).normal(size=(400, 400)).astype(np.float32)
 PHOTO = np.zeros((3, 9, 9), np.uint8)
 FEET = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'
@@ -229,6 +268,22 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: text(f, "a.qqq"), ".qqq is unknown; give .tif.*gdal_translate"),
     (lambda f: {"source": f / "nowhere.tif"}, r"cannot read terrain .*nowhere\.tif: No such file"),
     (lambda f: {"source": f}, "is a folder"),
+    (lambda f: vrt(f, "http://127.0.0.1:9/a.tif"), "cannot read raster .*No such file"),
+    (lambda f: vrt(f, "/vsicurl/a.tif"), "cannot read raster .*No such file"),
+    (lambda f: vrt(f, fifo(f)), "it is a device or pipe"),
+    (lambda f: vrt(f, "a.vrt"), "more than 4 deep"),
+    (lambda f: vrt(f, dem(f)["source"].name, 40), "paints its pixels 40 times over"),
+    (lambda f: vrt(f, vrt(f, dem(f)["source"].name, 40, "b.vrt")["source"].name), "paints its pixels 40 times"),
+    (lambda f: vrt(f, text(f, "wms.xml")["source"].name), r"wms\.xml is no raster"),
+    (lambda f: packed(f, "a.tif", "b.tif"), "holds 2 files of the kinds .tif"),
+    (lambda f: spoilt(packed(f, "a.tif")), r"a\.zip"),
+    (lambda f: spoilt(packed(f, "a.tif", method=zipfile.ZIP_LZMA)), r"a\.zip"),
+    (lambda f: spoilt(packed(f, "a.tif", method=zipfile.ZIP_BZIP2)), r"a\.zip"),
+    (lambda f: blank(f, "a.zip", b"PK no"), r"damaged or no \.zip"),
+    (lambda f: blank(f, "a.hgt", bytes(2 * 1201**2)), "says by its name where it lies, such as N46E008.hgt"),
+    (lambda f: blank(f, "N46E010.hgt", bytes(1000)), r"truncated or no \.hgt: it has 1000 bytes"),
+    (lambda f: dem(f, heights() * np.float32(100)), "m: of centimetres set terrain.height_scale = 0.01"),
+    (two_variables, "several rasters .*height.*snow"),
 ]
 
 
@@ -239,6 +294,15 @@ def test_a_bad_raster_is_refused_with_a_sentence(
     with pytest.raises(TerrainError, match=words) as caught:
         load(**make(tmp_path))
     assert "\n" not in str(caught.value)
+
+
+def test_a_raster_within_another_file_is_that_raster(tmp_path: Path) -> None:
+    plain = load(**dem(tmp_path))
+    nested = vrt(tmp_path, vrt(tmp_path, "a.tif", 30, "b.vrt")["source"].name)
+    for made in (nested, packed(tmp_path, "inside/dem.tif")):
+        found = load(**made)
+        assert found.grid == plain.grid
+        np.testing.assert_array_equal(found.elevation_m, plain.elevation_m)
 
 
 # --- real data ----------------------------------------------------------------------------------------------

@@ -33,13 +33,6 @@ def wrote(path: Path, text: str) -> Path:
     return path
 
 
-def test_points_give_what_a_raster_of_them_gives(tmp_path: Path) -> None:
-    plain = load(written(tmp_path / "a.tif", GROUND, transform=from_origin(WEST, NORTH, STEP, STEP)))
-    found = load(wrote(tmp_path / "a.xyz", text_of(POINTS)), crs="EPSG:32632")
-    assert found.grid == plain.grid
-    np.testing.assert_array_equal(found.elevation_m, plain.elevation_m)
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -83,13 +76,6 @@ def test_points_in_any_order_and_with_any_gaps_lie_where_they_say(
     expected.reshape(-1)[sorted(there)] = np.nan
     np.testing.assert_array_equal(plain.numbers, expected)
     assert (f"{len(there)} points of the grid" in " ".join(plain.notes)) == bool(there)
-
-
-def test_heights_of_zero_are_no_gaps_and_gaps_are_no_zeros(tmp_path: Path) -> None:
-    points = [(x, y, 0.0 if n % 3 else 2.0) for n, (x, y, _) in enumerate(POINTS) if n % 7]
-    heights = read_text_grid(wrote(tmp_path / "a.xyz", text_of(points)), "a").numbers
-    assert np.isnan(heights).sum() == len(POINTS) - len(points)
-    assert (heights == 0).sum() == sum(z == 0 for _, _, z in points)
 
 
 def test_rounded_degrees_are_a_grid_and_are_put_on_metres(tmp_path: Path) -> None:
