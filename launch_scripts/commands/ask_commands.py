@@ -7,7 +7,7 @@ import os
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -230,7 +230,7 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     router."""
     from launch_scripts.observe.run_observer import OutsideObserver
     from launch_scripts.web.health_verdict import Process
-    from launch_scripts.web.prometheus import MetricsEndpoint, families, figures_of
+    from launch_scripts.web.prometheus import MetricsEndpoint, families
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.runtime.health import Health, supervisor_of
@@ -242,11 +242,16 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     try:
         with open_bus(network) as bus:
             clock, observer = MonotonicClock(), OutsideObserver(bus, topics={STATS: 0.0, STATUS: 0.0}, follows=True)
+
+            def figures() -> list[Any]:
+                run, latest = observer.run, observer.latest
+                return families(run, latest, latest.status, latest.up()) if run and latest else []
+
             typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
             told = None
             while True:
                 observer.listen(clock, _TURN_S)
-                endpoint.answer(lambda: families(figures_of(observer.run, observer.latest)))
+                endpoint.answer(figures)
                 health.turned([] if observer.run is not None else ["a run"])
                 if observer.run is not None and observer.run.run_id != told:
                     told = observer.run.run_id

@@ -54,13 +54,7 @@ def compare(
 
     run  Folders of runs, or their names in --runs.
     """
-    from launch_scripts.report.compare import (
-        circumstances_that_differ,
-        figures,
-        remarks,
-        settings_that_differ,
-        text_of,
-    )
+    from launch_scripts.report.compare import circumstances_that_differ, figures, settings_that_differ, text_of
 
     if len(run) < 2:
         raise ConfigError("compare takes two runs or more, such as two folders in runs/")
@@ -69,19 +63,15 @@ def compare(
     numbers = figures(found, REPORTED)
     if as_json:
         told = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
-        named = {"runs": [each.name for each in found], "remarks": remarks(found)}
-        typer.echo(json.dumps({**named, **told}, indent=2, default=str))
+        typer.echo(json.dumps({"runs": [each.name for each in found], **told}, indent=2, default=str))
         return
     console = Console(highlight=False)
-    unknown = (each.name for each in found if each.settings is None)
-    for sentence in (
-        *(f"{name} has no {SCENARIO_FILE}: its settings are not known" for name in unknown),
-        *remarks(found),
-    ):
-        console.print(Text(plain(sentence), style="yellow"))
+    for each in found:
+        if each.settings is None:
+            console.print(Text(plain(f"{each.name} has no {SCENARIO_FILE}: its settings are not known")))
     if not settings:
         console.print("the scenarios are the same")
-    for heading, rows in (("setting", settings), ("version or machine", made), ("figure", numbers)):
+    for heading, rows in (("setting", settings), ("circumstance", made), ("figure", numbers)):
         table = Table(heading, pad_edge=False)
         for each in found:
             table.add_column(Text(plain(each.name)), justify="right", overflow="fold")

@@ -396,7 +396,7 @@ class _Run:
             title = self._title(up, elapsed_s)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
-        state = known.shown(now_ns)
+        state = known.summary(now_ns)
         title = self._title(facts.fact("processes_well").shown(state), elapsed_s)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 

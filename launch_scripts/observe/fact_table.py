@@ -177,12 +177,9 @@ def fact(name: str) -> Fact[RunState]:
     return _BY_NAME[name]
 
 
-def table(state: RunState, *, whole: bool = False) -> tuple[list[str], list[list[str]]]:
-    """The labels of the columns, and a row for each target.
-
-    whole  with the columns that `swarm status` alone has
-    """
-    columns = [column for column in TARGET_FACTS if whole or column.always]
+def table(state: RunState) -> tuple[list[str], list[list[str]]]:
+    """The labels of the columns that every table of targets has, and a row for each target."""
+    columns = [column for column in TARGET_FACTS if column.always]
     rows = [[column.shown(line) for column in columns] for line in state.targets]
     return [column.label for column in columns], rows
 

@@ -130,7 +130,8 @@ class Alarm:
         row, col = self.place(grid) or (None, None)
         return {
             "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
-            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "target": self.target,
+            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "cell": self.cell,
+            "target": self.target,
         }  # fmt: skip
 
 
@@ -189,7 +190,7 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
     for role, id in latest.plan.crew_now(targets):
         if latest.fills(role, id) or starts(latest, role, id, now_ns):
             continue
-        leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
+        leads = next((ranked for each, ranked in latest.up() if (each, job_of(ranked)) == (role, job_of(id))), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
         lives = "is gone" if latest.knows(role, id) else "has not come up"
         yield _of_process("down", role, id, f"{lives}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))

@@ -7,7 +7,7 @@ and `swarm status`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -32,12 +32,12 @@ _MOST_LIVES = 1 << 13
 
 
 class Counts:
-    """The newest counts of every incarnation of every process."""
+    """The newest counts of every process, and of its earlier lives only what no later one carries on: an hour of
+    kills takes no more memory than a minute."""
 
     def __init__(self) -> None:
-        self._stats: dict[tuple[str, str, int], Stats] = {}
-        self._counting: list[Stats] | None = None
-        """Lives that are summed; None since the last that was new."""
+        self._lives: dict[tuple[str, str], dict[int, Stats]] = {}
+        """(role, id) -> incarnation -> what it has said last."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
@@ -45,20 +45,22 @@ class Counts:
 
     def count(self, stats: Stats) -> None:
         """Takes in what a process says."""
-        key = (stats.role, stats.id, stats.incarnation)
-        known = self._stats.get(key)
-        if known is None and len(self._stats) >= _MOST_LIVES:
+        of = (stats.role, stats.id)
+        lives = self._lives.get(of, {})
+        known = lives.get(stats.incarnation)
+        if known is None:
+            if any(_carries(each, stats.incarnation) for each in lives.values()):
+                return
+            if sum(map(len, self._lives.values())) >= _MOST_LIVES:
+                return
+            self._lives[of] = lives = {life: each for life, each in lives.items() if not _carries(stats, life)}
+        elif stats.stamp_ns < known.stamp_ns:
             return
-        if known is None or stats.stamp_ns >= known.stamp_ns:
-            self._stats[key] = stats
-            self._counting = None
-            of = (stats.role, stats.id)
-            newest = self._newest.get(of)
-            if newest is None or stats.incarnation >= newest.incarnation:
-                self._newest[of] = stats
-            began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
-            if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
-                self.silences[of] = (known.stamp_ns, stats.stamp_ns)
+        lives[stats.incarnation] = stats
+        self._newest[of] = lives[max(lives)]
+        began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
+        if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
+            self.silences[of] = (known.stamp_ns, stats.stamp_ns)
 
     def newest_stats(self, role: str, id: str) -> Stats | None:
         """Returns the last `Stats` of a process's newest incarnation."""
@@ -68,17 +70,8 @@ class Counts:
         """(role, id) -> what its newest incarnation has said last, in order."""
         return dict(sorted(self._newest.items()))
 
-    def _summed(self) -> list[Stats]:
-        """Returns the summed counts: of lives whose counts a later one carries on only the later."""
-        if self._counting is None:
-            self._counting = []
-            before: dict[tuple[str, str], int] = {}
-            """(role, id) -> the incarnation from which on all is counted."""
-            for (role, id, incarnation), stats in sorted(self._stats.items(), reverse=True):
-                if incarnation < before.get((role, id), incarnation + 1):
-                    self._counting.append(stats)
-                    before[role, id] = min(stats.since or incarnation, incarnation)
-        return self._counting
+    def _summed(self) -> Iterator[Stats]:
+        return (stats for lives in self._lives.values() for stats in lives.values())
 
     def total(self, name: str) -> int | None:
         """A count, summed over processes and incarnations; None if no process has published it."""
@@ -112,6 +105,11 @@ class Counts:
     def histogram(self, name: str) -> Histogram:
         """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._summed())
+
+
+def _carries(stats: Stats, incarnation: int) -> bool:
+    """Returns True if a life counts on where an earlier one ended."""
+    return 0 < stats.since <= incarnation < stats.incarnation
 
 
 # --- the certified gap --------------------------------------------------------------------------------------------

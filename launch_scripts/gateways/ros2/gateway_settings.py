@@ -181,20 +181,17 @@ class GridSettings(Section, frozen=True, kw_only=True):
 class IncomingSettings(Section, frozen=True, kw_only=True):
     """Allowed incoming topics.
 
-    robots        vehicles of the swarm which ROS moves
-    targets       external targets of the scenario that ROS moves
-    set_pose      topic of a target's place, geometry_msgs/PoseStamped
-    goal_targets  external targets of the scenario that stand for places to which robots are sent: one for each goal
-                  at a time. Groups must name their `targets`, or their vehicles chase goals
-    zones         polygons that become zones
-    grids         grids that become marks
-    orders        whether ROS may pause the swarm and let it go on
+    robots    vehicles of the swarm which ROS moves. Goals which are places need `planner.places` in the scenario
+    targets   external targets of the scenario that ROS moves
+    set_pose  topic of a target's place, geometry_msgs/PoseStamped
+    zones     polygons that become zones
+    grids     grids that become marks
+    orders    whether ROS may pause the swarm and let it go on
     """
 
     robots: tuple[Robots, ...] = ()
     targets: tuple[Name, ...] = ()
     set_pose: Topic = "/targets/{target}/set_pose"
-    goal_targets: tuple[Name, ...] = ()
     zones: tuple[ZoneSettings, ...] = ()
     grids: tuple[GridSettings, ...] = ()
     orders: bool = False
@@ -339,7 +336,7 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
     robot_topics = [each.topic for each in settings.robots]
     for key, names in {
         "robots and grids": [*robot_ids, *(each.name for each in settings.grids)],
-        "targets and goal_targets": [*settings.targets, *settings.goal_targets],
+        "targets": settings.targets,
         "zones": [each.name for each in settings.zones],
         "topics": [*robot_topics, *map(settings.set_pose_of, settings.targets), *(topic for _, topic in drawn)],
     }.items():

@@ -20,7 +20,6 @@ from launch_scripts.monitor.ground.ground_colours import (
     COST_COLOURS,
     COST_TO_GO_COLOURS,
     LEARNED_COLOURS,
-    TREE,
     CostSamples,
     GroundColours,
     TargetPictures,
@@ -252,8 +251,6 @@ class GroundView:
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
         self._texture(layer.entity, 0, self._pictures.to_target(target))
-        lines, radii = self._pictures.tree(target)
-        self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
             self._legend(layer)
 

@@ -17,8 +17,7 @@ from launch_scripts.monitor.movers import styles
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.view_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
-from launch_scripts.observe.latest_messages import VehicleColumns
-from launch_scripts.observe.recorder import RunFigures
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_state import RunState
 from shared_map.replication.mark_filter import MarkFilter
@@ -62,19 +61,19 @@ Place = tuple[float, float]
 class MoversView:
     """Vehicles, targets, sightings, bodies, routes and trails.
 
-    figures  have heard each message before `hear`
-    filter   whose sightings count
+    observed  has heard each message before `on_observed`
+    filter    whose sightings count
     """
 
     def __init__(
         self,
         pen: Pen,
         scenario: Scenario,
-        figures: RunFigures,
+        observed: LatestState,
         counters: Counters,
         filter: MarkFilter,
     ) -> None:
-        self._pen, self._mesh, self._figures, self._counters = pen, pen.mesh, figures, counters
+        self._pen, self._mesh, self._observed, self._counters = pen, pen.mesh, observed, counters
         self._level = level = styles.level_for(scenario.vehicle_count)
         self.looks = styles.Looks([group.name for group in scenario.groups], scenario.target_ids)
         self._vehicles = VehiclesView(self._pen, scenario, level, self.looks)
@@ -137,7 +136,7 @@ class MoversView:
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
         self._targets = {line.id for line in summary.targets}
-        observed = self._figures.observed
+        observed = self._observed
         self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
         marks = alarm_marks(summary.alarms, summary.elapsed_s, observed.targets(), self._mesh.grid)
         tops = self._pen.placed(list(marks), _ALARM)
@@ -147,7 +146,7 @@ class MoversView:
     def tick(self, now_ns: int, watched: bool) -> None:
         """Draws one frame's due parts."""
         slower = 1 if watched else _UNSEEN
-        observed = self._figures.observed
+        observed = self._observed
         if self._fleets_new:
             self._fleets_new = False
             vehicles = observed.driven(self._crew, now_ns)
@@ -237,7 +236,7 @@ class MoversView:
         unknown."""
         if self._follow is None:
             return
-        place_m = self._figures.observed.targets().get(self._follow)
+        place_m = self._observed.targets().get(self._follow)
         n = bisect_left(vehicles.ids, self._follow)
         if n < len(vehicles) and vehicles.ids[n] == self._follow:
             place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])

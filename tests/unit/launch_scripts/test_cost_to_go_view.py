@@ -7,20 +7,12 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
 from support.makers import planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground.ground_colours import (
-    CostSamples,
-    GroundColours,
-    TargetPictures,
-    coarse_tree,
-    nearest_target,
-)
-from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from shared_map.terrain.terrain import Terrain
+from launch_scripts.monitor.ground.ground_colours import CostSamples, nearest_target
+from launch_scripts.monitor.ground.terrain_mesh import Floats
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec
 from swarm.wire.fields import pack_column
@@ -86,34 +78,6 @@ def test_between_samples_costs_are_linear_where_all_are_known(
     np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    pace = rng.uniform(0.1, 1, (40, 50)).astype(np.float32)
-    gap, wall = int(rng.integers(0, 40)), int(rng.integers(5, 45))
-    pace[:, wall - 1 : wall + 1] = np.inf
-    pace[gap, wall - 1 : wall + 1] = 0.1
-    samples = CostSamples(GridSpec(40, 50, 10.0), None)
-    samples.step, samples.rows, samples.cols = 4, np.arange(1, 40, 4), np.arange(1, 50, 4)
-    rows, cols = samples.rows, samples.cols
-    pace[5, 5] = 0.1
-    costs = costs_to(pace, 5, 5)
-    lethal = np.isinf(pace)
-
-    def lethal_at(at_rows: NDArray[np.intp], at_cols: NDArray[np.intp]) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = lethal[at_rows[:, None], at_cols]
-        return found
-
-    ends, through = coarse_tree(costs[rows[:, None], cols], samples, lethal_at)
-    assert len(ends)
-    assert through.max() <= len(rows) * len(cols)
-    for (from_row, from_col), (to_row, to_col) in ends.tolist():
-        assert costs[to_row, to_col] < costs[from_row, from_col]
-        crosses = (from_col < wall) != (to_col < wall)
-        if crosses and from_row == to_row:
-            assert from_row == gap
-
-
 def test_territories_go_by_cost_and_not_by_distance() -> None:
     pace = np.full((40, 50), 0.1, np.float32)
     pace[:, 20:22] = np.inf
@@ -123,13 +87,6 @@ def test_territories_go_by_cost_and_not_by_distance() -> None:
     assert nearest[0, 22] == 1, "next to `a`, behind a wall"
     assert nearest[39, 0] == 0
     assert nearest[0, 20] == -1
-
-
-def pictures(terrain: Terrain) -> tuple[TargetPictures, CostSamples]:
-    mesh = TerrainMesh(terrain)
-    samples = CostSamples(terrain.grid, "t0")
-    samples.hear_target("t0")
-    return TargetPictures(mesh, GroundColours(mesh, terrain, terrain.ground_s_per_m, None), samples), samples
 
 
 def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:

@@ -256,17 +256,6 @@ def mode_of(command: codec.Command) -> int:
     return int(command.params[-1]) if command.params else 0
 
 
-def test_a_pilot_who_takes_over_keeps_the_vehicle() -> None:
-    vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=10.0)
-    assert (vehicle.armed, vehicle.mode) == (True, AUTO_MISSION)
-    vehicle.mode, vehicle.commands = 1 << 16, []
-    world.run(30.0)
-    assert vehicle.mode == 1 << 16
-    assert not vehicle.commands
-    assert "the vehicle's mode and motors are left alone from now on" in world.told()[-1]
-
-
 def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     vehicle = Autopilot(PX4, answers=True)
     vehicle._obey = lambda command, params: 2  # type: ignore[method-assign]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 import re
 import tracemalloc
 
@@ -16,8 +17,8 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
+from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -29,6 +30,7 @@ from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
@@ -141,6 +143,59 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     assert recorder.report()["marks"] == late.report()["marks"] == 9
     hear(recorder, other)  # one that was started by hand knows of no other life
     assert recorder.report()["marks"] == 109
+
+
+def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
+    """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
+    latest = LatestState(plan_of(scenario(), 0), GRID)
+
+    def live(from_s: int, until_s: int) -> int:
+        lives = [
+            msgspec.structs.replace(stats("agent", "a0", 2 + n, n, {"marks": n}, x=[n + 1.0]), since=2)
+            for n in range(from_s, until_s)
+        ]
+        for n, life in zip(range(from_s, until_s), lives, strict=True):
+            late = random.Random(n).choice(lives[: n - from_s + 1])
+            for message in (life, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+                latest.heard(message, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert latest.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(latest).items() if name != "book"}
+        return len(pickle.dumps(kept))
+
+    minute = live(1, 60)
+    assert live(60, 3600) < 1.1 * minute
+
+
+def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observe = "launch_scripts.observe"
+    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_LIVES",
+                  "process_load._MOST"):  # fmt: skip
+        monkeypatch.setattr(f"{observe}.{limit}", 10)
+    latest = LatestState(plan_of(scenario(), 0), GRID)
+
+    def hear_of(name: str, at_s: int) -> None:
+        goal = GoalState(name=f"{name}-00", stamp_ns=1, done=0, state="underway")
+        for message in (
+            stats("agent", name, at_s=at_s), status(name, 1.0), pose(name, 1.0, 1.0, at_s + 1),
+            fleet(f"{name}.1", {f"{name}-00": (1.0, 1.0)}, at_s), set_of(f"{name}.1", 0, at_s + 1, {}),
+            Beat(role="planner", id=name, incarnation=1, ready=True, leads=True),
+            GoalStates(agent=name, stamp_ns=1, states=[goal]),
+        ):  # fmt: skip
+            latest.heard(message, at_s * NS_PER_S)
+        latest.alive(Peer("agent", name, 1), True, at_s * NS_PER_S)
+
+    for n in range(40):
+        hear_of(f"x{n}", 0)
+    hear_of("x3", 7)
+    kept = {**vars(latest), "loads": latest.loads._told}
+    sizes = {name: len(each) for name, each in kept.items() if isinstance(each, dict)}
+    assert max(sizes.values()) == 10, sizes
+    assert latest.newest_stats("agent", "x3") is not None
+    assert latest.poses["x3"].seq == 8
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
@@ -418,26 +473,3 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
     hear(recorder, ended, at_s=later_s + 1)
     assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
-
-
-def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(
-    recorder: Recorder,
-) -> None:
-    made: list[int] = []
-    summary = recorder.summary
-
-    def counted(now_ns: int) -> RunState:
-        made.append(now_ns)
-        return summary(now_ns)
-
-    recorder.summary = counted  # type: ignore[method-assign]
-    for tick in range(100):
-        now_ns = tick * NS_PER_S // 10
-        recorder.heard(status("t0", None), now_ns)
-        shown = [recorder.shown(now_ns) for _ in range(3)]
-        assert shown[0] is shown[1] is shown[2]
-        assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0
-    assert len(made) == 10
-    for second in range(12, 20, 2):  # the swarm has fallen silent
-        assert recorder.shown(second * NS_PER_S).elapsed_s == second
-    assert len(made) == 14
