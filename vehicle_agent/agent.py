@@ -24,7 +24,7 @@ from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
+from vehicle_agent.driving.driven_vehicle import PLACES, Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.goals import REASONS, GoalQueues
@@ -120,7 +120,6 @@ class Agent:
         self._goals_taken = -1
         """Version of the goals by which the vehicles go."""
         self._look_due_ns = 0
-        self._places_planned = False
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str | None, TargetPose] = {}
@@ -159,22 +158,16 @@ class Agent:
                 self._driver.stop_soon(vehicle)
         self.assignment.ask_soon(now_ns)
 
-    def follow_goals(self, shared: Mapping[int, int], places_planned: bool, now_ns: int) -> None:
+    def follow_goals(self, shared: Mapping[int, int], now_ns: int) -> None:
         """Sends vehicles where the book of `goals` says, and recalls them. Called in each tick.
 
-        shared          as in `GoalQueues`
-        places_planned  whether a process plans routes to places
+        shared  as in `GoalQueues`
         """
         goals = self.goals
         if shared != goals.shared or now_ns >= self._look_due_ns:
             self._look_due_ns = now_ns + NS_PER_S
             goals.shared = shared
             goals.look_again()
-        if places_planned != self._places_planned:
-            self._places_planned = places_planned
-            for vehicle in self.vehicles.values():
-                if vehicle.goal is not None:
-                    vehicle.regain_planner(now_ns) if places_planned else vehicle.lose_planner(now_ns)
         if not self.goals_taken:
             self._goals_taken = goals.book.version
             for vehicle in self.vehicles.values():
@@ -204,7 +197,7 @@ class Agent:
             self.assignment.ask_soon(now_ns)
             return
         vehicle.assign(name, now_ns)
-        if not self._places_planned:
+        if PLACES not in self._planners:
             vehicle.lose_planner(now_ns)
 
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
@@ -462,11 +455,11 @@ class Agent:
             self.assignment.target_jumped(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
-        """Returns which planners live: target -> incarnation."""
+        """Takes which planners live: target, or PLACES, -> incarnation."""
         before, self._planners = self._planners, dict(alive)
         for vehicle in self.vehicles.values():
-            target = vehicle.target
-            if target is None or vehicle.goal is not None:
+            target = vehicle.target if vehicle.goal is None else PLACES
+            if target is None:
                 continue
             if target not in alive and not vehicle.planner_gone:
                 vehicle.lose_planner(now_ns)
@@ -513,7 +506,8 @@ class Agent:
         vehicle = self.vehicles.get(pushed.vehicle)
         if vehicle is None:
             return []
-        return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
+        target = goal_name(pushed.target_cell) if pushed.target is None else pushed.target
+        return self._take(vehicle, target, pushed.route, now_ns, pushed=True)
 
     def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
         searching = route.status is RouteStatus.SEARCHING

@@ -1,13 +1,13 @@
 """The messages in which an agent tells where its vehicles are.
 
-`Chasers` go to each planner, one per target; `Fleet` to all who watch, one per region.
+`Chasers` go to each planner, one per target, and to the process that plans to places; `Fleet` to all who watch, one
+per region.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
-from operator import contains
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import NO_TARGET, Chasers, Fleet
-from vehicle_agent.driving.driven_vehicle import Places
+from vehicle_agent.driving.driven_vehicle import Places, goal_of
 
 HEARTBEAT_NS = NS_PER_S
 """Interval of messages about a target whose chasers are at rest: the planner's lease is five times as long."""
@@ -32,9 +32,9 @@ class ChasersReport:
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
-        self._told: dict[str, tuple[dict[str, int], int]] = {}
-        """Target -> the cells of its chasers in its planner's last message, and the time; for all that have
-        chasers."""
+        self._told: dict[str | None, tuple[dict[str, tuple[int, int | None]], int]] = {}
+        """Target, or None for places -> cell and goal of each of its chasers in the last message, and the time; for
+        all that have chasers."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
         """Returns due messages: about targets that a vehicle has taken or left, whose planner knows a cell that a
@@ -42,15 +42,16 @@ class ChasersReport:
 
         vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
         """
-        chasers: dict[str, dict[str, Sequence[int]]] = {target: {} for target in self._told}
+        chasers: dict[str | None, dict[str, tuple[Sequence[int], int | None]]] = {each: {} for each in self._told}
         for id, target, path in vehicles:
             if target is not None and path:
-                chasers.setdefault(target, {})[id] = path
+                goal = goal_of(target)
+                chasers.setdefault(target if goal is None else None, {})[id] = path, goal
         for target, paths in chasers.items():
             told = self._told.get(target)
             if told is not None and now_ns - told[1] < HEARTBEAT_NS and _holds(told[0], paths):
                 continue
-            cells = {id: path[-1] for id, path in paths.items()}
+            cells = {id: (path[-1], goal) for id, (path, goal) in paths.items()}
             if cells:
                 self._told[target] = cells, now_ns
             else:
@@ -60,14 +61,18 @@ class ChasersReport:
                 author=self._author,
                 stamp_ns=now_ns,
                 ids=list(cells),
-                cells=pack_column(list(cells.values()), "<u4"),
+                cells=pack_column([cell for cell, _ in cells.values()], "<u4"),
                 vehicle_class=self._vehicle_class,
+                goals=pack_column([goal for _, goal in cells.values() if goal is not None], "<u4"),
             )
 
 
-def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
-    """Returns True if the last message is still true: the same vehicles, and each may still reach its cell."""
-    return told.keys() == paths.keys() and all(map(contains, map(paths.__getitem__, told), told.values()))
+def _holds(told: dict[str, tuple[int, int | None]], paths: dict[str, tuple[Sequence[int], int | None]]) -> bool:
+    """Returns True if the last message is still true: the same vehicles and goals, and each may still reach its
+    cell."""
+    if told.keys() != paths.keys():
+        return False
+    return all(cell in paths[id][0] and goal == paths[id][1] for id, (cell, goal) in told.items())
 
 
 class FleetReport:

@@ -51,6 +51,7 @@ from swarm.wire.topics import (
     POSE,
     PUSHED_ROUTE,
     ROUTE,
+    SENT,
     SHARED_COSTS,
     SIGHTED,
     TRUE_POSE,
@@ -58,7 +59,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.assemble import AgentParts
-from vehicle_agent.driving.driven_vehicle import Follow, Places, goal_of
+from vehicle_agent.driving.driven_vehicle import PLACES, Follow, Places, goal_of
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts
 
@@ -116,6 +117,8 @@ class AgentService:
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
         self._obedience = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
+        self._places_job = place_job(setup.scenario, self.agent.plan.group.name)
+        """The process that plans to places for the group."""
         self._obeyed_version = 0
         self._goals_told: tuple[list[GoalState], int] = [], 0
         """The states of goals that were published last, and when."""
@@ -265,11 +268,12 @@ class AgentService:
         self._report(columns, now_ns)
         paths = agent.holdings.paths
         self._tell_goals(now_ns)
-        chasing = [
-            (id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items() if vehicle.goal is None
-        ]
+        chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
         for chasers in parts.chasers.reports(chasing, now_ns):
-            self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
+            if chasers.target is None:
+                self._bus.publish(SENT, chasers, places=self._places_job, author=self._author)
+            else:
+                self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
         self._member.tell_faults(parts.faults, now_ns)
         states = bytes([vehicle.state for vehicle in agent.vehicles.values()])
@@ -310,7 +314,7 @@ class AgentService:
                 book.setting("time_scale", scenario.time_scale),
                 book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
             )
-        agent.follow_goals(orders.shared, bool(self._roster.alive("places")), now_ns)
+        agent.follow_goals(orders.shared, now_ns)
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:
@@ -461,6 +465,9 @@ class AgentService:
             chased = {vehicle.target for vehicle in self.agent.vehicles.values()}
             known = chased.union(self._obedience.book.targets(self._setup.scenario))
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
+            places = self._roster.alive("places")
+            own = (id for id in sorted(places, reverse=True) if job_of(id) == self._places_job)
+            planners |= {PLACES: places[id] for id in own}
             self.agent.set_planners(planners, now_ns)
 
     def _on_routes(self, replied: Replied, reply: RouteReply | PlaceRouteReply, now_ns: int) -> None:
@@ -495,7 +502,7 @@ class AgentService:
                         place,
                         tag=f"{_ROUTES}{request}",
                         timeout_s=self._answer_s,
-                        places=place_job(self._setup.scenario, self.agent.plan.group.name),
+                        places=self._places_job,
                     )
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
                     self.counters.count("reroute_requests", reroutes)

@@ -223,9 +223,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
                 said = {"at": fields_of(frame, cell)}
             with progress("waiting until all processes obey"):
                 operator = Operator(bus)
-                given, acknowledged = (
-                    operator.send(order) if isinstance(order, SendVehicle) else operator.give(order)
-                )
+                given, acknowledged = operator.give(order)
             told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
             printed.append({"given": msgspec.to_builtins(given), **told, **said})
             silent |= bool(acknowledged.silent)

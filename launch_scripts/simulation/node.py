@@ -69,15 +69,14 @@ def built(
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-            of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
             prepared = boundary.external(outside.prepared, PREPARED_COSTS)
             worker = boundary.worker(outside.worker)
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
-            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
+            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, prepared)
         case "places":
             worker = boundary.worker(outside.worker)
-            of_places: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
+            of_places: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
             return PlacesService(setup, terrain, bus, post, worker, of_places)

@@ -228,6 +228,13 @@ CHASERS = Topic(
     access(put="agent:author", hear="planner:target"),
     put_bytes=_LONG,
 )  # fmt: skip
+SENT = Topic(
+    "sent", "place/{places}/sent/{author}", vehicles.Chasers,
+    "which vehicles of an agent go to which places, for the process that plans there, and where routes may begin",
+    "as chasers",
+    access(put="agent:author", hear="places:places"),
+    put_bytes=_LONG,
+)  # fmt: skip
 SHARED_COSTS = Topic(
     "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts,
     "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
@@ -294,7 +301,7 @@ FOLLOWED = Topic(
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", planning.PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
-    access(put="planner", hear="agent:agent rover:agent"),
+    access(put="planner places", hear="agent:agent rover:agent"),
     put_bytes=_LONG,
 )  # fmt: skip
 POSE = Topic(
@@ -432,8 +439,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, LEFT, STORED,
-    KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SENT, SHARED_COSTS, STANDING, TABLE, GRANTED, LEFT,
+    STORED, KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip

@@ -84,17 +84,25 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
 
 
 class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
-    """The vehicles of one agent process that chase one target. The newest replaces the older.
+    """The vehicles of one agent process that chase one target, or that go to places. The newest replaces the older.
 
-    cells  one that each vehicle may stand on or enter, where a new route for it may begin
+    target  None of those that go to places
+    cells   one that each vehicle may stand on or enter, where a new route for it may begin
+    goals   the place of each vehicle, if these go to places
     """
 
-    target: Id
+    target: Id | None
     author: Id
     stamp_ns: StampNs
     ids: Annotated[list[VehicleId], SMALL]
     cells: Annotated[bytes, Column("<u4", per="ids")]
     vehicle_class: Id = "ground"
+    goals: Annotated[bytes, Column("<u4")] = b""
+
+    def relate(self) -> None:
+        expected = 0 if self.target is not None else len(self.cells)
+        if len(self.goals) != expected:
+            raise ValueError(f"goals has {len(self.goals) // 4} places, expected {expected // 4}")
 
 
 MOST_SHARED_TARGETS = 64

@@ -170,13 +170,6 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
 
 
-def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:
-    report = bench("air", "--cells", "24", "--routes", "1000")
-    assert report["clearance_broken"] == 0
-    assert report["lowest_m"] >= report["clearance_m"]
-    assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
-
-
 @pytest.mark.parametrize("field", ["terrain", "maze"])
 def test_kernels_are_measured_and_a_repair_gives_way_to_a_growth_at_most(field: str) -> None:
     report = bench("kernels", "--size", "96", "--field", field, "--repeats", "2", "--side", "5")

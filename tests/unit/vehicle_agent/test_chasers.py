@@ -10,6 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
+from vehicle_agent.driving.driven_vehicle import goal_name
 from vehicle_agent.reports import HEARTBEAT_NS, ChasersReport
 
 TICK_NS = NS_PER_S // 10
@@ -49,11 +50,23 @@ def test_who_leaves_a_target_is_told_to_both_planners_at_once_and_an_empty_targe
     assert told(report, ("v", "t1", (4,)), at_ns=HEARTBEAT_NS) == {}
 
 
+def test_a_vehicle_that_is_sent_elsewhere_tells_its_new_place_at_once() -> None:
+    report = ChasersReport("a0.1")
+    vehicles: list[Chasing] = [("v", goal_name(7), (4, 5)), ("w", goal_name(7), (9,)), ("x", "t0", (3,))]
+    places, target = sorted(report.reports(vehicles, 0), key=lambda each: each.target or "")
+    assert (places.target, places.ids, column(places.goals, "<u4").tolist()) == (None, ["v", "w"], [7, 7])
+    assert (target.target, target.goals) == ("t0", b"")
+    vehicles[1] = ("w", goal_name(8), (9,))
+    (places,) = report.reports(vehicles, TICK_NS)
+    assert column(places.goals, "<u4").tolist() == [7, 8]
+    assert not list(report.reports(vehicles, 2 * TICK_NS))
+
+
 def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_still_reach() -> None:
     for seed in range(20):
         chance = random.Random(seed)
         report = ChasersReport("all.a0.1")
-        planners = {target: Followers(target, GRID, 5 * NS_PER_S, 0) for target in ("t0", "t1", "t2")}
+        planners = {target: Followers(GRID, 5 * NS_PER_S, 0) for target in ("t0", "t1", "t2")}
         driven: dict[str, int] = {f"v{n}": 200 * n for n in range(6)}
         chased: dict[str, str | None] = dict.fromkeys(driven)
         messages = 0
@@ -79,7 +92,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
 
 
 def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() -> None:
-    followers = Followers("t0", GRID, 5 * NS_PER_S, 0)
+    followers = Followers(GRID, 5 * NS_PER_S, 0)
 
     def hear(author: str, stamp_ns: int, cell: int) -> None:
         [message] = ChasersReport(author).reports([("v", "t0", (cell,))], stamp_ns)
@@ -91,7 +104,7 @@ def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() ->
 
 
 def test_a_planner_remembers_no_more_authors_than_followers() -> None:
-    followers = Followers("t0", GRID, 5 * NS_PER_S, 0)
+    followers = Followers(GRID, 5 * NS_PER_S, 0)
     for n in range(5000):
         followers.on_chasers(Chasers(target="t0", author=f"x{n}", stamp_ns=0, ids=[], cells=b""), 0)
     assert len(followers._told) == 4096
