@@ -466,8 +466,8 @@ class AgentService:
             known = chased.union(self._obedience.book.targets(self._setup.scenario))
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
             places = self._roster.alive("places")
-            own = (id for id in sorted(places, reverse=True) if job_of(id) == self._places_job)
-            planners |= {PLACES: places[id] for id in own}
+            if own := [id for id in sorted(places) if job_of(id) == self._places_job]:
+                planners[PLACES] = places[own[0]]
             self.agent.set_planners(planners, now_ns)
 
     def _on_routes(self, replied: Replied, reply: RouteReply | PlaceRouteReply, now_ns: int) -> None:
