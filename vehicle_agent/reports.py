@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
-from operator import contains
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +33,9 @@ class ChasersReport:
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
-        self._told: dict[str | None, tuple[dict[str, int], list[int], int]] = {}
-        """Target -> the cells and goals of its chasers in its planner's last message, and the time; for all that
-        have chasers. None: of vehicles that go to places."""
+        self._told: dict[str | None, tuple[dict[str, tuple[int, int | None]], int]] = {}
+        """Target, or None for places -> cell and goal of each of its chasers in the last message, and the time; for
+        all that have chasers."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
         """Returns due messages: about targets that a vehicle has taken or left, whose planner knows a cell that a
@@ -44,26 +43,18 @@ class ChasersReport:
 
         vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
         """
-        chasers: dict[str | None, dict[str, Sequence[int]]] = {target: {} for target in self._told}
-        goals: list[int] = []
+        chasers: dict[str | None, dict[str, tuple[Sequence[int], int | None]]] = {each: {} for each in self._told}
         for id, target, path in vehicles:
             if target is not None and path:
                 goal = goal_of(target)
-                goals += [] if goal is None else [goal]
-                chasers.setdefault(target if goal is None else None, {})[id] = path
+                chasers.setdefault(target if goal is None else None, {})[id] = path, goal
         for target, paths in chasers.items():
             told = self._told.get(target)
-            places = goals if target is None else []
-            if (
-                told is not None
-                and now_ns - told[2] < HEARTBEAT_NS
-                and told[1] == places
-                and _holds(told[0], paths)
-            ):
+            if told is not None and now_ns - told[1] < HEARTBEAT_NS and _holds(told[0], paths):
                 continue
-            cells = {id: path[-1] for id, path in paths.items()}
+            cells = {id: (path[-1], goal) for id, (path, goal) in paths.items()}
             if cells:
-                self._told[target] = cells, places, now_ns
+                self._told[target] = cells, now_ns
             else:
                 del self._told[target]
             yield Chasers(
@@ -71,15 +62,18 @@ class ChasersReport:
                 author=self._author,
                 stamp_ns=now_ns,
                 ids=list(cells),
-                cells=pack_column(list(cells.values()), "<u4"),
+                cells=pack_column([cell for cell, _ in cells.values()], "<u4"),
                 vehicle_class=self._vehicle_class,
-                goals=pack_column(places, "<u4"),
+                goals=pack_column([goal for _, goal in cells.values() if goal is not None], "<u4"),
             )
 
 
-def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
-    """Returns True if the last message is still true: the same vehicles, and each may still reach its cell."""
-    return told.keys() == paths.keys() and all(map(contains, map(paths.__getitem__, told), told.values()))
+def _holds(told: dict[str, tuple[int, int | None]], paths: dict[str, tuple[Sequence[int], int | None]]) -> bool:
+    """Returns True if the last message is still true: the same vehicles and goals, and each may still reach its
+    cell."""
+    if told.keys() != paths.keys():
+        return False
+    return all(cell in paths[id][0] and goal == paths[id][1] for id, (cell, goal) in told.items())
 
 
 class FleetReport:

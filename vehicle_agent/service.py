@@ -468,10 +468,9 @@ class AgentService:
             chased = {vehicle.target for vehicle in self.agent.vehicles.values()}
             known = chased.union(self._obedience.book.targets(self._setup.scenario))
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
-            alive = self._roster.alive("places")
-            for id in sorted(alive, reverse=True):
-                if job_of(id) == self._places_job:
-                    planners[PLACES] = alive[id]
+            places = self._roster.alive("places")
+            if own := [id for id in sorted(places) if job_of(id) == self._places_job]:
+                planners[PLACES] = places[own[0]]
             self.agent.set_planners(planners, now_ns)
 
     def _on_routes(self, replied: Replied, reply: RouteReply | PlaceRouteReply, now_ns: int) -> None:

@@ -19,6 +19,7 @@ from launch_scripts.stop_requests import stop_requests
 from swarm.bus.endpoints import listening
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
+from swarm.places import read_place
 
 if TYPE_CHECKING:
     from launch_scripts.gateways.ros2.gateway_settings import Settings
@@ -132,7 +133,8 @@ def _join(network: NetworkConfig) -> Swarm:
 class Drives:
     """Control of a vehicle.
 
-    target         Follow routes to this target; without it the vehicle is avoided, and no more.
+    target         Follow routes to this target; without it or --to the vehicle is avoided, and no more.
+    to             Go to this place, as 46.81,9.84, xy:X,Y or cell:ROW,COL.
     drive          By missions, or by guided setpoints.
     arm            Arm it and set its mode; without it that is the pilot's.
     altitude       Metres at which one that flies follows.
@@ -142,6 +144,7 @@ class Drives:
 
     panel: ClassVar[str | None] = "How it is driven"
     target: TargetId = None
+    to: str | None = None
     drive: Literal["mission", "guided"] = "mission"
     arm: bool = False
     altitude: Annotated[float | None, typer.Option(min=1.0, max=_MOST_ALTITUDE_M)] = None
@@ -176,7 +179,7 @@ def mavlink(
 ) -> None:
     """Join a PX4 or ArduPilot vehicle to a running swarm, until Ctrl-C.
 
-    The swarm's vehicles avoid it. With --target it follows the swarm's routes to that target. It is armed, and its
+    The swarm's vehicles avoid it. With --target or --to it follows the swarm's routes there. It is armed, and its
     mode is set, with --arm only. One process for each vehicle; docs/mavlink.md has the rest.
 
     swarm gateway mavlink udpin:127.0.0.1:14540
@@ -201,9 +204,13 @@ def mavlink(
             check_name(option, value)
     if id is not None and agent_of(id) != id:
         raise ConfigError(f"--id: {id!r} has a '-', by which the swarm names vehicles of its own agents")
+    if drives.to is not None:
+        if target is not None:
+            raise ConfigError("give --target or --to, not both: a vehicle goes to one of them")
+        target = read_place(drives.to, "--to").text
     if target is None and (drives.arm or altitude is not None):
         option = "--arm" if drives.arm else "--altitude"
-        raise ConfigError(f"{option} goes with --target: without it nothing is driven")
+        raise ConfigError(f"{option} goes with --target or --to: without one nothing is driven")
     if drives.above == "terrain" and altitude is None:
         raise ConfigError("--above terrain goes with --altitude: how many metres above it")
     pymavlink()

@@ -259,19 +259,12 @@ def make_output_outlive_readers() -> None:
 def what_is_left(run_dir: Path) -> list[str]:
     """A line for each thing to look at that is there."""
     lines = [f"{name}: {_shown(run_dir / file)}" for name, file in _FILES if (run_dir / file).is_file()]
-    return [*lines, *(f"recording: {_rerun_command()} {_shown(path)}" for path in _recordings(run_dir))]
-
-
-def _recordings(run_dir: Path) -> list[Path]:
-    """The recordings of a run, oldest first: more than one where the monitor was started again."""
-    found = [path for path in run_dir.glob("run*.rrd") if path.stat().st_size]
-    return sorted(found, key=lambda path: (len(path.name), path.name))
-
-
-def _rerun_command() -> str:
-    """Returns the command line of rerun's viewer, from the caller's folder."""
     beside = Path(sys.executable).with_name("rerun")
-    return "rerun" if shutil.which("rerun") or not beside.exists() else _shown(beside)
+    viewer = "rerun" if shutil.which("rerun") or not beside.exists() else _shown(beside)
+    # More than one where the monitor was started again: oldest first.
+    recordings = [path for path in run_dir.glob("run*.rrd") if path.stat().st_size]
+    recordings.sort(key=lambda path: (len(path.name), path.name))
+    return [*lines, *(f"recording: {viewer} {_shown(path)}" for path in recordings)]
 
 
 def tunnel(port: int) -> str:

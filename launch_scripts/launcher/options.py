@@ -106,28 +106,24 @@ def with_network(
         changes["listen"] = (*network.listen, also_listen)
     if namespace is not None:
         changes["namespace"] = namespace
-    return msgspec.structs.replace(scenario, network=_replaced(network, changes))
-
-
-def _replaced(network: NetworkConfig, changes: dict[str, object]) -> NetworkConfig:
     raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
     try:
-        return msgspec.convert(raw, NetworkConfig)
+        return msgspec.structs.replace(scenario, network=msgspec.convert(raw, NetworkConfig))
     except msgspec.ValidationError as error:
         raise ConfigError(f"network: {explain(str(error), raw, NetworkConfig)}") from error
 
 
 def tls_of(ca: str | None, certificate: str | None, key: str | None, folder: str | None = None) -> TlsConfig | None:
     """The three --tls options, all or none; without them the files in the folder of --tls-dir."""
-    if ca is certificate is key is None and folder is not None:
+    if ca is certificate is key is None:
+        if folder is None:
+            return None
         if not Path(folder, "ca.pem").is_file():
             raise ConfigError(f"--tls-dir: no file ca.pem in {folder}, which `swarm deploy certs` writes")
         keys = [each for each in Path(folder).glob("*.key") if each.stem != "ca"]
         own = keys[0] if len(keys) == 1 else None  # of many, a process finds its own by name
         certificate, key = (folder, folder) if own is None else (str(own.with_suffix(".pem")), str(own))
         return TlsConfig(ca=f"{folder}/ca.pem", certificate=certificate, key=key)
-    if ca is None and certificate is None and key is None:
-        return None
     if ca is None or certificate is None or key is None:
         raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
     for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):

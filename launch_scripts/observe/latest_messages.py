@@ -40,6 +40,8 @@ _VEHICLES_LAST_NS = 3 * NS_PER_S
 """A vehicle whose agent raises no liveliness token is there for this long after its last word."""
 _MOST_NAMES = 1 << 14
 """Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
+_MOST_SETS = 1 << 17
+"""Sets of marks that are remembered: of a map of 4096 x 4096 cells, those of eight authors on each tile."""
 _ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """Counts of planners: poses which do not count, or look wrong."""
 
@@ -173,9 +175,9 @@ class MarkedCells:
     stamps_ns: NDArray[np.int64]
 
 
-def _remember(known: dict[K, V], key: K, value: V) -> None:
-    """Keeps the newest value of a key, unless too many other keys are known."""
-    if key in known or len(known) < _MOST_NAMES:
+def _remember(known: dict[K, V], key: K, value: V, most: int | None = None) -> None:
+    """Keeps the newest value of a key, unless as many other keys are known: `_MOST_NAMES` if not given."""
+    if key in known or len(known) < (most or _MOST_NAMES):
         known[key] = value
 
 
@@ -234,7 +236,7 @@ class LatestState(Counts):
             case Stats():
                 self.count(message)
                 self.loads.on_stats(message)
-                self._told_ns[message.role, message.id] = now_ns
+                _remember(self._told_ns, (message.role, message.id), now_ns)
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 _remember(self.status, message.target, message)
@@ -242,7 +244,7 @@ class LatestState(Counts):
                 _remember(self.leads, (message.role, message.id), leads)
                 if leads:
                     job, rank = split_rank(message.id)
-                    self._ranks[message.role, job] = rank
+                    _remember(self._ranks, (message.role, job), rank)
             case Fleet():
                 self.moved_ns = self.fleet_ns = max(self.moved_ns, now_ns)
                 fleet = self._fleets.get((message.author, message.region))
@@ -250,17 +252,17 @@ class LatestState(Counts):
                     _remember(self._fleets, (message.author, message.region), message)
                     self._vehicles = None
                 if message.ids:
-                    self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
+                    _remember(self._fleet_told_ns, agent_of(message.ids[0]), now_ns)
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
                 pose = self._trackings.counted(message, now_ns)
                 if pose is not None:
-                    self.poses[pose.target] = pose
+                    _remember(self.poses, pose.target, pose)
                 return pose
             case MarkSet():
                 marks = self._marks.get((message.author, message.tile))
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
-                    self._marks[message.author, message.tile] = message
+                    _remember(self._marks, (message.author, message.tile), message, _MOST_SETS)
             case GoalStates(states=states):
                 for each in states:
                     _remember(self._goals, each.name, each)

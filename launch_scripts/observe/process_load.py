@@ -9,6 +9,8 @@ from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CPU_S, MESSAGES_PER_S, RESTARTS, RSS_BYTES
 from swarm.wire.messages.processes import Stats
 
+_MOST = 1 << 13
+"""Processes whose load is kept, as many as are counted: names may be made up by strangers."""
 _LEAST_NS = NS_PER_S // 2
 """Over a shorter time no rate is measured."""
 
@@ -49,7 +51,8 @@ class ProcessLoads:
         key = (stats.role, stats.id)
         _, last = self._told.get(key, (None, None))
         if last is None or stats.incarnation > last.incarnation:
-            self._told[key] = (None, stats)
+            if last is not None or len(self._told) < _MOST:
+                self._told[key] = (None, stats)
         elif stats.incarnation == last.incarnation and stats.stamp_ns - last.stamp_ns >= _LEAST_NS:
             self._told[key] = (last, stats)
 

@@ -16,9 +16,16 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import ConfigError
 from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
-from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages.planning import (
+    GROUND,
+    PlaceRouteReply,
+    PlaceRouteRequest,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+)
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
-from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PUSHED_ROUTE
+from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.right_of_way.external_session import ExternalSession
@@ -64,6 +71,8 @@ class Vehicle(Reported):
         lease_s = session.number("lease_s", lease_s, 0, LONGEST_OBSTACLE_LEASE_S, more=True)
         super().__init__(session, OBSTACLE, "vehicle", id, lease_s, _REPEAT_NS)
         self._target: str | None = None
+        self._goal: int | None = None
+        """The cell of the place that is followed; None of a target."""
         self._route: Route | None = None
         self._ask_due_ns = 0
         self._asking = False
@@ -160,14 +169,19 @@ class Vehicle(Reported):
     def follow(self, target: str) -> Stream[Route]:
         """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
         or the route runs out. Ends the previous subscription to routes. `newest` of the stream is the route to
-        drive."""
+        drive.
+
+        target  its id, or a place that stays: "46.81,9.84", "xy:X,Y" or "cell:ROW,COL"
+        """
         session = self._session
         with session.lock:
             session.check_open()
-            session.check_ids(target=target)
+            goal = session.frame.cell_named(target) if "," in target else None
+            if goal is None:
+                session.check_ids(target=target)
             _ = self.cell
             self.unfollow()
-            self._target, self._ask_due_ns = target, 0
+            self._target, self._goal, self._ask_due_ns = target, goal, 0
             stream: Stream[Route] = Stream(16)
             self._streams.append(stream)
             session.bus.subscribe(PUSHED_ROUTE, session.post, agent=self.id, vehicle=self.id)
@@ -183,7 +197,7 @@ class Vehicle(Reported):
         with self._session.lock:
             if self._target is not None:
                 self._session.bus.unsubscribe(PUSHED_ROUTE, agent=self.id, vehicle=self.id)
-            self._target, self._route = None, None
+            self._target, self._goal, self._route = None, None, None
             for stream in self._streams:
                 stream.close()
             self._streams.clear()
@@ -196,10 +210,17 @@ class Vehicle(Reported):
         if self._asking:
             return
         ran_out = before is not None and (not before.ok or (before.remaining_s > 0 and self._near_end(before)))
-        request = RouteRequest(
-            cells=[self.cell], vehicles=[self.id], force=ran_out, vehicle_class=self.vehicle_class
-        )
-        asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
+        from_here: dict[str, Any] = {
+            "cells": [self.cell],
+            "vehicles": [self.id],
+            "vehicle_class": self.vehicle_class,
+        }
+        if self._goal is None:
+            request = RouteRequest(force=ran_out, **from_here)
+            asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
+        else:
+            place = PlaceRouteRequest(to=self._goal, **from_here)
+            asked = self._session.ask(PLACE_ROUTE, place, _TIMEOUT_S, asker=asker_of("rover", self.id))
         self._asking = True
 
         def finish(done: Future[list[Any]]) -> None:
@@ -217,13 +238,13 @@ class Vehicle(Reported):
     def _near_end(self, route: Route) -> bool:
         return self.cell in route.cells[-_NEAR_END_CELLS:]
 
-    def _take(self, reply: RouteReply | PushedRoute) -> None:
+    def _take(self, reply: RouteReply | PlaceRouteReply | PushedRoute) -> None:
         """Takes a received route, and reports it if it differs from the last one."""
         try:
             given = reply.route if isinstance(reply, PushedRoute) else reply.routes[0]
             route = Route.of(self._session.frame, given, reply)
         except (ValueError, IndexError) as error:
-            self._session.problem("routes_refused", f"the planner of {reply.target} answers nonsense: {error}")
+            self._session.problem("routes_refused", f"the planner of {self._target} answers nonsense: {error}")
             return
         if self._route is not None and route.is_rest_of(self._route):
             return
@@ -301,8 +322,8 @@ class Vehicle(Reported):
                 obstacle.id == self.id and obstacle.incarnation != self.incarnation
             ):
                 self._on_double(obstacle)
-            case Heard(message=PushedRoute() as pushed) if (
-                pushed.vehicle == self.id and pushed.target == self._target
+            case Heard(message=PushedRoute() as pushed) if pushed.vehicle == self.id and (
+                pushed.target_cell == self._goal if pushed.target is None else pushed.target == self._target
             ):
                 self._take(pushed)
             case Heard(message=MarkSet() as marks) if marks.author == self._marks.author:

@@ -66,7 +66,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
 
     # A router belongs to no run: what starts beside it says which run it is.
     for role in ("keeper", "targets"):
-        hands.start(role, str(here), "--run-id", "far")
+        hands.start("role", role, str(here), "--run-id", "far")
     eventually(lambda: len(hands.members()) == 3, 60, "those with the file")
     hands.start("role", "agent", str(there), "--id", "a0", runs=elsewhere)
     eventually(lambda: len(hands.members()) == 5, 60, "all five")
@@ -103,7 +103,7 @@ def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: 
         ("planner", "--target", "t1"),
         ("agent", "--id", "a0"),
     ):
-        hands.start(role[0], scenario, "--run-id", "two", *role[1:])
+        hands.start("role", role[0], scenario, "--run-id", "two", *role[1:])
 
     def sets(store: str) -> dict[str, int]:
         path = hands.folder / "runs" / "two" / store

@@ -24,7 +24,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
     hands.start("role", "keeper", *scenario, "--run-id", "by-hand")
     eventually(lambda: ("keeper", "0", "by-hand") in hands.members(), 60, "the keeper")
     for role in (("targets",), ("planner", "--target", "t0")):
-        hands.start(*role, *scenario)
+        hands.start("role", *role, *scenario)
     eventually(lambda: len(hands.members()) == 4, 60, "all four")
     assert {(role, run_id) for role, _, run_id in hands.members()} == {
         ("router", ""), ("keeper", "by-hand"), ("targets", "by-hand"), ("planner", "by-hand"),

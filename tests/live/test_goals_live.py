@@ -94,6 +94,11 @@ def test_twenty_vehicles_get_to_twenty_places_though_their_agent_and_the_planner
         same = swarm.route(*(frame.centre_m(began[id]) for id in (ids[0], ids[7])))
         assert (same.ok, same.cells[0], same.cells[-1]) == (True, began[ids[0]], began[ids[7]])
         assert same.cost_s >= same.lower_bound_s > 0.999 * same.cost_s
+        rover = swarm.vehicle("r1")
+        rover.at(*frame.centre_m(began[ids[0]]))
+        routes = rover.follow(cell(began[ids[7]]))
+        eventually(lambda: routes.newest is not None and routes.newest.cells == same.cells, 10, "a rover's route")
+        rover.leave()
         # Each goes to where another one has been, so that there is a way.
         goals = {id: began[ids[(n + 7) % 20]] for n, id in enumerate(ids)}
         done = command(

@@ -46,7 +46,7 @@ _HOLDS = 3
 class Wishes:
     """Requested state of the vehicle.
 
-    target      it follows routes to it; None: it is avoided, and no more
+    target      id of a target, or a place, to which it follows routes; None: it is avoided, and no more
     drive       how it is driven there
     arm         it may be armed, and its mode changed
     altitude_m  of one that flies

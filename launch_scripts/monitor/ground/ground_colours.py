@@ -241,11 +241,6 @@ class CostSamples:
         """Targets with a planner, the one that was asked least lately first."""
         self._asked = 0
 
-    def hear_target(self, target: str) -> None:
-        """Takes a planner's state."""
-        if target not in self.targets:
-            self.targets.append(target)
-
     def next_target(self) -> str | None:
         """The target to ask about; None while none has a planner."""
         self._asked += 1

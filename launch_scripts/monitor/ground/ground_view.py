@@ -183,8 +183,9 @@ class GroundView:
 
     def hear_status(self, status: PlannerStatus) -> None:
         """Takes in that a target has a planner, which can be asked for costs."""
-        if len(self.samples.targets) < _MOST_TARGETS + len(self._target_ids):
-            self.samples.hear_target(status.target)
+        targets = self.samples.targets
+        if status.target not in targets and len(targets) < _MOST_TARGETS + len(self._target_ids):
+            targets.append(status.target)
 
     def hear_costs(self, reply: CostReply, now_ns: int) -> None:
         """Draws what a planner answered."""

@@ -49,8 +49,7 @@ def test_few_cells_are_asked_about_the_shown_target_most_and_all_others_in_turn(
     assert 0 < len(cells) <= 64 * 64
     assert cells.min() >= 0
     assert cells.max() < rows * cols
-    for target in heard:
-        samples.hear_target(target)
+    samples.targets.extend(dict.fromkeys(heard))
     asked = [samples.next_target() for _ in range(16)]
     if not heard:
         assert asked == [None] * 16
@@ -67,7 +66,7 @@ def test_an_answer_that_fits_no_question_is_left_out() -> None:
     samples = CostSamples(GridSpec(40, 50, 10.0), "t0")
     right = len(samples.request.cells)
     assert not samples.on_costs(answer(samples, "t0", [1.0] * right)), "nobody said that there is such a target"
-    samples.hear_target("t0")
+    samples.targets.append("t0")
     assert not samples.on_costs(answer(samples, "t0", [1.0] * (right - 1)))
     assert samples.on_costs(answer(samples, "t0", [1.0] * right))
     assert samples.on_costs(answer(samples, "t0", [math.inf] * right)), "a target that nobody reaches any more"

@@ -30,6 +30,7 @@ from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Heartbeat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
@@ -165,6 +166,36 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
 
     minute = live(1, 60)
     assert live(60, 3600) < 1.1 * minute
+
+
+def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observe = "launch_scripts.observe"
+    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_GENERATIONS",
+                  "process_load._MOST"):  # fmt: skip
+        monkeypatch.setattr(f"{observe}.{limit}", 10)
+    latest = LatestState(plan_of(scenario(), 0), GRID)
+
+    def hear_of(name: str, at_s: int) -> None:
+        goal = GoalState(name=f"{name}-00", stamp_ns=1, done=0, state="underway")
+        for message in (
+            stats("agent", name, at_s=at_s), status(name, 1.0), pose(name, 1.0, 1.0, at_s + 1),
+            fleet(f"{name}.1", {f"{name}-00": (1.0, 1.0)}, at_s), set_of(f"{name}.1", 0, at_s + 1, {}),
+            Heartbeat(role="planner", id=name, incarnation=1, ready=True, leads=True),
+            GoalStates(agent=name, stamp_ns=1, states=[goal]),
+        ):  # fmt: skip
+            latest.heard(message, at_s * NS_PER_S)
+        latest.alive(Peer("agent", name, 1), True, at_s * NS_PER_S)
+
+    for n in range(40):
+        hear_of(f"x{n}", 0)
+    hear_of("x3", 7)
+    kept = {**vars(latest), "loads": latest.loads._told}
+    sizes = {name: len(each) for name, each in kept.items() if isinstance(each, dict)}
+    assert max(sizes.values()) == 10, sizes
+    assert latest.newest_stats("agent", "x3") is not None
+    assert latest.poses["x3"].seq == 8
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:

@@ -10,6 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
+from vehicle_agent.driving.driven_vehicle import goal_name
 from vehicle_agent.reports import HEARTBEAT_NS, ChasersReport
 
 TICK_NS = NS_PER_S // 10
@@ -47,6 +48,18 @@ def test_who_leaves_a_target_is_told_to_both_planners_at_once_and_an_empty_targe
     told(report, ("v", "t0", (4,)))
     assert told(report, ("v", "t1", (4,)), at_ns=TICK_NS) == {"t0": {}, "t1": {"v": 4}}
     assert told(report, ("v", "t1", (4,)), at_ns=HEARTBEAT_NS) == {}
+
+
+def test_a_vehicle_that_is_sent_elsewhere_tells_its_new_place_at_once() -> None:
+    report = ChasersReport("a0.1")
+    vehicles: list[Chasing] = [("v", goal_name(7), (4, 5)), ("w", goal_name(7), (9,)), ("x", "t0", (3,))]
+    places, target = sorted(report.reports(vehicles, 0), key=lambda each: each.target or "")
+    assert (places.target, places.ids, column(places.goals, "<u4").tolist()) == (None, ["v", "w"], [7, 7])
+    assert (target.target, target.goals) == ("t0", b"")
+    vehicles[1] = ("w", goal_name(8), (9,))
+    (places,) = report.reports(vehicles, TICK_NS)
+    assert column(places.goals, "<u4").tolist() == [7, 8]
+    assert not list(report.reports(vehicles, 2 * TICK_NS))
 
 
 def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_still_reach() -> None:
