@@ -61,9 +61,6 @@ class Driver:
         self.patience_ns = NS_PER_S
         self._waits: dict[str, tuple[Entry, int]] = {}
         """Vehicle -> the entry which waits for others, and since when nothing has changed."""
-        self._rolling: set[str] = set()
-        """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
-        measured."""
 
     def begin(self, vehicles: Mapping[str, Vehicle], seconds: float) -> None:
         """Gives each of these so much time. Those which come to no end of a stretch in it have used it then."""
@@ -95,18 +92,14 @@ class Driver:
         while left_s > 0.0:
             if motion.at_rest:
                 if stopped(vehicle.id):
-                    self._rolling.discard(vehicle.id)
                     return 0.0
                 path = self._holdings.path(vehicle.id)
                 waits = len(path) < 2 or not self._passable(path[0], path[1])
                 # With dynamics of its own a vehicle could not stop at the border.
                 if waits or not (self._dynamics is None or self._holdings.may_enter(vehicle.id, path[1])):
-                    self._rolling.discard(vehicle.id)
                     return 0.0
                 motion.set_out(path[1], self._passes(vehicle, path[1]))
-                # A vehicle with dynamics of its own has its full pace between two cells before and behind.
-                freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
-                if self._measures and freely:
+                if self._measures:
                     motion.row[DRIVEN_S] = 0.0
             before = motion.cell
             had_s, head, measured_s = left_s, motion.head, motion.row.item(DRIVEN_S)
@@ -128,12 +121,10 @@ class Driver:
                     measured_s = math.nan
             if self._measures:
                 measured_s += had_s - left_s if before == head or not self._pulled else 0.0
-                if motion.at_rest:
-                    self._rolling.add(vehicle.id)
-                    if not math.isnan(measured_s):
-                        self.driven.append((head, measured_s / (length_m * climbing)))
-                else:
+                if not motion.at_rest:
                     motion.row[DRIVEN_S] = measured_s
+                elif not math.isnan(measured_s):
+                    self.driven.append((head, measured_s / (length_m * climbing)))
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)

@@ -113,10 +113,6 @@ class Stay:
     first_seq: int
 
     @property
-    def name(self) -> str:
-        return self.vehicle
-
-    @property
     def key(self) -> str:
         """The key of the reports, below the namespace."""
         return FLEET.below({"region": str(self.region), "author": self.author})
@@ -129,7 +125,8 @@ def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
     def said(each: Stay | Cover) -> str:
         begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
         reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
-        return f"{each.name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
+        name = each.vehicle if isinstance(each, Stay) else f"body {each.body}"
+        return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
 
     return f": {' and '.join(map(said, evidence))}"
 
@@ -266,10 +263,6 @@ class Cover:
     end_ns: int
     seq: int
     first_seq: int
-
-    @property
-    def name(self) -> str:
-        return f"body {self.body}"
 
     @property
     def key(self) -> str:
