@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import compress, pairwise
 
-from shared_map.terrain.step_climb import Climb, may_be_pulled
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Entry
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, Point, roll, together
+from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, roll, together
 
 
 class Driver:
@@ -52,7 +52,7 @@ class Driver:
         self._passable = passable
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
-        self._pulled = pulled and may_be_pulled(local_map.climb)
+        self._pulled = pulled
         self._left: list[tuple[Vehicle, float]] = []
         """Vehicles that are still to be driven in this tick, and the seconds that each has left."""
         self._vehicles: list[Vehicle] = []
@@ -98,7 +98,7 @@ class Driver:
                 # With dynamics of its own a vehicle could not stop at the border.
                 if waits or not (self._dynamics is None or self._holdings.may_enter(vehicle.id, path[1])):
                     return 0.0
-                motion.set_out(path[1], self._passes(vehicle, path[1]))
+                motion.set_out(path[1], vehicle.route.point(path[1], self._cols))
                 if self._measures:
                     motion.row[DRIVEN_S] = 0.0
             before = motion.cell
@@ -115,7 +115,7 @@ class Driver:
                     return left_s  # in this tick another of ours may leave yet
             else:
                 path = self._holdings.open(vehicle.id)
-                passes = partial(self._passes, vehicle)
+                passes = partial(vehicle.route.point, cols=self._cols)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
                     measured_s = math.nan
@@ -133,10 +133,6 @@ class Driver:
                 # Even with no time left it has to look before it drives on.
                 return left_s
         return 0.0
-
-    def _passes(self, vehicle: Vehicle, cell: int) -> Point | None:
-        """Returns the point where a vehicle passes one of its next cells; None is the middle."""
-        return vehicle.route.point(cell, self._cols) if self._pulled else None
 
     def _climbing(self, motion: Motion) -> float:
         return 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
