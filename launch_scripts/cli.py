@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 from launch_scripts.command_line import declaring
 from launch_scripts.command_line.declaring import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family
-from launch_scripts.command_line.old_names import current
 from launch_scripts.command_line.run_command import run_command
 
 LEAVES = (
@@ -120,7 +119,7 @@ def help_(
     """
     root = command()
     root.all = every
-    root.main([*current(words or ())[0], "-h"], prog_name="swarm", standalone_mode=False)
+    root.main([*(words or ()), "-h"], prog_name="swarm", standalone_mode=False)
 
 
 for leaves in LEAVES:

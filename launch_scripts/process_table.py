@@ -10,9 +10,9 @@ import msgspec
 
 from swarm.config.agents import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
+from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
-
-Restart = Literal["always", "never"]
+from swarm.wire.fields import check_id
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,15 +134,13 @@ only. Every plan of machines has one, and keeps it on the machine of its store."
 class ProcessSpec:
     """One row of the table.
 
-    entry    `module:function`, called as function(setup, stop_when)
-    restart  whether it is started again when it crashes
-    added    an operator's order started it: the run goes on without it, whatever keeps it from starting
+    entry  `module:function`, called as function(setup, stop_when)
+    added  an operator's order started it: the run goes on without it, whatever keeps it from starting
     """
 
     role: str
     id: str
     entry: str
-    restart: Restart = "always"
     added: bool = False
 
     @property
@@ -173,6 +171,14 @@ def spec_of(role: str, id: str, *, added: bool = False) -> ProcessSpec:
 def planner_spec(id: str) -> ProcessSpec:
     """The planner of a target that was added while the swarm runs, or one of its standbys."""
     return spec_of("planner", id, added=True)
+
+
+def check_name(option: str, name: str) -> None:
+    """Raises ConfigError if the value of an option cannot be the id of a process, a run or a certificate."""
+    try:
+        check_id(option, name)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
 
 
 LAUNCHER = "launcher"

@@ -1,4 +1,4 @@
-"""The vehicles that follow one target, and which changes of the map concern them. Pure.
+"""The vehicles that follow one target, or go to places, and which changes of the map concern them. Pure.
 
 To repair a tree costs about the same however many cells have changed. With hundreds of vehicles that see something
 new in every tick, somewhere, a planner that repaired in every tick did little else. A change that no follower's
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +38,13 @@ class Follower:
     row        in the table of all bounds
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
+    goal       the cell of the place to which it goes; None if it follows the target
     """
 
     cell: int
     max_cells: int
     heard_ns: int
+    goal: int | None = None
     route: Route | None = None
     bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
     walked: list[int] | None = None
@@ -67,6 +70,15 @@ class _Told:
     heard_ns: int
 
 
+class Batch(NamedTuple):
+    """Followers whose routes are read together: to one goal, of as many cells."""
+
+    goal: int | None
+    max_cells: int
+
+
+_WORTH_PUSHING = (RouteStatus.OK, RouteStatus.UNREACHABLE)
+"""A vehicle wants to know of a way, and that there is none any more."""
 CAPACITY = 4096
 """Followers at most: any client may ask for vehicles that do not exist."""
 MOST_PUSHES = 256
@@ -81,8 +93,7 @@ class Followers:
     they were registered. A vehicle that is dropped so is registered again by its agent's next word.
     """
 
-    def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
-        self._target = target
+    def __init__(self, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
         self._grid = grid
         self._lease_ns = lease_ns
         self._max_cells = max_cells
@@ -119,23 +130,31 @@ class Followers:
         elif len(self._told) >= CAPACITY:
             del self._told[next(iter(self._told))]
         self._told[chasers.author] = told
-        for id, cell in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), strict=True):
+        goals: list[int] | list[None] = [None] * len(chasers.ids)
+        if chasers.target is None:
+            goals = column(chasers.goals, "<u4").tolist()
+        for id, cell, goal in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), goals, strict=True):
             follower = self._by_id.get(id)
             if cell >= self._grid.cells:
                 self._drop(id)
             elif follower is None:
-                self._register(id, Follower(cell, self._max_cells, now_ns))
+                self._register(id, Follower(cell, self._max_cells, now_ns, goal))
             else:
                 follower.cell, follower.heard_ns = cell, now_ns
+                if follower.goal != goal:
+                    follower.goal = goal
+                    self._forget_route(follower)
 
-    def given(self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int) -> None:
+    def given(
+        self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int, goal: int | None = None
+    ) -> None:
         """A vehicle asked, and this is the answer. One outside the grid is no follower, whatever the status."""
         if not 0 <= route.start < self._grid.cells:
             return
         follower = self._by_id.get(vehicle)
         if follower is None:
             follower = self._register(vehicle, Follower(route.start, max_cells, now_ns))
-        follower.cell, follower.max_cells, follower.heard_ns = route.start, max_cells, now_ns
+        follower.cell, follower.max_cells, follower.heard_ns, follower.goal = route.start, max_cells, now_ns, goal
         self.sent(follower, route, push_ns)
 
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
@@ -159,8 +178,11 @@ class Followers:
         """Forgets all given routes after another planner has given some: the next route is new to every
         follower."""
         for follower in self._by_id.values():
-            follower.route, follower.stale, follower.push_ns = None, True, 0
-            self._lies(follower, _NOWHERE_BOUNDS)
+            self._forget_route(follower)
+
+    def _forget_route(self, follower: Follower) -> None:
+        follower.route, follower.stale, follower.push_ns = None, True, 0
+        self._lies(follower, _NOWHERE_BOUNDS)
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
@@ -194,12 +216,35 @@ class Followers:
         for follower, near in self._near(changed):
             follower.stale = follower.stale or self._crosses(follower, near)
 
-    def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
-        """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
+    def due(self, now_ns: int) -> dict[Batch, list[tuple[str, Follower]]]:
+        """Followers with a stale route that may be pushed another one, by what they ask for alike; of too many,
+        those that waited longest. From now on their routes are not stale."""
         due = [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
         if len(due) > MOST_PUSHES:
             due = sorted(due, key=lambda item: item[1].push_ns)[:MOST_PUSHES]
-        return due
+        batches: dict[Batch, list[tuple[str, Follower]]] = {}
+        for id, follower in due:
+            follower.stale = False
+            batches.setdefault(Batch(follower.goal, follower.max_cells), []).append((id, follower))
+        return batches
+
+    def pushed(
+        self, batch: Iterable[tuple[str, Follower]], routes: RouteBatch, push_ns: int
+    ) -> Iterator[tuple[str, Route]]:
+        """Returns the routes to push: of those for these followers, in their order, the ones that are news."""
+        for index, ((id, follower), outline) in enumerate(zip(batch, routes.outlines(), strict=True)):
+            if outline.status in _WORTH_PUSHING and self.is_news(follower, outline):
+                route = routes[index]
+                self.sent(follower, route, push_ns)
+                yield id, route
+
+    def get(self, vehicle: str) -> Follower | None:
+        return self._by_id.get(vehicle)
+
+    def is_stale(self, vehicle: str) -> None:
+        """There may be a better route for a vehicle than the one it has."""
+        if vehicle in self._by_id:
+            self._by_id[vehicle].stale = True
 
     def is_news(self, follower: Follower, route: RouteOutline) -> bool:
         """Returns True if a route is new to the follower: other steps, or no path."""

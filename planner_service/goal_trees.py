@@ -12,17 +12,16 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.layout import step_offsets
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, joined
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import CutTree, PartialGrowth, route_of, whole_tree
-from swarm.grid import STEP_COL, STEP_ROW
-
-GoalStatus = Literal["ok", "unreachable", "lethal_goal", "lethal_start", "outside", "growing"]
+from swarm.wire.route_columns import Route, RouteStatus
 
 MOST_CHANGES = 500
 """Changes near a tree beyond which it is dropped: another growth costs less than to look at them."""
@@ -35,25 +34,27 @@ _OBJECTS_BYTES = 1 << 10
 _NO_CELLS: Cells = np.empty(0, np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GoalAnswer:
+class GoalAnswer(NamedTuple):
     """A route from a start to a goal, or why there is none.
 
-    status         "ok"; "growing": not known yet, asking again goes on; "unreachable", "lethal_goal",
-                   "lethal_start", "outside"
-    cells          int64 (steps + 1,), cells of the grid from the start to the goal; the start alone without a route
-    cost_s         s, what driving it takes; inf without a route
-    lower_bound_s  s, proven: no route takes less; inf where there is none. While it grows, the frontier
-    grown_cells    cells that this ask has grown
-    from_cache     whether a tree that was kept answered as it was
+    route        NO_TARGET while it is not known yet: asking again goes on. Its lower bound is then the frontier
+    lethal_goal  no route leads to the goal: the status is UNREACHABLE
+    grown_cells  cells that this ask has grown: 0 if a tree that was kept answered as it was
     """
 
-    status: GoalStatus
-    cells: Cells
-    cost_s: float
-    lower_bound_s: float
+    route: Route
+    lethal_goal: bool = False
     grown_cells: int = 0
-    from_cache: bool = False
+
+    @property
+    def grows(self) -> bool:
+        """True if it is not known yet."""
+        return self.route.status is RouteStatus.NO_TARGET
+
+
+Directions = NDArray[np.uint8]
+_Found = tuple[CutTree, Directions | None]
+"""A tree, and a route of it; None if it has none from the start, or does not know it yet."""
 
 
 @dataclass(slots=True)
@@ -76,7 +77,7 @@ class GoalTrees:
     Parameters
     ----------
     costs : CostGrid
-        Its owner calls `changed` after each `apply`, and `forget_all` after any other change.
+        Its owner calls `changed` after each `apply`.
     budget_bytes : int
         What the trees that are kept may take. Beside them one is in hand, with 20 bytes for each cell it has grown.
     """
@@ -85,6 +86,9 @@ class GoalTrees:
         self.costs = costs
         self._budget = budget_bytes
         self._growth = PartialGrowth(costs)
+        self._offsets = step_offsets(costs.stride).astype(np.int64)
+        self._lengths = np.array((1.0, costs.diagonal))
+        """Lengths of a straight and of a diagonal step."""
         self._in_hand: _Kept | None = None
         # By goal, in the order of their last asks.
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
@@ -113,40 +117,43 @@ class GoalTrees:
             self._logged -= self._log.pop(0).cells.size
             self._forgotten += 1
 
-    def forget_all(self) -> None:
-        """Every cell cost may be another: all trees are dropped."""
-        self._in_hand = None
-        self._kept.clear()
-        self.bytes = 0
-        self._growth = PartialGrowth(self.costs)
-        self._forgotten += len(self._log)
-        self._log, self._logged = [], 0
-
     # --- answers ------------------------------------------------------------------------------------------------
 
-    def ask(self, goal: int, start: int, most_cells: int) -> GoalAnswer:
+    def ask(self, goal: int, start: int, most_cells: int, most_steps: int = 0) -> GoalAnswer:
         """The cheapest route between two cells of the grid. Grows about `most_cells` at most; where growths cannot
-        stop (see `PartialGrowth`), a whole tree."""
+        stop (see `PartialGrowth`), a whole tree.
+
+        most_steps  of the route that is given; 0 is the whole route
+        """
         grid = self.costs.grid
-        alone = np.array((start,), np.int64)
         if not (0 <= goal < grid.cells and 0 <= start < grid.cells):
-            return GoalAnswer("outside", alone, math.inf, math.inf)
+            return GoalAnswer(Route(status=RouteStatus.OUTSIDE, start=start))
         root, at = self.costs.pad(goal), self.costs.pad(start)
         if not self.costs.cell_cost[root] < np.inf:
             self._drop(goal)
-            return GoalAnswer("lethal_goal", alone, math.inf, math.inf)
+            return GoalAnswer(Route(status=RouteStatus.UNREACHABLE, start=start), lethal_goal=True)
         if not self.costs.cell_cost[at] < np.inf:
-            return GoalAnswer("lethal_start", alone, math.inf, math.inf)
+            return GoalAnswer(Route(status=RouteStatus.LETHAL_START, start=start))
         kept = self._kept.get(goal)
         if kept is not None and not self._look(kept):
             self._drop(goal)
             kept = None
+        known: _Found | None = None
         if kept is not None:
             self._kept.move_to_end(goal)
             known = self._known(kept, at)
-            if known is not None:
-                return known
-        return self._grown(goal, kept, root, at, max(most_cells, 1))
+        grown = 0
+        if known is None:
+            known, grown = self._grown(goal, kept, root, at, max(most_cells, 1))
+        tree, directions = known
+        if directions is not None:
+            return GoalAnswer(self._route(tree, start, directions, most_steps), grown_cells=grown)
+        if tree.bound == math.inf:
+            return GoalAnswer(Route(status=RouteStatus.UNREACHABLE, start=start), grown_cells=grown)
+        frontier_s = tree.bound * (1.0 - 1e-6) * self.costs.time_share
+        return GoalAnswer(
+            Route(status=RouteStatus.NO_TARGET, start=start, lower_bound_s=frontier_s), grown_cells=grown
+        )
 
     def _look(self, kept: _Kept) -> bool:
         """Collects the changes near a tree since it was looked at last. Returns False if they are too many."""
@@ -161,22 +168,19 @@ class GoalTrees:
             kept.changes = joined([kept.changes, *near])
         return kept.changes.cells.size <= MOST_CHANGES
 
-    def _known(self, kept: _Kept, start: int) -> GoalAnswer | None:
+    def _known(self, kept: _Kept, start: int) -> _Found | None:
         """The answer of a tree as it is; None if it must grow for that."""
-        tree = kept.tree
-        if tree is None:
-            tree = self._held
+        tree = self._held if kept.tree is None else kept.tree
         cost = tree.at(start, self.costs.stride)
         if not kept.changes.cells.size:
             if cost < math.inf:
-                return self._ok(tree, start, route_of(self.costs, tree, start), 0)
-            return self._none(start, 0) if tree.bound == math.inf else None
+                return tree, route_of(self.costs, tree, start)
+            return (tree, None) if tree.bound == math.inf else None
         if cost == math.inf:
             return None
         route = self._as_it_was(kept.changes, tree, start)
-        cells = self._padded(start, route, self.costs.stride)
-        level, stands = self._growth.stays(tree, kept.changes, cells)
-        return self._ok(tree, start, route, 0) if stands or cost < level * (1.0 - 1e-6) else None
+        level, stands = self._growth.stays(tree, kept.changes, self._cells(start, route))
+        return (tree, route) if stands or cost < level * (1.0 - 1e-6) else None
 
     @property
     def _held(self) -> CutTree:
@@ -185,7 +189,7 @@ class GoalTrees:
         whole = growth.cost.reshape(-1, stride)
         return CutTree(growth.root, (0, 0, *whole.shape), whole, growth.bound, 0.0)
 
-    def _as_it_was(self, changes: Changes, tree: CutTree, start: int) -> NDArray[np.uint8]:
+    def _as_it_was(self, changes: Changes, tree: CutTree, start: int) -> Directions:
         """The directions of a route on the map on which the tree was grown."""
         costs, cells = self.costs.cell_cost, changes.cells
         now = costs[cells]
@@ -195,8 +199,8 @@ class GoalTrees:
         finally:
             costs[cells] = now
 
-    def _grown(self, goal: int, kept: _Kept | None, root: int, start: int, most: int) -> GoalAnswer:
-        """Grows the tree until it has a cost for the start."""
+    def _grown(self, goal: int, kept: _Kept | None, root: int, start: int, most: int) -> tuple[_Found, int]:
+        """Grows the tree until it has a cost for the start. Returns the cells grown, too."""
         growth = self._growth
         if not growth.usable:
             return self._grown_whole(goal, root, start)
@@ -217,53 +221,48 @@ class GoalTrees:
         cells = growth.go_on(np.array((start,)), most)
         if cells < 0:
             return self._grown_whole(goal, root, start)
-        if growth.cost[start] < np.inf:
-            tree = self._held
-            return self._ok(tree, start, route_of(self.costs, tree, start), cells)
-        return self._none(start, cells) if growth.bound == math.inf else self._none(start, cells, growth.bound)
+        tree = self._held
+        return (tree, route_of(self.costs, tree, start) if growth.cost[start] < np.inf else None), cells
 
-    def _grown_whole(self, goal: int, root: int, start: int) -> GoalAnswer:
+    def _grown_whole(self, goal: int, root: int, start: int) -> tuple[_Found, int]:
         self._drop(goal)
         tree = whole_tree(self.costs, root)
         self._kept[goal] = _Kept(tree, self._forgotten + len(self._log))
         self.bytes += _bytes(tree)
         self._evict()
-        cells = self.costs.grid.cells
-        if tree.at(start, self.costs.stride) == math.inf:
-            return self._none(start, cells)
-        return self._ok(tree, start, route_of(self.costs, tree, start), cells)
+        has_way = tree.at(start, self.costs.stride) < math.inf
+        return (tree, route_of(self.costs, tree, start) if has_way else None), self.costs.grid.cells
 
-    def _ok(self, tree: CutTree, start: int, route: NDArray[np.uint8], grown: int) -> GoalAnswer:
-        grid = self.costs
-        cells = self._padded(start, route, grid.stride)
-        cost = tree.at(start, grid.stride)
-        bound = cost * (1.0 - 2.0 * float(grid.rounding.at(np.float64(cost)))) * grid.time_share
-        if grid.climbs is None:
-            lengths = np.where(route & 1, grid.diagonal, 1.0)
-            driven = float(grid.time_cost[cells[1:]] @ lengths)
-        else:
+    def _route(self, tree: CutTree, start: int, directions: Directions, most: int) -> Route:
+        costs, at = self.costs, self.costs.pad(start)
+        cost = tree.at(at, costs.stride)
+        cells, lengths = self._cells(at, directions), self._lengths[directions & 1]
+        steps = directions.size if not 0 < most < directions.size else most
+
+        def driven(first: int) -> float:
+            if costs.climbs is None:
+                return float(costs.time_cost[cells[first + 1 :]] @ lengths[first:])
             assert tree.parent is not None
-            driven = float(grid.walk(tree.parent, tree.root, cells[:1].copy(), 0, grid.time_cost).driven[0])
-        here = self._padded(self._unpad(start), route, grid.grid.cols)
-        return GoalAnswer("ok", here, driven, min(max(bound, 0.0), driven), grown, grown == 0)
+            walks = costs.walk(tree.parent, tree.root, cells[first : first + 1].copy(), 0, costs.time_cost)
+            return float(walks.driven[0])
 
-    def _none(self, start: int, grown: int, bound: float = math.inf) -> GoalAnswer:
-        alone = np.array((self._unpad(start),))
-        if bound == math.inf:
-            return GoalAnswer("unreachable", alone, math.inf, math.inf, grown, grown == 0)
-        return GoalAnswer("growing", alone, math.inf, bound * (1.0 - 1e-6) * self.costs.time_share, grown)
+        driven_s = driven(0)
+        bound = cost * (1.0 - 2.0 * float(costs.rounding.at(np.float64(cost)))) * costs.time_share
+        return Route(
+            status=RouteStatus.OK,
+            start=start,
+            directions=directions[:steps].tobytes(),
+            cost_s=driven_s,
+            lower_bound_s=min(max(bound, 0.0), driven_s),
+            length_m=float(lengths[:steps].sum()) * costs.grid.resolution_m,
+            remaining_s=driven(steps) if steps < directions.size else 0.0,
+        )
 
-    def _unpad(self, cell: int) -> int:
-        row, col = divmod(cell, self.costs.stride)
-        return (row - 1) * self.costs.grid.cols + col - 1
-
-    @staticmethod
-    def _padded(start: int, route: NDArray[np.uint8], stride: int) -> Cells:
-        """The cells that directions lead through, on rows of this many cells."""
-        steps = _ROWS * stride + _COLS
-        cells = np.empty(route.size + 1, np.int64)
+    def _cells(self, start: int, directions: Directions) -> Cells:
+        """The padded cells that directions lead through from one."""
+        cells = np.empty(directions.size + 1, np.int64)
         cells[0] = start
-        np.cumsum(steps[route], out=cells[1:])
+        np.cumsum(self._offsets[directions], out=cells[1:])
         cells[1:] += start
         return cells
 
@@ -293,9 +292,6 @@ class GoalTrees:
             if self.bytes <= self._budget:
                 return
             self._drop(goal)
-
-
-_ROWS, _COLS = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 
 
 def _bytes(tree: CutTree) -> int:

@@ -36,7 +36,6 @@ from planner_service.kernels import (
     queue_dial,
     queue_directed,
     queue_heap,
-    queue_wide,
     repair,
     route_walk,
     stride_growth,
@@ -53,9 +52,9 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
+    queue_directed.grow_directed_by_buckets,
+    StepKernel(queue_dial.grow_by_buckets, None),
     parents.point_to_parents,
-    StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
@@ -106,36 +105,38 @@ _BUILDERS = "builders.lock"
 class NeededKernels:
     """Kernels that planners call, none of them twice. Builders and planners use the same list.
 
-    first    until the first route of the class "ground" is served
-    classes  beside these, until the first route of any other class is
-    later    what saves growing whole trees
+    first  until the first route of the class "ground" is served
+    later  for other classes, and what saves growing whole trees
     """
 
     first: tuple[Kernel, ...]
-    classes: tuple[Kernel, ...]
     later: tuple[Kernel, ...]
 
     def __iter__(self) -> Iterator[Kernel]:
         """In the order in which they are needed."""
-        yield from (*self.first, *self.classes, *self.later)
+        yield from (*self.first, *self.later)
 
 
 def needed_kernels(scenario: Scenario) -> NeededKernels:
     """Returns the kernels that the planners of a scenario call. Its ground may be of one kind, and a class that
     flies of the other."""
-    ground = scenario.cost.directional
-    aloft = bool(aloft_classes(scenario))
-    pulled = scenario.planner.routes == "pulled"
-    first = _of_kind([*FIRST, PULL] if pulled and not ground else FIRST, ground)
-    classes = _of_kind([*FIRST, PULL] if pulled else FIRST, True) if aloft else []
+    ground, aloft = scenario.cost.directional, bool(aloft_classes(scenario))
+    first, classes = _first_kernels(scenario)
     later = [*_of_kind(LATER, ground), *(_of_kind(LATER, True) if aloft else [])]
-    return NeededKernels(*_once(first, classes, later))
+    return NeededKernels(*_once(first, [*classes, *later]))
 
 
 def place_kernels(scenario: Scenario) -> NeededKernels:
     """Returns the kernels that the process which plans to places calls."""
-    needed = needed_kernels(scenario)
-    return NeededKernels(*_once((*needed.first, *GOALS), needed.classes, ()))
+    first, classes = _first_kernels(scenario)
+    return NeededKernels(*_once([*first, *GOALS], classes))
+
+
+def _first_kernels(scenario: Scenario) -> tuple[list[Kernel], list[Kernel]]:
+    """Those that the first route of the ground needs, and that of a class."""
+    ground, pulled = scenario.cost.directional, scenario.planner.routes == "pulled"
+    first = _of_kind([*FIRST, PULL] if pulled and not ground else FIRST, ground)
+    return first, _of_kind([*FIRST, PULL] if pulled else FIRST, True) if aloft_classes(scenario) else []
 
 
 def all_kernels() -> list[Kernel]:
@@ -243,7 +244,6 @@ class KernelLoader:
     def __init__(self, needed: NeededKernels, whole: bool) -> None:
         self._kernels = list(needed)
         self._first = self._kernels if whole else list(needed.first)
-        self._classes = list(needed.classes)
         self._missing = list(self._kernels)
         self._asked_s = -math.inf
         self.builders: list[subprocess.Popen[bytes]] = []
@@ -254,15 +254,6 @@ class KernelLoader:
     def complete(self) -> bool:
         """True if all may be called. Once true, it stays so."""
         return not self._missing
-
-    @property
-    def classes_complete(self) -> bool:
-        """True if whole trees of all classes may be searched, beside those of "ground". Once true, it stays so."""
-        if self._classes and self._missing:
-            gone = {name_of(kernel) for kernel in self._missing}
-            self._classes = [kernel for kernel in self._classes if name_of(kernel) in gone]
-            return not self._classes
-        return True
 
     def load_first(self, tell: Callable[[str], None] = lambda _: None) -> None:
         """Waits until a first route can be planned; later kernels are loaded as they appear. `tell` is handed a

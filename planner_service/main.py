@@ -11,7 +11,7 @@ from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, needed_kernels
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
-from shared_map.terrain.store import kept_key, load_terrain
+from shared_map.terrain.store import load_terrain
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
@@ -37,7 +37,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     load_classes(setup, terrain)
     kernels = KernelLoader(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
-    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, lambda: kept_key(scenario))
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
     inbox = Inbox()
 
     def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> PlannerService:
@@ -49,7 +49,6 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.worker(worker),
             boundary.function("stopwatch", time.thread_time_ns, int),
             boundary.function("all kernels", lambda: kernels.complete, bool),
-            boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
             boundary.external(prepared, PREPARED_COSTS),
         )
 

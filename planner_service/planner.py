@@ -18,7 +18,7 @@ from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import StrideSearch, StrideShelf
+from planner_service.tree.strides import StrideNetwork
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -35,7 +35,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
 )
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
@@ -68,7 +68,6 @@ class Planner:
     watch           position of the target, kept by the caller. The planners of all classes share it
     stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
-    shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     vehicle_class   whose routes these are: what the cost map is for
     target_search   while the target is unseen. All classes share it
@@ -86,7 +85,6 @@ class Planner:
         route_cells: int = 0,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
-        shelf: StrideShelf | None = None,
         leads: bool = True,
         target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
@@ -102,9 +100,8 @@ class Planner:
         self._cost_map = cost_map
         self._stopwatch = stopwatch
         self._newest_mark_ns = newest_mark_ns
-        self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
-        self.followers = Followers(watch.target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        self.followers = Followers(self._grid, FOLLOWER_LEASE_NS, route_cells)
         self._intake = MapIntake(cost_map, self.followers)
         self._watch = watch
         # (target cell, map version) of the tree's last update.
@@ -128,7 +125,7 @@ class Planner:
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
         climb = cost_map.terrain.climb
-        self._gaps = GapStatistics(self._grid, config, counters, climb)
+        self._gaps = GapStatistics(config, counters)
         pace, resolution_m = cost_map.pace_s_per_m, self._grid.resolution_m
         self._puller = Puller(pace, resolution_m, config, climb) if pulls(config, climb) else None
         self._status_due_ns = 0
@@ -185,7 +182,7 @@ class Planner:
         actions = self._keep_up(now_ns)
         self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
-            actions.append(FindStrides(self.tree.stride_job(self._shelf)))
+            actions.append(FindStrides(self.tree.stride_job()))
         self.followers.drop_silent(now_ns)
         if self.leads:
             actions.extend(self._pushes(now_ns))
@@ -220,13 +217,13 @@ class Planner:
         else:
             self.counters.count("growths_late")
             self._exact_ns = snapshot_ns
-        self._gaps.adopted(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+        self._gaps.adopted(self.tree, now_ns)
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
 
-    def adopt_strides(self, search: StrideSearch) -> None:
+    def adopt_strides(self, found: StrideNetwork) -> None:
         """Goes by what the worker found."""
-        self.tree.take_strides(search)
+        self.tree.take_strides(found)
 
     def must_wait(self, cells: Sequence[int]) -> bool:
         """Returns True if no tree answers these cells now, but one will once the search under way is adopted."""
@@ -341,7 +338,7 @@ class Planner:
         if update.kind in ("full", "bounded", "exact"):
             self._exact_ns = now_ns
             self._record_growth(took_ns - update.repair_ns, update.kind)
-            self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+            self._gaps.record_growth(self.tree, self.followers, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
@@ -484,19 +481,11 @@ class Planner:
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []
-        due: dict[int, list[tuple[str, Follower]]] = {}
-        for id, follower in self.followers.due(now_ns):
-            due.setdefault(follower.max_cells, []).append((id, follower))
         pushes: list[Action] = []
-        for max_cells, batch in due.items():
+        for (_, max_cells), batch in self.followers.due(now_ns).items():
             cells = [follower.cell for _, follower in batch]
             routes = self._pulled(self._read(cells, max_cells, now_ns))
-            for index, ((id, follower), outline) in enumerate(zip(batch, routes.outlines(), strict=True)):
-                follower.stale = False
-                if outline.status not in _WORTH_PUSHING or not self.followers.is_news(follower, outline):
-                    continue
-                route = routes[index]
-                self.followers.sent(follower, route, now_ns + self._push_ns)
+            for id, route in self.followers.pushed(batch, routes, now_ns + self._push_ns):
                 pushes.append(self._pushed(id, route, target_cell))
         self.counters.count("pushes", len(pushes))
         return pushes
@@ -552,7 +541,3 @@ class Planner:
             gap_p95=p95,
             gap_max=highest,
         )
-
-
-_WORTH_PUSHING = (RouteStatus.OK, RouteStatus.UNREACHABLE)
-"""A vehicle wants to know of a way, and that there is none any more."""

@@ -12,7 +12,7 @@ from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, in_cells
-from planner_service.tree.strides import StrideSearch
+from planner_service.tree.strides import StrideNetwork
 from shared_map.array_files import Floats
 from swarm.wire.messages.planning import Believed, PlannerStatus, PushedRoute
 
@@ -123,10 +123,9 @@ class GrowTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FindStrides:
-    """Take the steps of `search` on a worker, one now and then, until it has found them; bring it to
-    `Planner.adopt_strides`."""
+    """Run `job` on a worker and bring what it returns to `Planner.adopt_strides`."""
 
-    search: StrideSearch
+    job: Callable[[], StrideNetwork]
 
 
 Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Believed

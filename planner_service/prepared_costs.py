@@ -10,18 +10,16 @@ import contextlib
 import fcntl
 import hashlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from shared_map import array_files as arrays
-from shared_map.array_files import Bytes, Floats, open_array, private_copy, save_array, source_digest
-from shared_map.terrain.store import keep_beside
+from shared_map.array_files import Floats, open_array, private_copy, save_array, source_digest
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import StoreError
@@ -30,86 +28,39 @@ from swarm.recording.external_calls import ExternalCalls
 log = logging.getLogger(__name__)
 
 
-PREPARED_COSTS = ExternalCalls(
-    "prepared costs",
-    calls={"load": np.ndarray | None, "claim": bool, "leave": None},
-    fixed=("cell_cost",),
-)
-"""Calls of it that a planner uses."""
+PREPARED_COSTS = ExternalCalls("prepared costs", calls={}, fixed=("cell_cost",))
+"""The part of it that a planner uses."""
 
 
 _DIGEST_BYTES = 16
 """Same length as in names of cached terrains: no two arrays of one machine have the same by chance."""
-Kept = Callable[[], str | None]
-
-
-def _not_kept() -> None:
-    return None
 
 
 class PreparedCosts:
-    """Cell costs before any mark, and a `StrideShelf` beside them.
+    """Cell costs before any mark.
 
     cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
-    kept       the name under which the terrain is kept from run to run, and its networks of strides then, too; None
-               if it is not. Asked once there is a network: the name takes longer to find than all else here
     """
 
-    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: Kept = _not_kept) -> None:
+    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig) -> None:
         cost_grid = CostGrid(terrain.grid, config, terrain.climb)
         of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.metres}"
-        rules = f"{cost_grid.length_weight_s} {cost_grid.rule} {cost_grid.corners}"
-        of_ways = f"{of_costs} {rules} {strides.LEAST} {strides.MOST_SHARE}"
-        self._size = cost_grid.size
-        self._folder = folder
-        self._kept = kept
-        self._strides = folder / f"strides-{_digest(of_ways)}.npy"
-        self._claimed: IO[bytes] | None = None
         path = folder / f"cell-costs-{_digest(of_costs)}.npy"
         with _locked(folder / "cell-costs.lock"):
-            found = _read(path, np.float32, self._size)
+            found = _read(path, cost_grid.size)
             if found is None:
                 cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
                 _save(path, cost_grid.time_cost)
-                found = open_array(path)[: self._size]
+                found = open_array(path)[: cost_grid.size]
         self.cell_cost: Floats = found
 
-    def load(self) -> Bytes | None:
-        found = _read(self._strides, np.uint8, None)
-        return None if found is None else private_copy(found)
 
-    def claim(self) -> bool:
-        """Released by the system if this process ends."""
-        try:
-            if self._claimed is None:
-                self._claimed = (self._folder / "strides.lock").open("wb")
-            fcntl.flock(self._claimed, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError as error:  # a full disk: then each finds its own
-            log.warning("cannot share networks of strides in %s: %s", self._folder, error.strerror or error)
-        return True
-
-    def leave(self, packed: Bytes) -> None:
-        try:
-            _save(self._strides, packed)
-            if (kept := self._kept()) is not None:
-                keep_beside(kept, self._strides)
-        except (OSError, StoreError) as error:
-            log.warning("cannot share networks of strides: %s", error)
-        if self._claimed is not None:
-            self._claimed.close()
-            self._claimed = None
-
-
-def prepared_costs(
-    folder: Path | None, terrain: Terrain, config: PlannerConfig, kept: Kept = _not_kept
-) -> PreparedCosts | None:
+def prepared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig) -> PreparedCosts | None:
     """None where there is no folder or it cannot be written: then a planner computes its own."""
     if folder is None:
         return None
     try:
-        return PreparedCosts(folder, terrain, config, kept)
+        return PreparedCosts(folder, terrain, config)
     except (OSError, StoreError) as error:
         log.warning("cannot share cell costs in %s: %s", folder, error)
         return None
@@ -131,16 +82,16 @@ def _save(path: Path, array: NDArray[Any]) -> None:
     save_array(path, np.concatenate((array, _digest_of(array))))
 
 
-def _read(path: Path, dtype: type[np.generic], size: int | None) -> NDArray[Any] | None:
+def _read(path: Path, size: int) -> Floats | None:
     """None where the file is not there; a damaged one is as none, and is said: kernels check no index that they
     read from it."""
     try:
         whole = open_array(path)
-        if whole.ndim != 1 or whole.dtype != dtype:
+        if whole.ndim != 1 or whole.dtype != np.float32:
             raise ValueError(f"it is {whole.shape} {whole.dtype}")
         digest_size = _DIGEST_BYTES // whole.itemsize
         found, digest = whole[:-digest_size], whole[-digest_size:]
-        if size not in (None, found.size):
+        if found.size != size:
             raise ValueError(f"it has {found.size} values")
         if digest.tobytes() != _digest_of(found).tobytes():
             raise ValueError("its digest is another")

@@ -148,12 +148,16 @@ class RouteFinder:
         row, col = _whole(row, col)
         cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
-        cells = np.array([(row, col)], np.int64)
-        if found.status is RouteStatus.OK:
-            cells = np.stack(np.divmod(np.array(walk(self.grid, cell, found.directions)), self.grid.cols), axis=1)
         lethal = found.status is RouteStatus.NO_TARGET and self._tree.lethal_target is not None
-        status = TargetStatus.LETHAL if lethal else found.status
-        return FoundRoute(status, cells, found.cost_s, found.lower_bound_s, found.length_m)
+        return self._found((row, col), found, lethal)
+
+    def _found(self, start: tuple[int, int], route: Route, lethal_target: bool) -> FoundRoute:
+        cells = np.array([start], np.int64)
+        if route.status is RouteStatus.OK:
+            crossed = np.array(walk(self.grid, route.start, route.directions))
+            cells = np.stack(np.divmod(crossed, self.grid.cols), axis=1)
+        status = TargetStatus.LETHAL if lethal_target else route.status
+        return FoundRoute(status, cells, route.cost_s, route.lower_bound_s, route.length_m)
 
     def between(self, start: tuple[int, int], goal: tuple[int, int]) -> FoundRoute:
         """The cheapest route between any two cells, whatever the target is.
@@ -167,23 +171,14 @@ class RouteFinder:
         is not downhill, or where the costliest cell costs some 2,900 times the cheapest, it grows over all of the
         map. Costs are in s, lengths in m, with the same meaning as of `route`.
         """
-        start_row, start_col = _whole(*start)
-        goal_row, goal_col = _whole(*goal)
+        start, goal, grid = _whole(*start), _whole(*goal), self.grid
         if self._goals is None:
             costs = CostGrid(self.grid, self._config, self._climb)
             costs.load(self._pace)
             self._goals = GoalTrees(costs, _KEPT_BYTES)
-        grid = self.grid
-        if not (grid.inside(start_row, start_col) and grid.inside(goal_row, goal_col)):
-            alone = np.array([(start_row, start_col)], np.int64)
-            return FoundRoute(RouteStatus.OUTSIDE, alone, np.inf, 0.0, 0.0)
-        found = self._goals.ask(grid.cell(goal_row, goal_col), grid.cell(start_row, start_col), grid.cells)
-        cells = np.stack(np.divmod(found.cells, grid.cols), axis=1)
-        diagonal = 1.0 if self._config.edge == "paper" else np.sqrt(2.0)
-        lengths = np.where(np.abs(np.diff(cells, axis=0)).sum(axis=1) > 1, diagonal, 1.0)
-        bound = found.lower_bound_s if found.status == "ok" else 0.0
-        status = TargetStatus.LETHAL if found.status == "lethal_goal" else RouteStatus(found.status)
-        return FoundRoute(status, cells, found.cost_s, bound, float(lengths.sum()) * grid.resolution_m)
+        at, to = (grid.cell(*end) if grid.inside(*end) else -1 for end in (start, goal))
+        found = self._goals.ask(to, at, grid.cells)
+        return self._found(start, found.route, found.lethal_goal)
 
     def _cell(self, row: int, col: int) -> int:
         """The index of a cell. Raises OutsideGridError outside."""
@@ -232,7 +227,7 @@ class RouteFinder:
             grown = tree.full_job(self._target)()
             tree.adopt(grown, pace, self._target, [], self._version, [])
         if tree.wants_strides:
-            tree.take_strides(tree.stride_job().run())
+            tree.take_strides(tree.stride_job()())
 
 
 def _whole(row: Any, col: Any) -> tuple[int, int]:

@@ -10,32 +10,24 @@ import msgspec
 
 from planner_service.planner import Answer, Planner
 from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
+from planner_service.planning_process import PlanningProcess
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.strides import StrideSearch
+from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
-from shared_map.learning.learned_factors import LearnedGauges
-from shared_map.replication.mark_filter import MarkFilter, readable_for_target
-from shared_map.replication.replica import MapReplica
-from shared_map.replication.replica_sync import MapSync
+from shared_map.replication.mark_filter import readable_for_target
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
-from shared_map.vehicle_class_grounds import class_terrains
-from shared_map.vehicle_class_maps import ClassMaps
 from shared_map.vehicle_presence import Presence
 from swarm.bus.bus import Asked, Bus, Event, Heard, LinkChanged, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
-from swarm.config.vehicle_classes import GROUND, class_numbers
+from swarm.config.vehicle_classes import GROUND
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
-from swarm.runtime.election import Candidacy
-from swarm.runtime.membership import Member
-from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
@@ -56,7 +48,6 @@ from swarm.wire.topics import (
     NAMELESS_COST,
     NAMELESS_ROUTE,
     POSE,
-    PUSHED_ROUTE,
     ROUTE,
     SIGHTED,
     STATUS,
@@ -74,13 +65,11 @@ _AT_ONCE, _ROUTE_COST = 1 << 16, 64
 """Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
 
 
-class PlannerService:
+class PlannerService(PlanningProcess):
     """Serves routes and costs to the target that the process is named after.
 
     stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
                   model is used
-    all_kernels   whether all kernels may be called by now, not only those for whole trees; if not given, they may
-    class_kernels whether those for whole trees of all classes may, not only of "ground"; if not given, they may
     """
 
     def __init__(
@@ -92,31 +81,19 @@ class PlannerService:
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
         all_kernels: Callable[[], bool] | None = None,
-        class_kernels: Callable[[], bool] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
-        scenario = setup.scenario
-        self._target = job_of(setup.id)
-        self._scenario, self._incarnation = scenario, setup.incarnation
-        self._stopwatch, self._prepared = stopwatch, prepared
-        self._all_kernels = all_kernels or (lambda: True)
-        # The network: this process among the others, and who of the target's planners leads.
-        self._bus, self._post, self._worker = bus, post, worker
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
-        self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
-        self.counters = self._member.counters
-        # The map, of each class of vehicles.
-        self._cost_map = CostMap(terrain, learning=scenario.map.learning)
+        scenario, self._target = setup.scenario, job_of(setup.id)
         self._heard_groups = readable_for_target(scenario, self._target)
-        filter = MarkFilter(terrain.grid, self._heard_groups)
-        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
-        self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        key = {"target": self._target}
+        served = dict.fromkeys((ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST), key)
+        super().__init__(setup, terrain, bus, post, worker, self._heard_groups, served, all_kernels)
+        self._stopwatch, self._prepared = stopwatch, prepared
         # Position of the target.
         self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
         self._untracked = self._target in scenario.untracked
-        self._sightings = Sightings(filter)
-        self._presence = Presence(_PRESENCE_NS, filter)
+        self._sightings = Sightings(self._mark_filter)
+        self._presence = Presence(_PRESENCE_NS, self._mark_filter)
         """Positions of vehicles that may see the target; empty for a target that has a tracker."""
         self._listens = False
         """True if it subscribes to positions and views of vehicles."""
@@ -125,32 +102,23 @@ class PlannerService:
         """Faults of the strategy's plug-in that are not reported yet."""
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
-        tree = self._new_tree(self._cost_map)
+        tree = self._new_tree(self._cost_maps[GROUND])
         if prepared is not None:
             tree.share(prepared.cell_cost)
         hidden = hidden_target(scenario, self._target, setup.incarnation)
         self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
-        self._planner = self._new_planner(GROUND, self._cost_map, tree)
-        self._planners = ClassPlanners(
-            self._planner, self._begin_class, self._maps.of, class_kernels or (lambda: True)
-        )
-        self._obedience = OrderClient(setup, bus, post, self._obeys)
+        self._planner = self._new_planner(GROUND, self._cost_maps[GROUND], tree)
+        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._all_kernels)
         self._obeyed_version = 0
         self._removed = False
         """True if its target was removed: then it serves no queries."""
-        self._now_ns = 0
         self._forced = False
         """True if another than an agent has forced the tree to grow since the last tick."""
         self._served = False
         self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
-        self._stride_searches: dict[str, StrideSearch] = {}
-        """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
-        self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
-        self._member.needs("the shared map", lambda: self._sync.joined)
         self._member.needs(f"a tree of {self._target}", lambda: self._planner.tree.ready or self._served_by_search)
-        self._learned = LearnedGauges(self._cost_map.keys, self.counters)
 
     def _new_tree(self, cost_map: CostMap) -> TargetTree:
         return TargetTree(
@@ -176,7 +144,6 @@ class PlannerService:
             route_cells=scenario.vehicles.route_cells,
             stopwatch=self._stopwatch,
             newest_mark_ns=self._replica.take_newest_stamp_ns if is_ground else lambda: None,
-            shelf=self._prepared if is_ground else None,
             leads=False,
             target_search=self._search,
             vehicle_class=name,
@@ -184,7 +151,7 @@ class PlannerService:
 
     def _begin_class(self, name: str) -> Planner:
         """Makes the planner of a class at its first query."""
-        cost_map = self._maps.of[name]
+        cost_map = self._cost_maps[name]
         planner = self._new_planner(name, cost_map, self._new_tree(cost_map))
         planner.lead(self._planner.leads)
         self._pace(planner)
@@ -196,20 +163,13 @@ class PlannerService:
         """Returns True if there need not be a tree: the target is searched for, or was removed."""
         return self._untracked or self._removed
 
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
-
     def start(self, now_ns: int) -> None:
-        self._member.join()
-        self._sync.start(now_ns)
         if self._untracked:
             self._listen(True)
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
-        self._obedience.start(now_ns)
-        self._candidacy.start()
-        self._lead(self._candidacy.leads, now_ns)
+        super().start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
@@ -223,16 +183,11 @@ class PlannerService:
                 self._on_sighted(sighted, now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns):
                 self._on_grown(tag, grown, took_ns, now_ns)
-            case WorkDone(tag=tag, result=StrideSearch() as search):
-                self._on_strides(tag, search)
-            case _ if not self._member.on_member_event(event):
-                # Each takes its own.
-                handlers = (
-                    self._sync.on_map_event,
-                    self._candidacy.on_election_event,
-                    self._obedience.on_order_event,
-                )
-                any(handle(event, now_ns) for handle in handlers)
+            case WorkDone(tag=tag, result=StrideNetwork() as found):
+                if (asked_by := self._asked_by(tag)) is not None:
+                    asked_by.adopt_strides(found)
+            case _:
+                super().handle(event, now_ns)
 
     def _on_grown(self, tag: str, grown: GrownTree, took_ns: int, now_ns: int) -> None:
         planner = self._asked_by(tag)
@@ -240,17 +195,9 @@ class PlannerService:
             self._perform(planner, planner.adopt(grown, took_ns, now_ns), now_ns)
         self._answer(now_ns)
 
-    def _on_strides(self, tag: str, search: StrideSearch) -> None:
-        self._finding_strides = None
-        planner = self._asked_by(tag)
-        if search.network is not None and planner is not None:
-            del self._stride_searches[tag]
-            planner.adopt_strides(search)
-
     def tick(self, now_ns: int) -> None:
         self._take_collected(now_ns)
-        self._sync.tick(now_ns)
-        self._learned.tick(self._cost_map.factors)
+        self._take_map(now_ns)
         self._sightings.expire(now_ns)
         self._take_fleet(now_ns)
         self._obey()
@@ -261,11 +208,9 @@ class PlannerService:
         self._planners.drop_unused(now_ns)
         for _, planner in self._planners:
             self._perform(planner, planner.tick(now_ns), now_ns)
-        self._now_ns = now_ns
         self._obedience.tick(now_ns)
         self._forced = False
         self._answer(now_ns)
-        self._look_for_strides()
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
@@ -280,7 +225,7 @@ class PlannerService:
         if lethal is None or not self._candidacy.leads:
             self._member.alarms.end("target-lethal", self._target, now_ns)
             return
-        grid = self._cost_map.grid
+        grid = self._cost_maps[GROUND].grid
         shown = [f"cell:{row},{col}" for row, col in (grid.row_col(each) for each in lethal if each is not None)]
         nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
         text = f"no vehicle can reach {self._target} on lethal ground at {shown[0]}; {nearest}"
@@ -296,22 +241,13 @@ class PlannerService:
             if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
                 self._planners.used(name, now_ns).on_chasers(heard.message, now_ns)
 
-    def _look_for_strides(self) -> None:
-        for tag in list(self._stride_searches):
-            if self._asked_by(tag) is None:
-                del self._stride_searches[tag]
-        if self._finding_strides is None and self._stride_searches:
-            self._finding_strides, search = next(iter(self._stride_searches.items()))
-            model_ns = self._planner.tree.times.model_ns
-            self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
-
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         if not self._listens or not self._sightings.receive(sighted, now_ns):
             return  # a tracker knows better
         seen = self._sightings.best(now_ns)
         for each in seen.values():
             self._watch.on_sighting(pose_of(each), now_ns)
-        if not seen and 0 <= sighted.cell < self._cost_map.grid.cells:
+        if not seen and 0 <= sighted.cell < self._cost_maps[GROUND].grid.cells:
             self._search.remember(sighted, now_ns)
 
     def _tag(self, work: str, name: str) -> str:
@@ -362,8 +298,7 @@ class PlannerService:
             name = request.vehicle_class
             fault = self._planners.fault(name)
             if fault is not None:
-                event.refuse(fault)
-                event.end()
+                self._refuse(event, fault)
                 continue
             planner = self._planners.used(name, now_ns)
             crowded = len(self._held) + len(held) - n > _MOST_HELD
@@ -421,25 +356,17 @@ class PlannerService:
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
         for _, event in self._held:
-            event.refuse(f"{event.topic.name}: the planner ends")
-            event.end()
+            self._refuse(event, f"{event.topic.name}: the planner ends")
         if self._planner.leads:
             self._tell_status(self._planner.status(now_ns))
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
-        """Serves the target, or leave that to another. A query which comes meanwhile is answered all the same."""
-        if leads == self._planner.leads:
-            return
-        self._watch.leads = leads
-        for _, planner in self._planners:
-            planner.lead(leads)
-        for topic in (ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST):
-            if leads:
-                self._bus.serve(topic, self._post, undecoded=True, target=self._target)
-            else:
-                self._bus.unserve(topic, target=self._target)
-        self._candidacy.tell(self._member, now_ns)
+        if leads != self._leads:
+            self._watch.leads = leads
+            for _, planner in self._planners:
+                planner.lead(leads)
+        super()._lead(leads, now_ns)
 
     def _tell_status(self, status: PlannerStatus) -> None:
         """Publishes the status of "ground", with the vehicles of all classes."""
@@ -453,12 +380,12 @@ class PlannerService:
             match action:
                 case GrowTree(job):
                     self._worker.submit(self._tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
-                case FindStrides(search):
-                    self._stride_searches[self._tag(_STRIDES, name)] = search
+                case FindStrides(job):
+                    self._worker.submit(self._tag(_STRIDES, name), job, self._post, planner.tree.times.model_ns)
                 case PlannerStatus() if name != GROUND:
                     pass  # the planner of "ground" has published the same about the target
-                case PushedRoute(vehicle=vehicle) as pushed:
-                    self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
+                case PushedRoute() as pushed:
+                    self._push(pushed)
                 case PlannerStatus() as status:
                     self._tell_status(status)
                 case Believed() as believed:

@@ -137,16 +137,14 @@ ROWS: Mapping[str, StrategyRow] = {
 }
 """Every strategy of one row; `auto` goes through those of `STAGES`."""
 
-Stage = Literal["exact", "rotate", "coarsen"]
+Stage = Literal["exact", "rotate"]
 
-_ROTATE = StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True)
 STAGES: Mapping[Stage, StrategyRow] = {
     "exact": StrategyRow(OnMove.EXACT_MOVE, renews_loose_bounds=True, stops_at_askers=True),
-    "rotate": _ROTATE,
-    "coarsen": replace(_ROTATE, thins_far_cells=True),
+    "rotate": StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True),
 }
-"""`auto`: exact moves while one fits into a tick; then windows, with exact trees in turn; and where these come so
-seldom that the target leaves what the widest window can make up for, strides beyond that."""
+"""`auto`: exact moves while one fits into a tick; then windows, with exact trees in turn
+(docs/method/paper.md says why no strides)."""
 
 HYSTERESIS = 0.7
 """`auto` returns to the better stage only below this share of the budget: times are noisy."""
@@ -163,16 +161,9 @@ class Auto:
         self.stage: Stage = "exact"
 
     def row(self, growths: Growths) -> StrategyRow:
-        often = max(growths.moves_per_tick, 1e-9)
-        slowest_exact = growths.budget_ns / often
-        # A window is due once the target has come an `AHEAD`th of its width.
-        slowest_rotation = max(slowest_exact * growths.widest_cells / AHEAD, slowest_exact)
-        if growths.exact_ns <= slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
-            self.stage = "exact"
-        elif growths.full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
-            self.stage = "coarsen"
-        else:
-            self.stage = "rotate"
+        slowest_ns = growths.budget_ns / max(growths.moves_per_tick, 1e-9)
+        exact = growths.exact_ns <= slowest_ns * (1.0 if self.stage == "exact" else HYSTERESIS)
+        self.stage = "exact" if exact else "rotate"
         return STAGES[self.stage]
 
 

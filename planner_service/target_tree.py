@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.route_bounds import LowerBounds, read_routes
-from planner_service.tree.strides import StrideNetwork, StrideSearch, StrideShelf, StrideUpkeep
+from planner_service.tree.strides import StrideNetwork, find_strides
 from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -157,8 +158,9 @@ class TargetTree:
         self._state = State.STALE
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
-        # The networks of strategies that thin far cells.
-        self._strides = StrideUpkeep()
+        # The network of strategies that thin far cells; None until it is found.
+        self._network: StrideNetwork | None = None
+        self._seeks_network = False
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
         self._windows = WindowLimit(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
@@ -226,15 +228,16 @@ class TargetTree:
     @property
     def wants_strides(self) -> bool:
         """Please run `stride_job` on a worker, and `take_strides` once it has found them."""
-        return self.strategy.thins_far_cells and self._loaded and self._strides.wanted
+        return self.strategy.thins_far_cells and self._loaded and not self._seeks_network
 
-    def stride_job(self, shelf: StrideShelf | None = None) -> StrideSearch:
-        """See `StrideUpkeep.search`."""
-        return self._strides.search(self._costs, shelf)
+    def stride_job(self) -> Callable[[], StrideNetwork]:
+        """Returns the one search of this tree, for a worker: marks make its result less good, never wrong."""
+        self._seeks_network = True
+        return partial(find_strides, self._costs.snapshot())
 
-    def take_strides(self, search: StrideSearch) -> None:
-        """Goes by the networks that were found."""
-        self._strides.take(self._costs, search)
+    def take_strides(self, found: StrideNetwork) -> None:
+        """Goes by the network that was found."""
+        self._network = found
 
     def adopt(
         self,
@@ -345,7 +348,6 @@ class TargetTree:
             return None
         changes = self._costs.apply(pace, dirty)
         self._growth.learn(changes)
-        self._strides.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
         self._learn_bounds(changes)
@@ -447,10 +449,6 @@ class TargetTree:
     def _is_quick(self) -> bool:
         """Returns True if a whole tree may be searched here."""
         return self.times.is_quick(self._grid.cells)
-
-    @property
-    def _network(self) -> StrideNetwork | None:
-        return self._strides.network
 
     def _prepared(self, tree: CostToGoTree) -> CostToGoTree:
         """A tree before a window makes its costs upper bounds: they are taken for a heuristic if they are exact."""

@@ -81,3 +81,11 @@ def check_writable(folder: Path, size: int = _PROBE_BYTES, *, file: Path | None 
         finally:
             with contextlib.suppress(OSError):
                 probe.unlink()
+
+
+def discard_output(*descriptors: int) -> None:
+    """Makes descriptors of this process lead nowhere, for all who write to them, native libraries included."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in descriptors:
+        os.dup2(nowhere, descriptor)
+    os.close(nowhere)

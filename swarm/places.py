@@ -2,7 +2,7 @@
 
     46.81230,9.84560     latitude and longitude, WGS 84 (on another planet or moon, its own degrees)
     xy:779610,190390     metres of the map: the terrain's coordinate system
-    cell:40,200          row and column from the north-west corner; cell:40.5,200.5 is the middle of that cell
+    cell:40,200          row and column from the north-west corner; of an area's corner also cell:40.5,200.5
 
 Two bare whole numbers may be a row and a column as well: they are what lies in the terrain. A text that fits both
 is refused. Without a coordinate system two bare numbers are metres of the map.
@@ -83,7 +83,7 @@ def read_place(given: Given, what: str) -> Place:
         return given
     if not isinstance(given, str):
         row, col = given[0], given[1]
-        return Place(f"[{row}, {col}]", "cell", row, col, True)
+        return Place(f"[{row}, {col}]", "cell", row, col, row == int(row) and col == int(col))
     match = _PLACE.fullmatch(given.strip())
     if match is None:
         comma = re.sub(r"(?<=[\d.])[\s;]+(?=[-+.\d])", ",", given.strip(), count=1)
@@ -99,9 +99,11 @@ def read_place(given: Given, what: str) -> Place:
 
 
 def cell_of(given: Given, frame: Frame, what: str) -> int:
-    """Returns the cell that a user names. Raises ConfigError as `read_place`, and if the place is outside the
-    terrain."""
+    """Returns the cell that a user names. Raises ConfigError as `read_place`, if the place is outside the terrain,
+    and on a row or column that is no whole number: half a row may be half a map away."""
     place, grid = read_place(given, what), frame.grid
+    if place.kind == "cell" and not place.whole:
+        raise ConfigError(f"{what} is {_shown(place)}; expected whole numbers: a row and a column")
     kinds = _kinds_of(place, grid)
     cells = {kind: cell for kind in kinds if (cell := _cell_at(_corner(place, kind, frame, what), grid)) >= 0}
     if not cells:

@@ -1,6 +1,7 @@
 """The messages in which an agent tells where its vehicles are.
 
-`Chasers` go to each planner, one per target; `Fleet` to all who watch, one per region.
+`Chasers` go to each planner, one per target, and to the process that plans to places; `Fleet` to all who watch, one
+per region.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import NO_TARGET, Chasers, Fleet
-from vehicle_agent.driving.driven_vehicle import Places
+from vehicle_agent.driving.driven_vehicle import Places, goal_of
 
 HEARTBEAT_NS = NS_PER_S
 """Interval of messages about a target whose chasers are at rest: the planner's lease is five times as long."""
@@ -33,9 +34,9 @@ class ChasersReport:
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
-        self._told: dict[str, tuple[dict[str, int], int]] = {}
-        """Target -> the cells of its chasers in its planner's last message, and the time; for all that have
-        chasers."""
+        self._told: dict[str | None, tuple[dict[str, int], list[int], int]] = {}
+        """Target -> the cells and goals of its chasers in its planner's last message, and the time; for all that
+        have chasers. None: of vehicles that go to places."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
         """Returns due messages: about targets that a vehicle has taken or left, whose planner knows a cell that a
@@ -43,17 +44,26 @@ class ChasersReport:
 
         vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
         """
-        chasers: dict[str, dict[str, Sequence[int]]] = {target: {} for target in self._told}
+        chasers: dict[str | None, dict[str, Sequence[int]]] = {target: {} for target in self._told}
+        goals: list[int] = []
         for id, target, path in vehicles:
             if target is not None and path:
-                chasers.setdefault(target, {})[id] = path
+                goal = goal_of(target)
+                goals += [] if goal is None else [goal]
+                chasers.setdefault(target if goal is None else None, {})[id] = path
         for target, paths in chasers.items():
             told = self._told.get(target)
-            if told is not None and now_ns - told[1] < HEARTBEAT_NS and _holds(told[0], paths):
+            places = goals if target is None else []
+            if (
+                told is not None
+                and now_ns - told[2] < HEARTBEAT_NS
+                and told[1] == places
+                and _holds(told[0], paths)
+            ):
                 continue
             cells = {id: path[-1] for id, path in paths.items()}
             if cells:
-                self._told[target] = cells, now_ns
+                self._told[target] = cells, places, now_ns
             else:
                 del self._told[target]
             yield Chasers(
@@ -63,6 +73,7 @@ class ChasersReport:
                 ids=list(cells),
                 cells=pack_column(list(cells.values()), "<u4"),
                 vehicle_class=self._vehicle_class,
+                goals=pack_column(places, "<u4"),
             )
 
 

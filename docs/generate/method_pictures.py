@@ -61,7 +61,7 @@ class Chase:
         if done.wants_full:
             done = self.tree.adopt(self.tree.full_job(cell)(), self.pace, cell, [], 0, [])
         if self.tree.wants_strides:
-            self.tree.take_strides(self.tree.stride_job().run())
+            self.tree.take_strides(self.tree.stride_job()())
         self.widths.append(done.window.row1 - done.window.row0)
         return done
 

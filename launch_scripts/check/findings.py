@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
+
+from rich.console import Console
+from rich.text import Text
 
 Level = Literal["ok", "warning", "failure"]
 STYLES: dict[Level, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
@@ -40,9 +44,19 @@ def counted(findings: Sequence[Finding], level: Level) -> str:
     return f"{many or 'no'} {level}{'' if many == 1 else 's'}"
 
 
-def as_fields(findings: Sequence[Finding]) -> dict[str, Any]:
-    """For `--json`."""
-    return {
-        "ok": not any(finding.level == "failure" for finding in findings),
-        "findings": [finding._asdict() for finding in findings],
-    }
+def answer(found: Sequence[Finding], as_json: bool, facts: dict[str, Any], summary: str = "") -> int:
+    """Prints a line for each finding, and a last one: how many are wrong, or `summary` where none is a failure.
+    As JSON it has the facts, too. Returns the exit code."""
+    failed = any(finding.level == "failure" for finding in found)
+    if as_json:
+        told = {**facts, "ok": not failed, "findings": [finding._asdict() for finding in found]}
+        print(json.dumps(told, indent=2))
+        return int(failed)
+    console = Console(soft_wrap=True, highlight=False)
+    for finding in found:
+        console.print(Text.assemble((f"{finding.level}: ", STYLES[finding.level]), finding.sentence))
+    if summary and not failed:
+        console.print(summary)
+    elif len(found) > 1:
+        console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}")
+    return int(failed)

@@ -215,7 +215,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _kernels(runs: Path) -> Said:
+def _planner_kernels(runs: Path) -> Said:
     from planner_service.kernel_build import all_kernels
     from planner_service.kernels.compile import cache_folder, code_folder, is_on_disk
 
@@ -250,7 +250,7 @@ def _memory(runs: Path) -> Said:
     return "ok", f"{size(free)} are free"
 
 
-def _files(runs: Path) -> Said:
+def _open_files(runs: Path) -> Said:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < _ENOUGH_FILES:
         return "warning", f"{soft} at a time, too few for a router of many: `ulimit -n {min(4096, hard)}`"
@@ -317,16 +317,9 @@ def _disk(runs: Path) -> Said:
 
 
 CHECKS: dict[str, Callable[[Path], Said]] = {
-    "python": _python,
-    "packages": _packages,
-    "planner kernels": _kernels,
-    "cores": _cores,
-    "memory": _memory,
-    "open files": _files,
-    "zenoh": _zenoh,
-    "ports": _ports,
-    "clock": _clock,
-    "browser": _browser,
-    "disk": _disk,
-}
-"""The checks, in order."""
+    look.__name__.strip("_").replace("_", " "): look
+    for look in (
+        _python, _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _ports, _clock, _browser, _disk,
+    )
+}  # fmt: skip
+"""The checks by their names, in order."""

@@ -21,15 +21,16 @@ from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.explain import nearest
+from swarm.config.input_files import FileKind, check_file
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
-from swarm.places import cell_of
+from swarm.places import Given, cell_of
 from swarm.plugins.find import find_plugin
-from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Plots, fitting_regions
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Shards, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 _MOST_STEPS_CELLS = 1 << 21
@@ -62,17 +63,17 @@ def _of_source(name: str) -> Iterator[Finding]:
 
 
 def _of_file(key: str, path: Path) -> Iterator[Finding]:
-    if not path.exists():
-        yield failure(key, f"no such file {path}")
-    elif not path.is_file():  # to open a pipe waits for a writer
-        what = "a folder" if path.is_dir() else "a device or pipe"
-        yield failure(key, f"found {path}, it is {what}; expected a file")
-    else:
-        try:
-            with path.open("rb"):
-                pass
-        except OSError as error:
-            yield failure(key, f"cannot read {path}: {error.strerror or error}")
+    kind = FileKind.VECTORS if "zones" in key else FileKind.POINTS
+    if key == "cost.slope_csv":
+        kind = FileKind.SLOPE_TABLE
+    try:
+        check_file(path, kind)
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        yield failure(key, str(kind.unreadable(path, error)))
+    except SwarmError as error:
+        yield failure(key, str(error))
 
 
 def places_counted(scenario: Scenario) -> Iterator[Finding]:
@@ -185,15 +186,15 @@ def places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | N
     yield from _vehicles(scenario, terrain.grid, grounds)
 
 
-def plots(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
-    """More plots of right of way than the agents have use for."""
+def shards(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
+    """More shards of right of way than the agents have use for."""
     agents = sum(not flies(scenario, plan.group.vehicle_class) for plan in plan_agents(scenario))
     fitting = fitting_regions(grid.rows, grid.cols, agents)
-    if agents >= FEWEST_FOR_MAJORITY and fitting > scenario.map.plot_regions:  # fewer keep plots for themselves
-        many = Plots(grid, (), scenario.map.plot_regions * REGION_CELLS).count
+    if agents >= FEWEST_FOR_MAJORITY and fitting > scenario.map.shard_regions:  # fewer keep shards for themselves
+        many = Shards(grid, (), scenario.map.shard_regions * REGION_CELLS).count
         yield warning(
-            "map.plot_regions",
-            f"{agents} agents share {many} plots of right of way, and speak of each in which vehicles drive"
+            "map.shard_regions",
+            f"{agents} agents share {many} shards of right of way, and speak of each in which vehicles drive"
             f" {scenario.vehicles.tick_hz:g} times a second; set it to {fitting}, for larger ones",
         )
 
@@ -243,45 +244,29 @@ def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) 
         if target.start is None:
             continue
         key = f"targets[{n}].start"
-        try:
-            cell = cell_of(target.start, frame, key)
-        except ConfigError as error:
-            yield failure("", str(error))
-            continue
-        place = grid.row_col(cell)
-        shown = _shown(target.start, place)
-        if closed[place]:
-            yield failure(key, f"{shown} is lethal{_near(closed, place)}")
-        elif not homes[place]:
+        place, shown, fault = _start(target.start, frame, key, closed)
+        if fault is None and not homes[place]:
             part = "the largest part of the terrain that can be driven"
-            yield failure(key, f"no way leads to {shown} from {part}, where vehicles start{_near(~homes, place)}")
+            fault = failure(key, f"no way leads to {shown} from {part}, where vehicles start{_near(~homes, place)}")
+        yield from [fault] if fault else []
 
 
 def _vehicles(scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGround]) -> Iterator[Finding]:
-    frame, taken = MapFrame(grid), dict[int, str]()
+    frame, taken = MapFrame(grid), dict[tuple[int, int], str]()
     refused = False
     for n, group in enumerate(scenario.groups):
         key, own = f"groups[{n}].cells", grounds[group.vehicle_class]
         closed, homes = np.isinf(own.truth) | own.terrain.lethal, own.homes
+        whom = "" if group.vehicle_class == GROUND else f" to the class {group.vehicle_class}"
         for given in group.cells:
-            try:
-                cell = cell_of(given, frame, key)
-            except ConfigError as error:
-                refused = True
-                yield failure("", str(error))
-                continue
-            place = grid.row_col(cell)
-            shown = _shown(given, place)
-            if cell in taken:
-                refused = True
-                yield failure(key, f"{shown} is given twice, here and in {taken[cell]}")
-            elif closed[place]:
-                refused = True
-                whom = "" if group.vehicle_class == GROUND else f" to the class {group.vehicle_class}"
-                yield failure(key, f"{shown} is lethal{whom}{_near(closed, place)}")
-            elif not homes[place]:
-                yield warning(key, f"{shown} is cut off from the largest part that can be driven")
-            taken[cell] = key
+            place, shown, fault = _start(given, frame, key, closed, whom)
+            if fault is None and place in taken:
+                fault = failure(key, f"{shown} is given twice, here and in {taken[place]}")
+            refused |= fault is not None
+            if fault is None and not homes[place]:
+                fault = warning(key, f"{shown} is cut off from the largest part that can be driven")
+            yield from [fault] if fault else []
+            taken[place] = key
     if refused:
         return
     try:
@@ -290,8 +275,17 @@ def _vehicles(scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGro
         yield failure("", str(error))
 
 
-def _shown(given: object, place: tuple[int, int]) -> str:
-    return str(list(place)) if not isinstance(given, str) else f"{given!r}, {list(place)},"
+def _start(
+    given: Given, frame: MapFrame, key: str, closed: Bools, whom: str = ""
+) -> tuple[tuple[int, int], str, Finding | None]:
+    """Row and column of a start, the start in words, and the failure if none can start there."""
+    try:
+        place = frame.grid.row_col(cell_of(given, frame, key))
+    except ConfigError as error:
+        return (-1, -1), "", failure("", str(error))
+    shown = str(list(place)) if not isinstance(given, str) else f"{given!r}, {list(place)},"
+    lethal = failure(key, f"{shown} is lethal{whom}{_near(closed, place)}") if closed[place] else None
+    return place, shown, lethal
 
 
 def _near(closed: Bools, place: tuple[int, int]) -> str:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import importlib
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from swarm.config.agents import AgentPlan
     from swarm.config.scenario import Scenario
 
 Completion = Callable[[typer.Context, str], list[str]]
@@ -59,31 +60,26 @@ def runs(ctx: typer.Context, incomplete: str) -> list[str]:
     return [name for name in sorted(names, reverse=True) if name.startswith(incomplete)]
 
 
-def target_ids(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Targets of the scenario that is named, or of the newest run."""
-    scenario = _scenario(ctx)
-    return [] if scenario is None else [id for id in scenario.target_ids if id.startswith(incomplete)]
+def _ids(of: Callable[[Scenario], Iterable[str]]) -> Completion:
+    """Names of the scenario that is named, or of the newest run."""
+
+    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
+        scenario = _scenario(ctx)
+        return [] if scenario is None else [id for id in of(scenario) if id.startswith(incomplete)]
+
+    return offered
 
 
-def agent_ids(ctx: typer.Context, incomplete: str) -> list[str]:
+def _plans(scenario: Scenario) -> Sequence[AgentPlan]:
     from swarm.config.agents import plan_agents
 
-    scenario = _scenario(ctx)
-    return [] if scenario is None else [plan.id for plan in plan_agents(scenario) if plan.id.startswith(incomplete)]
+    return plan_agents(scenario)
 
 
-def vehicle_ids(ctx: typer.Context, incomplete: str) -> list[str]:
-    from swarm.config.agents import plan_agents
-
-    scenario = _scenario(ctx)
-    plans = [] if scenario is None else plan_agents(scenario)
-    return [id for plan in plans for id in plan.vehicle_ids if id.startswith(incomplete)]
-
-
-def group_names(ctx: typer.Context, incomplete: str) -> list[str]:
-    scenario = _scenario(ctx)
-    names = [] if scenario is None else [group.name for group in scenario.groups]
-    return [name for name in names if name.startswith(incomplete)]
+target_ids = _ids(lambda scenario: scenario.target_ids)
+group_names = _ids(lambda scenario: [group.name for group in scenario.groups])
+agent_ids = _ids(lambda scenario: [plan.id for plan in _plans(scenario)])
+vehicle_ids = _ids(lambda scenario: [id for plan in _plans(scenario) for id in plan.vehicle_ids])
 
 
 def words(module: str, name: str) -> Completion:

@@ -7,7 +7,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import pairwise
 from typing import Any
 
@@ -15,14 +15,22 @@ import typer
 from typer.exceptions import TyperException
 
 from launch_scripts.command_line.declaring import ENVIRONMENT
-from launch_scripts.command_line.old_names import current, meant
 from launch_scripts.plain_text import plain
-from swarm.config.explain import nearest
+from swarm.config.explain import choice, nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
+from swarm.files import discard_output
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
+_SYNONYMS = {
+    "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
+    "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
+    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
+    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
+    "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
+}  # fmt: skip
+"""Word that other programs have, or we had -> our words, the first of which that a group knows is meant."""
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -39,10 +47,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     _fill_streams()
     try:
         try:
-            words, told = current(sys.argv[1:])
-            for sentence in told:
-                print(f"swarm: {sentence}", file=sys.stderr)
-            code = command().main(args=words, prog_name=name, standalone_mode=False)
+            code = command().main(prog_name=name, standalone_mode=False)
         finally:
             sys.stdout.flush()
     except TyperException as error:
@@ -63,7 +68,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         print(f"swarm: this needs {missing(package)}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:
-        _leave_output()
+        discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
         return 0
     except OSError as error:
         if error.errno in _NO_PATHS and error.filename is not None:
@@ -71,7 +76,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             return ConfigError.exit_code
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
             raise
-        _leave_output()
+        discard_output(1)
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
     except KeyboardInterrupt:
@@ -95,9 +100,9 @@ def _sentence(error: TyperException) -> str:
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
     elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
-        said = said.removesuffix(".") + meant(unknown[1], ctx.command.commands)
+        said = said.removesuffix(".") + _meant(unknown[1], ctx.command.commands)
     elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
-        names = [name for each in ctx.command.params if not getattr(each, "hidden", False) for name in each.opts]
+        names = [name for each in ctx.command.params for name in each.opts]
         said = f"No such option: {option}{nearest(option, names)}"
     for before, word in pairwise(sys.argv):
         if re.fullmatch(r"\S*\d,", before) and re.fullmatch(r"[-+.\d]+", word):
@@ -106,6 +111,14 @@ def _sentence(error: TyperException) -> str:
         return said
     said = re.sub(r"(?<!\.)\.$", "", said)
     return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
+
+
+def _meant(word: str, known: Collection[str]) -> str:
+    """Returns the end of a sentence about an unknown command: the command which is meant, or all that are known."""
+    file = (f"up {word}", f"info {word}") if "." in word else ()
+    found = (each for each in _SYNONYMS.get(word, file) if each.split()[0] in known or each[0] in "-.")
+    synonym = next(found, None)
+    return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"
 
 
 def _given_by(said: str) -> str:
@@ -130,10 +143,3 @@ def _fill_streams() -> None:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
             setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
-
-
-def _leave_output() -> None:
-    """Sends what still waits to be printed nowhere: the interpreter would complain about it at its end."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)

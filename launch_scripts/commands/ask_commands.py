@@ -7,7 +7,7 @@ import os
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -38,10 +38,6 @@ CPU without any query."""
 def route(
     where: Where,
     target: TargetId = None,
-    row: Annotated[int | None, typer.Option(hidden=True)] = None,
-    col: Annotated[int | None, typer.Option(hidden=True)] = None,
-    steps: Annotated[int, typer.Option(min=0)] = 0,
-    cost: bool = False,
     terrain: str | None = None,
     start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
     end: Annotated[str | None, typer.Option("--to", metavar="PLACE")] = None,
@@ -56,15 +52,11 @@ def route(
 
     swarm route --target t3 --from cell:40,200
 
-    swarm route --target t3 --from 36.41,-84.29 --steps 1
-
     swarm route --target t3 --from cell:40,200 --json | jq .routes[0].cost_s
 
     swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
 
     target         The target, such as t3.
-    steps          Most steps to show; 1 is the next, 0 is all.
-    cost           Print only the cost, or that no path exists.
     terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
     start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
     end            Instead of a target: the destination, in the same forms as --from.
@@ -78,27 +70,23 @@ def route(
 
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png")
     if terrain is not None:
-        if start is None or end is None or target is not None or row is not None or col is not None:
+        if start is None or end is None or target is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
         terrain_routes.print_route(terrain_routes.find_route(terrain, start, end, preset), out, as_json)
         return
     if preset is not None:
         raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
-    by_cell = row is not None and col is not None
-    to_place = end is not None and not cost
-    if (target is None) != to_place or (start is None) == (not by_cell) or (cost and out is not None):
+    if (target is None) == (end is None) or start is None:
         raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
-    place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
+    place = read_place(start, "--from")
     from launch_scripts.commands import swarm_route
 
     goal = None if end is None else read_place(end, "--to")
     with where.bus() as bus:
         if goal is not None:
-            answer = swarm_route.ask_place(bus, where, place, goal, steps=steps, vehicle_class=vehicle_class)
+            answer = swarm_route.ask_place(bus, where, place, goal, vehicle_class)
         elif target is not None:
-            answer = swarm_route.ask_planner(
-                bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
-            )
+            answer = swarm_route.ask_planner(bus, where, target, place, vehicle_class)
     if out is not None:
         swarm_route.write(answer, out)
     if as_json:
@@ -242,7 +230,7 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     router."""
     from launch_scripts.observe.run_observer import OutsideObserver
     from launch_scripts.web.health_verdict import Process
-    from launch_scripts.web.prometheus import MetricsEndpoint, families, figures_of
+    from launch_scripts.web.prometheus import MetricsEndpoint, families
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.runtime.health import Health, supervisor_of
@@ -254,11 +242,16 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     try:
         with open_bus(network) as bus:
             clock, observer = MonotonicClock(), OutsideObserver(bus, topics={STATS: 0.0, STATUS: 0.0}, follows=True)
+
+            def figures() -> list[Any]:
+                run, latest = observer.run, observer.latest
+                return families(run, latest, latest.status, latest.up()) if run and latest else []
+
             typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
             told = None
             while True:
                 observer.listen(clock, _TURN_S)
-                endpoint.answer(lambda: families(figures_of(observer.run, observer.latest)))
+                endpoint.answer(figures)
                 health.turned([] if observer.run is not None else ["a run"])
                 if observer.run is not None and observer.run.run_id != told:
                     told = observer.run.run_id

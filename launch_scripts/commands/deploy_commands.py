@@ -23,8 +23,7 @@ from launch_scripts.deploy import certificates, revocations
 from launch_scripts.deploy.host_scenario import CERTIFICATES
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan
-from launch_scripts.deploy.machine_plan import as_json as plan_fields
+from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan, plan_fields
 from launch_scripts.deploy.machines_needed import (
     CELLS_PER_VEHICLE,
     Estimate,
@@ -94,7 +93,10 @@ def plan(
     except ConfigError as error:
         sentence = str(error)
         raise ConfigError(sentence if sentence.startswith(str(hosts)) else f"{hosts}: {sentence}") from error
-    _check_image(image, kit)
+    if image and kit == "systemd":
+        raise ConfigError(f"--image: found {quoted(image)} with --kit systemd, expected none: it has no containers")
+    if image and re.fullmatch(_IMAGE, image) is None:
+        raise ConfigError(f"--image: found {quoted(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
     if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
         raise ConfigError(f"--wheel: found {wheel}, expected a file NAME.whl; `uv build --wheel` makes one")
     if kit != "systemd" and wheel is not None:
@@ -111,13 +113,6 @@ def plan(
         typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
     if out is not None:
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
-
-
-def _check_image(image: str, kit: KitName) -> None:
-    if image and kit == "systemd":
-        raise ConfigError(f"--image: found {quoted(image)} with --kit systemd, expected none: it has no containers")
-    if image and re.fullmatch(_IMAGE, image) is None:
-        raise ConfigError(f"--image: found {quoted(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
 
 
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
@@ -221,7 +216,6 @@ def _show_size(found: Needs) -> None:
         ("between machines, messages/s", found.crossings_per_s),
         ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
         ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
-        ("out, routers each with each, Mbit/s", found.link_mbit_per_s),
         ("out, by a router of the region, Mbit/s", found.link_out_mbit_per_s),
         ("sessions of a router", found.sessions),
     ):

@@ -11,9 +11,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import typer
 
 from launch_scripts.command_line.declaring import command, family_app
-from launch_scripts.commands.role_commands import check_name
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
+from launch_scripts.observe.run_folder import RUNS
+from launch_scripts.process_table import check_name
+from launch_scripts.stop_requests import stop_requests
+from swarm.bus.endpoints import listening
+from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
@@ -66,7 +70,6 @@ def ros2(
     as_json   With --list: as JSON.
     """
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
-    from launch_scripts.observe.run_folder import RUNS
 
     told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
     chosen = load_settings(settings, {**told, "vehicles": vehicles})
@@ -102,8 +105,6 @@ def _list_topics(settings: Settings, *, as_json: bool) -> None:
 def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
     """Forwards until Ctrl-C. Raises BusError if one of the two sides does not answer at the start."""
     from launch_scripts.gateways.ros2.service import serve
-    from launch_scripts.stop_requests import stop_requests
-    from swarm.bus.endpoints import listening
 
     ros = settings.ros.endpoint
     if ros in network.connect:
@@ -190,7 +191,6 @@ def mavlink(
     from launch_scripts.gateways.mavlink.link import read_address
     from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
     from launch_scripts.gateways.mavlink.service import read_key, run
-    from swarm.config.agents import agent_of
 
     address = read_address(link)
     key = None if vehicle.signing_key is None else read_key(vehicle.signing_key)

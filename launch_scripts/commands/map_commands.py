@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import numpy as np
 import typer
 from rich.console import Console
@@ -88,12 +89,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
         "authors": authors,
         "authors_that_learned": sorted(each.author for each in words if each.kinds),
         "sightings": {
-            each.target: {
-                "row_col": list(divmod(each.cell, grid.cols)),
-                "at": fields_of(frame, each.cell),
-                **{name: getattr(each, name) for name in ("uncertainty_m", "author", "stamp_ns", "until_ns")},
-            }
-            for each in seen
+            each.target: {**msgspec.to_builtins(each), "at": fields_of(frame, each.cell)} for each in seen
         },
     }
     if as_json:

@@ -10,12 +10,14 @@ import json
 import time
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import ORDER, command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, Walk
+from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain
 from swarm.errors import ConfigError
 
@@ -37,7 +39,6 @@ Id = Annotated[
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
-AsScenario = Annotated[bool, typer.Option(hidden=True)]
 
 
 @command(short, ORDER)
@@ -70,10 +71,7 @@ def resume(where: Where, as_json: AsJson = False) -> int:
 def group(
     name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
     where: Where,
-    targets: Annotated[
-        list[str] | None, typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)
-    ] = None,
-    as_scenario: AsScenario = False,
+    targets: Annotated[list[str], typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)],
     as_json: AsJson = False,
 ) -> int:
     """Set the targets that the vehicles of a group may chase.
@@ -81,22 +79,16 @@ def group(
     swarm order group red t1 t2
 
     name     The group.
-    targets  The targets that it may chase.
+    targets  The targets that it may chase. `swarm order unset groups.NAME` restores those of the scenario.
     """
-    chosen = list(targets or ())
-    if chosen[:1] == ["targets"]:
-        chosen = chosen[1:]
-    if as_scenario == bool(chosen):
-        raise ConfigError(f"group: give targets; `swarm order unset groups.{name}` restores those of the scenario")
-    return give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
+    return give(where, as_json, {"subject": "group", "name": name, "targets": targets})
 
 
 @command(app, name="set", context_settings={"ignore_unknown_options": True})  # a number below 0 is no option
 def set_(
     key: Key,
     where: Where,
-    value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
-    as_scenario: AsScenario = False,
+    value: Annotated[float, typer.Argument(metavar="VALUE")],
     as_json: AsJson = False,
 ) -> int:
     """Change a setting of a running swarm.
@@ -106,12 +98,10 @@ def set_(
     swarm order set time_scale 5
 
     key    A key of the scenario, such as time_scale.
-    value  Its new value.
+    value  Its new value. `swarm order unset KEY` restores that of the scenario.
     """
     _check_setting(key)
-    if as_scenario == (value is not None):
-        raise ConfigError(f"set: give a value; `swarm order unset {key}` restores that of the scenario")
-    return give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
+    return give(where, as_json, {"subject": "set", "name": key, "value": value})
 
 
 @command(app)
@@ -144,8 +134,6 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
 
     swarm order ls --json
     """
-    import msgspec
-
     from swarm.runtime.operator import Operator
     from swarm.runtime.order_book import OrderBook, described
 
@@ -210,8 +198,6 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     orders  fields of `GiveOrder`, or those with a `vehicle` of `SendVehicle`
     at      the place that they are about, if any: becomes their `cell`
     """
-    import msgspec
-
     from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
@@ -237,9 +223,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
                 said = {"at": fields_of(frame, cell)}
             with progress("waiting until all processes obey"):
                 operator = Operator(bus)
-                given, acknowledged = (
-                    operator.send(order) if isinstance(order, SendVehicle) else operator.give(order)
-                )
+                given, acknowledged = operator.give(order)
             told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
             printed.append({"given": msgspec.to_builtins(given), **told, **said})
             silent |= bool(acknowledged.silent)
@@ -254,8 +238,6 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
 
 def checked(kind: type[M], fields: dict[str, Any]) -> M:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
-    import msgspec
-
     from swarm.wire.versions import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}
@@ -270,7 +252,6 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
 def print_obeyed(acknowledged: Acknowledged) -> int:
     """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
-    from launch_scripts.plain_text import unanswered
     from swarm.runtime.operator import OBEY_S
 
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3

@@ -10,12 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
+from launch_scripts.launcher.console import REPORTED, progress
+from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
 from swarm.config.explain import choice
+from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -29,7 +35,7 @@ RunArgument = Annotated[
         metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
     ),
 ]
-_ROW = "{:<22} {:>4} {:>9} {:>9} {:>9}  {}"
+_ROW = "{:<20} {:>10} {:>8} {:>8} {:>8}  {}"
 _SHOWN = 300
 """Characters of an output."""
 
@@ -48,19 +54,7 @@ def compare(
 
     run  Folders of runs, or their names in --runs.
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from launch_scripts.launcher.console import REPORTED
-    from launch_scripts.observe.run_folder import SCENARIO_FILE
-    from launch_scripts.report.compare import (
-        circumstances_that_differ,
-        figures,
-        remarks,
-        settings_that_differ,
-        text_of,
-    )
+    from launch_scripts.report.compare import circumstances_that_differ, figures, settings_that_differ, text_of
 
     if len(run) < 2:
         raise ConfigError("compare takes two runs or more, such as two folders in runs/")
@@ -69,19 +63,15 @@ def compare(
     numbers = figures(found, REPORTED)
     if as_json:
         told = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
-        named = {"runs": [each.name for each in found], "remarks": remarks(found)}
-        typer.echo(json.dumps({**named, **told}, indent=2, default=str))
+        typer.echo(json.dumps({"runs": [each.name for each in found], **told}, indent=2, default=str))
         return
     console = Console(highlight=False)
-    unknown = (each.name for each in found if each.settings is None)
-    for sentence in (
-        *(f"{name} has no {SCENARIO_FILE}: its settings are not known" for name in unknown),
-        *remarks(found),
-    ):
-        console.print(Text(plain(sentence), style="yellow"))
+    for each in found:
+        if each.settings is None:
+            console.print(Text(plain(f"{each.name} has no {SCENARIO_FILE}: its settings are not known")))
     if not settings:
         console.print("the scenarios are the same")
-    for heading, rows in (("setting", settings), ("version or machine", made), ("figure", numbers)):
+    for heading, rows in (("setting", settings), ("circumstance", made), ("figure", numbers)):
         table = Table(heading, pad_edge=False)
         for each in found:
             table.add_column(Text(plain(each.name)), justify="right", overflow="fold")
@@ -92,9 +82,7 @@ def compare(
 
 
 def _left(name: str, runs: Path) -> LeftRun:
-    from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
     from launch_scripts.report.compare import LeftRun
-    from swarm.config.input_files import FileKind, parse_toml, read_text
 
     folder = find_run(name, runs)
     report, path = read_report(folder), folder / SCENARIO_FILE
@@ -112,7 +100,6 @@ def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
 
     swarm runs report LAST
     """
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_page import write_page
 
     typer.echo(write_page(find_run(run, runs)))
@@ -148,8 +135,6 @@ def export(
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     force   Replace files that are there.
     """
-    from launch_scripts.launcher.console import progress
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
     ending = "" if out is None or out.is_dir() else out.suffix.lower().removeprefix(".")
@@ -193,7 +178,6 @@ def replay(
     until_s  Stop at this time (s) of the run's own clock.
     keep     Copy the replayed files into a folder: a test case.
     """
-    from launch_scripts.observe.run_folder import find_run
     from launch_scripts.simulation.replay import keep as keep_recorded
     from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 
@@ -210,7 +194,7 @@ def replay(
     if not as_json:
         for package, (then, now) in others.items():
             typer.echo(f"recorded with {package} {then}, replayed with {now}")
-        typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
+        typer.echo(_ROW.format("process", "generation", "events", "outputs", "seconds", "result"))
     rows: list[Replayed] = []
     for row in replay_run(folder, process, until_s):
         rows.append(row)
@@ -232,8 +216,8 @@ def replay(
 def _lines(row: Replayed) -> Iterator[str]:
     """A row of the table, and what explains it."""
     recorded, outcome = row.recorded, row.outcome
-    name = (recorded.process, recorded.life)
-    who = "{}, life {}".format(*name)
+    name = (recorded.process, recorded.generation)
+    who = "{}, generation {}".format(*name)
     if outcome is None:
         yield _ROW.format(*name, "-", "-", "-", "not replayed")
         yield f"{who}: {row.why}"
@@ -259,7 +243,7 @@ def _fields(row: Replayed) -> dict[str, Any]:
     recorded = row.recorded
     return {
         "process": recorded.process,
-        "life": recorded.life,
+        "generation": recorded.generation,
         "incarnation": recorded.head.incarnation,
         "bytes": recorded.path.stat().st_size,
         "same": row.same,

@@ -6,8 +6,10 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from pkgutil import resolve_name
+from typing import Annotated, Any, ClassVar
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
@@ -21,11 +23,13 @@ from launch_scripts.commands.shared_options import (
     SignalsAddress,
     Tls,
 )
+from launch_scripts.launcher import options
+from launch_scripts.process_table import TABLE, check_name, processes_of
+from swarm.config.agents import added_agent
+from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
-
-if TYPE_CHECKING:
-    from swarm.runtime.health import Health
-    from swarm.wire.messages.processes import RunInfo
+from swarm.runtime.health import Health, supervisor_of
+from swarm.wire.messages.processes import RunInfo
 
 app = family_app("Run one process of a swarm, by hand, on any machine.")
 
@@ -175,18 +179,10 @@ def run_role(
 
     joins  vehicles that the scenario does not have, for an agent that is added
     """
-    import msgspec
-
-    from launch_scripts.launcher import options
-    from launch_scripts.launcher.child_process import load_entry
     from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.log_file import Speaker, log_to
-    from launch_scripts.launcher.options import next_incarnation
     from launch_scripts.launcher.watcher import check_vacant
-    from launch_scripts.process_table import TABLE, processes_of
-    from swarm.config.agents import added_agent
-    from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"
@@ -232,19 +228,26 @@ def run_role(
     if not is_router:
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
-    life = next_incarnation(run_dir, role, id)
+    generation = options.next_incarnation(run_dir, role, id)
     log.info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(
-        scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
+        scenario,
+        run_id,
+        role,
+        id,
+        incarnation=generation,
+        started_ns=generation,
+        run_dir=run_dir,
+        added=added,
+        health=health,
     )
-    load_entry(TABLE[role].entry)(setup, None, **role_options)
+    resolve_name(TABLE[role].entry)(setup, None, **role_options)
 
 
 def _health_of(name: str, place: Place) -> Health:
     """Returns the health reports of the role: to its supervisor, and to probes if they have a port."""
     from launch_scripts.web.health_verdict import Process, health_pages
     from launch_scripts.web.server import Server
-    from swarm.runtime.health import Health, supervisor_of
 
     health = Health(supervisor=supervisor_of(os.environ))
     if place.health_port is not None:
@@ -258,14 +261,3 @@ def _free_id(found: list[RunInfo]) -> str:
     """The first of added0, added1, ... that no process has."""
     taken = {info.id for info in found}
     return next(id for n in range(len(taken) + 1) if (id := f"added{n}") not in taken)
-
-
-def check_name(option: str, name: str) -> None:
-    """Raises ConfigError if the value of an option is no id."""
-    from swarm.errors import ConfigError
-    from swarm.wire.fields import check_id
-
-    try:
-        check_id(option, name)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 
+import msgspec
 import typer
 
 from launch_scripts.command_line.declaring import RUN, command
@@ -42,20 +42,15 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
         from launch_scripts.commands.runs_commands import in_background
 
         return in_background(as_json=run.as_json)
-    from launch_scripts.launcher.console import busy_loading
     from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
     named = {word.partition(".")[0] for word in part.only or ()}
     start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
 
-    with busy_loading(as_json=run.as_json, plain=run.plain) if run.log_format == "text" else nullcontext():
-        import msgspec
-
-        from launch_scripts.launcher import options
-        from launch_scripts.launcher.options import UpOptions, chosen_processes
-        from launch_scripts.launcher.up import run_swarm
-        from launch_scripts.process_table import ROLES
+    from launch_scripts.launcher import options
+    from launch_scripts.launcher.up import run_swarm
+    from launch_scripts.process_table import ROLES
 
     chosen = options.find_scenario(scenario)
     if run.port is not None:
@@ -76,10 +71,10 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
     )
     joins = meeting.connect is not None or (bool(named) and "router" not in named)
     return run_swarm(
-        UpOptions(
+        options.UpOptions(
             chosen,
             run.runs,
-            chosen_processes(chosen, part.only or ROLES, part.rank, joins=joins),
+            options.chosen_processes(chosen, part.only or ROLES, part.rank, joins=joins),
             joins=joins,
             run_id=part.run_id,
             as_json=run.as_json,

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import NETWORK, from_environment
 from launch_scripts.commands.shared_options import Tls
+from swarm.config.input_files import FileKind, read_text
+from swarm.errors import BusError, ConfigError, SwarmError
 
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
@@ -50,21 +53,18 @@ class Where(Tls):
     @cached_property
     def _found(self) -> NetworkConfig:
         from swarm.config.scenario import NetworkConfig
-        from swarm.errors import ConfigError
 
         if self.connect is not None:
             if self.run is not None:
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
-        found = find_swarm(self.runs, self.run)
-        say_newest(found.run, found.others)
-        return found.network
+        (run, network), *others = find_swarm(self.runs, self.run)
+        say_newest(run, [name for name, _ in others if name])
+        return network
 
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
         wrong option."""
-        import msgspec
-
         from launch_scripts.launcher.options import as_process, with_network
         from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
@@ -91,7 +91,6 @@ class Where(Tls):
         from launch_scripts.observe.latest_messages import run_of_most
         from launch_scripts.observe.run_observer import ask_run
         from swarm.bus.zenoh_bus import open_bus
-        from swarm.errors import BusError
         from swarm.runtime.run_secret import authenticator_of
 
         network = self.network()
@@ -106,91 +105,56 @@ class Where(Tls):
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
-def say_newest(run: str | None, others: Sequence[str]) -> None:
+def say_newest(run: str, others: Sequence[str]) -> None:
     """Says which run a command asks, if others run too."""
     if others:
         told = ", ".join(others[:_NAMED])
         typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A router that listens, and whose it is as far as that is known.
+def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[str, NetworkConfig]]:
+    """The runs whose routers listen, at least one, the newest first; of a router at the usual endpoint no run is
+    known, and its name is empty.
 
-    others  names of further runs whose routers listen
-    """
-
-    network: NetworkConfig
-    run: str | None = None
-    others: tuple[str, ...] = ()
-
-
-def find_swarm(runs: Path | None = None, name: str | None = None) -> Found:
-    """The newest run whose router listens; a router at the usual endpoint if there is none.
-
-    runs  folder of the runs that are looked at; None: all of this user, and those in ./runs
+    runs  folder of the runs that are looked at; None: all of this user
     name  of the run, or its folder; only that is looked at then
-    Raises BusError with the places that were tried, ConfigError if there is no run of that name.
+    Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
     from launch_scripts.observe.run_folder import RUNS, find_run
+    from launch_scripts.observe.run_registry import registered
     from swarm.bus.endpoints import listening
-    from swarm.config import scenario
-    from swarm.errors import BusError
+    from swarm.config.scenario import NetworkConfig
 
-    folders = [find_run(name, runs or RUNS)] if name is not None else _newest_first(runs)
+    if name is not None:
+        folders = [find_run(name, runs or RUNS)]
+    else:
+        folders = [each.folder for each in registered() if runs is None or each.folder.parent == runs.resolve()]
     networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
     tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
-        tried.append(("", scenario.NetworkConfig()))
+        tried.append(("", NetworkConfig()))
     # Of runs with the same router only the newest can be connected to it.
     by_router = {network.connect: (run, network) for run, network in reversed(tried)}
     newest_first = sorted(by_router.values(), key=tried.index)
-    found = [each for each in newest_first if any(map(listening, each[1].connect))]
-    if found:
-        run, network = found[0]
-        return Found(network, run or None, tuple(run for run, _ in found[1:] if run))
-    looked = [f"{run} at {', '.join(at.connect)}" if run else at.connect[0] for run, at in newest_first]
+    if found := [each for each in newest_first if any(map(listening, each[1].connect))]:
+        return found
     if name is not None:
-        raise BusError(
-            f"run {name} does not run here: no process listens ({'; '.join(looked) or 'it names no router'})"
-        )
+        looked = ", ".join(each for _, network in tried for each in network.connect) or "it names no router"
+        raise BusError(f"run {name} does not run here: no process listens ({looked})")
     runs_in = "your runs" if runs is None else f"the runs in {runs}"
-    more = f" and {len(looked) - _NAMED} more" if len(looked) > _NAMED else ""
     raise BusError(
         f"no swarm runs here: no process listens at any router of {runs_in} or at the usual endpoint "
-        f"({'; '.join(looked[:_NAMED])}{more}); --connect names another"
+        f"({tried[-1][1].connect[0]}); --connect names another"
     )
 
 
 def _network_of(folder: Path) -> NetworkConfig | None:
     """The network of a run, from its scenario as it ran; None if it was simulated or that cannot be read."""
-    import msgspec
-
     from launch_scripts.observe.run_folder import SCENARIO_FILE, run_facts
-    from swarm.config.input_files import FileKind, read_text
     from swarm.config.scenario import NetworkConfig
-    from swarm.errors import SwarmError
 
     try:
         raw = tomllib.loads(read_text(folder / SCENARIO_FILE, FileKind.SCENARIO)).get("network", {})
         return None if run_facts(folder).get("simulated") else msgspec.convert(raw, NetworkConfig)
     except (OSError, ValueError, SwarmError, msgspec.ValidationError):
         return None
-
-
-def _newest_first(runs: Path | None) -> list[Path]:
-    """Folders of runs: those whose launcher runs first, then those that have left no report, and of these the
-    newest."""
-    from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE, RUNS
-    from launch_scripts.observe.run_registry import registered
-
-    known = registered()
-    launched = {run.folder for run in known if run.launchers}
-    folders = set() if runs is not None else {run.folder for run in known}
-    with suppress(OSError):
-        folders |= {each.resolve() for each in (runs or RUNS).iterdir() if each.name != LAST}
-
-    def newness(folder: Path) -> tuple[bool, bool, float]:
-        return folder in launched, not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
-
-    return sorted((each for each in folders if (each / RUN_FILE).is_file()), key=newness, reverse=True)

@@ -24,6 +24,10 @@ from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
 from launch_scripts.commands.running_swarm import RunOption, say_newest
 from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.plain_text import plain
+from launch_scripts.stop_requests import stop_requests
+from swarm.errors import ConfigError, StoreError, SwarmError
+from swarm.files import check_writable
 
 if TYPE_CHECKING:
     from launch_scripts.observe.run_registry import KnownRun
@@ -57,7 +61,6 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 
     from launch_scripts.launcher.terminal_tables import columns
     from launch_scripts.observe.run_registry import logging_into, open_logs, registered
-    from launch_scripts.plain_text import plain
 
     logs = list(open_logs())
     found = [(run, len(logging_into(run.folder, logs))) for run in registered()]
@@ -92,7 +95,6 @@ def down(run: RunArgument = None) -> int:
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folder import read_report
     from launch_scripts.observe.run_registry import is_of_a_swarm, registered
-    from swarm.errors import ConfigError, SwarmError
 
     running = [each.name for each in registered() if each.launchers]
     if run is None and len(running) > 1:
@@ -146,10 +148,6 @@ def logs(
     lines    Print at most this number of lines of the past.
     run      Name of the run, or its folder; if not given, the newest that runs, or else the newest.
     """
-    from launch_scripts.plain_text import plain
-    from launch_scripts.stop_requests import stop_requests
-    from swarm.errors import ConfigError
-
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
     if process is not None and process not in names:
@@ -181,7 +179,6 @@ def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--pr
     import webbrowser
 
     from launch_scripts.ports import page_of
-    from swarm.errors import ConfigError
 
     found = _chosen(run)
     report = found.folder / "report.html"
@@ -205,8 +202,6 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     """
     import psutil
 
-    from swarm.errors import ConfigError
-
     found = _chosen(run)
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
@@ -224,9 +219,6 @@ def in_background(*, as_json: bool) -> int:
     """Runs this command again in the background, without `-d`. Returns once the swarm is whole, or else the exit
     code of the command. Raises ConfigError or StoreError if the run could not be found later."""
     from launch_scripts.observe.run_registry import registered, registry
-    from launch_scripts.stop_requests import stop_requests
-    from swarm.errors import ConfigError, StoreError
-    from swarm.files import check_writable
 
     if as_json:
         raise ConfigError("--json prints the report at the end, and --detach does not wait for it")
@@ -257,7 +249,6 @@ def _chosen(name: str | None) -> KnownRun:
     """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError."""
     from launch_scripts.observe.run_folder import RUNS, find_run
     from launch_scripts.observe.run_registry import registered
-    from swarm.errors import ConfigError
 
     if name is None:
         if not (known := registered()):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import typer
 
@@ -23,14 +22,8 @@ from launch_scripts.commands.shared_options import (
     Seconds,
     Walk,
 )
-from swarm.errors import BusError, ConfigError, SwarmError
+from swarm.errors import ConfigError
 from swarm.files import write_file
-
-if TYPE_CHECKING:
-    from launch_scripts.check.findings import Finding
-    from launch_scripts.check.machine_check import Machine, Needs
-    from shared_map.terrain.terrain import Terrain
-    from swarm.config.scenario import Scenario
 
 app = typer.Typer()
 _HEAD = """A scenario of terrain-swarm, written by `swarm new`. Every setting that is not here has its default; all
@@ -214,127 +207,13 @@ def check(
 
     swarm check my.toml --json | jq .findings
     """
-    from launch_scripts.check import scenario_check
-    from launch_scripts.check.findings import as_fields, failure
-    from launch_scripts.launcher.options import scenario_path, with_port
-    from swarm.config.input_files import FileKind, read_text
-    from swarm.config.load import read_scenario
+    from launch_scripts.check.findings import answer
+    from launch_scripts.check.whole_check import check_scenario
+    from launch_scripts.launcher.options import scenario_path
 
     path = scenario_path(scenario)
-    read, faults = read_scenario(read_text(path, FileKind.SCENARIO), str(path), path.parent)
-    found = [failure("", fault) for fault in faults]
-    facts: dict[str, Any] = {}
-    if read is not None:
-        if port is not None:
-            read = with_port(read, port)
-        found += [
-            finding._replace(about=f"{path}: {finding.about}" if finding.about else str(path))
-            for finding in (_findings(read, runs, facts) if not faults else scenario_check.files_named(read))
-        ]
-    found.sort(key=lambda finding: finding.level != "failure")  # failures stand before warnings
-    if as_json:
-        told = {"scenario": str(path), **as_fields(found), **facts}
-        typer.echo(json.dumps(told, indent=2))
-        return int(not told["ok"])
-    return _print(found, _summary(path, found, facts) if facts else "")
-
-
-def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    """facts  collects facts on the way, for the last line"""
-    from launch_scripts.check import scenario_check
-    from launch_scripts.check.findings import warning
-    from launch_scripts.ports import check_ports
-    from launch_scripts.process_table import ROLES
-
-    yield from scenario_check.network(scenario)
-    yield from scenario_check.meets(scenario)
-    yield from scenario_check.plugins(scenario)
-    try:
-        check_ports(scenario, ROLES)
-    except BusError as error:  # it may be free when the run starts
-        yield warning("", str(error))
-    broken = [*scenario_check.files_named(scenario), *scenario_check.places_counted(scenario)]
-    yield from broken
-    if not broken:
-        yield from _of_ground(scenario, runs, facts)
-
-
-def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    from launch_scripts.check import machine_check as machine
-    from launch_scripts.check import scenario_check
-    from launch_scripts.check.findings import failure
-    from launch_scripts.launcher.console import progress
-    from shared_map.terrain.terrain import build_terrain, build_truth
-    from swarm.config.plugin_names import plugins_of
-
-    try:
-        with progress() as tell:
-            terrain = build_terrain(scenario, tell)
-        truth = build_truth(scenario, terrain)
-    except SwarmError as error:
-        yield failure("", str(error))
-        return
-    yield from scenario_check.places(scenario, terrain, truth)
-    yield from scenario_check.plots(scenario, terrain.grid)
-    if any(each.name not in each.kind.built_in for each in plugins_of(scenario)):
-        from launch_scripts.check.plugin_check import not_made
-
-        yield from not_made(scenario, terrain.grid, truth)
-    yield from scenario_check.one_way_ground(scenario, terrain, truth)
-    wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
-    yield from machine.against(scenario, wanted, here, runs)
-    facts |= _facts(scenario, terrain, wanted, here)
-
-
-def _facts(scenario: Scenario, terrain: Terrain, wanted: Needs, here: Machine) -> dict[str, Any]:
-    return {
-        "targets": len(scenario.target_ids),
-        "vehicles": scenario.vehicle_count,
-        "agents": wanted.agents,
-        "processes": wanted.processes,
-        "seconds": scenario.seconds,
-        "rows": terrain.grid.rows,
-        "cols": terrain.grid.cols,
-        "resolution_m": terrain.grid.resolution_m,
-        "passable_share": round(1 - float(terrain.lethal.mean()), 4),
-        "estimated_cores": round(wanted.cores, 2),
-        "cores": here.cores,
-        "estimated_memory_bytes": wanted.memory_bytes,
-        "available_memory_bytes": here.free_bytes,
-    }
-
-
-def _print(found: list[Finding], summary: str = "") -> int:
-    """Prints a line for each finding, and a last one: how many are wrong, or `summary` where none is a failure.
-    Returns the exit code."""
-    from rich.console import Console
-    from rich.text import Text
-
-    from launch_scripts.check.findings import STYLES, counted
-
-    console = Console(soft_wrap=True, highlight=False)
-    for finding in found:
-        console.print(Text.assemble((f"{finding.level}: ", STYLES[finding.level]), finding.sentence))
-    failed = any(finding.level == "failure" for finding in found)
-    if summary and not failed:
-        console.print(summary)
-    elif len(found) > 1:
-        console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}")
-    return int(failed)
-
-
-def _summary(path: Path, found: list[Finding], facts: dict[str, Any]) -> str:
-    """Returns the summary of a scenario that can run."""
-    from launch_scripts.check.findings import counted
-    from swarm.config.input_files import size
-
-    return (
-        f"{path} can run, {counted(found, 'warning')}: vehicles {facts['vehicles']:,},"
-        f" targets {facts['targets']:,}, processes {facts['processes']}, {facts['seconds']:g} s;"
-        f" {facts['rows']} x {facts['cols']} cells of {facts['resolution_m']:g} m,"
-        f" {facts['passable_share']:.0%} passable; about {facts['estimated_cores']:.1f} of {facts['cores']} cores"
-        f" and {size(facts['estimated_memory_bytes'])}"
-    )
+    found, facts, summary = check_scenario(path, runs, port)
+    return answer(found, as_json, {"scenario": str(path), **facts}, summary)
 
 
 @command(app, PREPARE)
@@ -348,12 +227,7 @@ def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
 
     swarm doctor --json | jq .findings
     """
-    from launch_scripts.check.findings import as_fields
+    from launch_scripts.check.findings import answer
     from launch_scripts.check.machine_check import examine
 
-    found = list(examine(runs))
-    if as_json:
-        told = as_fields(found)
-        typer.echo(json.dumps(told, indent=2))
-        return int(not told["ok"])
-    return _print(found)
+    return answer(list(examine(runs)), as_json, {})

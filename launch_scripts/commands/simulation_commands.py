@@ -11,11 +11,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
+from launch_scripts.stop_requests import stop_requests
+from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError
 from swarm.files import writing
 
@@ -83,8 +86,6 @@ def _simulate_once(
     name: str, seed: int | None, seconds: float | None, trace: Path | None, runs: Path, as_json: bool
 ) -> None:
     """Runs a scenario without faults, prints its report and leaves a run's folder in `runs`."""
-    import msgspec
-
     from launch_scripts.check.scenario_check import check_places
     from launch_scripts.launcher.console import Terminal, progress
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
@@ -136,8 +137,6 @@ def _simulate_once(
 
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:
     """Runs many seeds with faults, and prints what they break. True if every law held in all of them."""
-    import msgspec
-
     from launch_scripts.launcher.options import find_scenario
     from launch_scripts.simulation.many_seeds import MIX, SECONDS, parse_seeds, run_seeds
     from launch_scripts.simulation.worlds import WORLDS
@@ -224,8 +223,6 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     """Runs what a study lacks, and prints its summary. True if every trial has a result and no law broke."""
     from rich.console import Console
 
-    from swarm.config.input_files import quoted
-
     if scheduler is not None and workers is not None:
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
     if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
@@ -236,7 +233,6 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
 
     from launch_scripts.simulation.study.study import study_path
     from launch_scripts.simulation.study.sweep import NUMBERS, Sweep
-    from launch_scripts.stop_requests import stop_requests
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)

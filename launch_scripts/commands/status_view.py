@@ -201,11 +201,8 @@ def status_fields(status: Status) -> dict[str, Any]:
     def process_fields(info: RunInfo) -> dict[str, Any]:
         stats = latest.newest_stats(info.role, info.id)
         return {
-            "role": info.role,
-            "id": info.id,
+            **msgspec.to_builtins(info),
             "pid": status.pids.get(f"{info.role}-{info.id}"),
-            "incarnation": info.incarnation,
-            "wire_version": info.wire_version,
             "leads": status.latest.leads.get((info.role, info.id)),
             "counts": None if stats is None else stats.counts,
             "gauges": None if stats is None else stats.gauges,
@@ -281,15 +278,8 @@ def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], consol
 
 def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:
     """The same for programs."""
-    told = [{name: _rounded(value) for name, value in asdict(each).items()} for each in processes]
+    told = list(map(asdict, processes))
     return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": told}
-
-
-def _rounded(value: Any) -> Any:
-    """A number with two digits of its fraction, if it has any."""
-    if not isinstance(value, float):
-        return value
-    return int(value) if value.is_integer() else round(value, 2)
 
 
 @contextmanager

@@ -23,17 +23,9 @@ from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.operator import replies_to
 from swarm.wire.access import OPERATOR
 from swarm.wire.codec import COMPASS, encode_json
-from swarm.wire.fields import column
-from swarm.wire.messages.planning import (
-    CostReply,
-    CostRequest,
-    PlaceRouteReply,
-    PlaceRouteRequest,
-    RouteReply,
-    RouteRequest,
-)
+from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
-from swarm.wire.topics import COST, PLACE_ROUTE, ROUTE, asker_of
+from swarm.wire.topics import PLACE_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -56,24 +48,25 @@ _NO_PLACE = {
 class Answer:
     """A planner's answer, and where the terrain lies."""
 
-    reply: RouteReply | CostReply
+    reply: RouteReply
     frame: MapFrame
     start: int
     took_ms: float
 
     @property
+    def route(self) -> Route:
+        """The only route of the reply."""
+        return self.reply.routes[0]
+
+    @property
     def searching(self) -> bool:
         """True if the target is unseen: then the route leads to a cell to search."""
-        return isinstance(self.reply, RouteReply) and self.reply.routes[0].status is RouteStatus.SEARCHING
+        return self.route.status is RouteStatus.SEARCHING
 
     @property
     def goal(self) -> int | None:
-        """End of the route; None if the planner does not state it: during a search it states no cell beyond the
-        requested steps."""
-        if not self.searching:
-            return self.target_cell
-        cells = self.path()
-        return cells[-1] if cells and self.reply.routes[0].remaining_s == 0 else None  # type: ignore[union-attr]
+        """End of the route; None if the planner does not state it."""
+        return self.target_cell if not self.searching else next(reversed(self.path()), None)
 
     @property
     def target_cell(self) -> int | None:
@@ -83,9 +76,9 @@ class Answer:
 
     def path(self) -> list[int]:
         """The cells of the route, of a pulled one those in which it turns; none without one."""
-        if isinstance(self.reply, CostReply) or not _leads(self.reply.routes[0]):
+        route = self.route
+        if not _leads(route):
             return []
-        (route,) = self.reply.routes
         cells = walk(self.frame.grid, route.start, route.directions)
         return [cells[turn] for turn in route.turns] if route.turns else cells
 
@@ -96,43 +89,29 @@ def _leads(route: Route) -> bool:
     return searching or route.status is RouteStatus.OK
 
 
-def ask_planner(
-    bus: Bus,
-    where: object,
-    target: str,
-    start: Place,
-    *,
-    cost: bool,
-    steps: int,
-    vehicle_class: str = GROUND,
-) -> Answer:
-    """Ask for the route, or with `cost` for its cost only. Raises BusError or ConfigError in one sentence."""
+def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_class: str = GROUND) -> Answer:
+    """Asks for the route. Raises BusError or ConfigError in one sentence."""
     frame = frame_of_run(bus, where)
     cell = cell_of(start, frame, "--from")
     row, col = frame.grid.row_col(cell)
-    request = (
-        CostRequest(row=row, col=col, vehicle_class=vehicle_class)
-        if cost
-        else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
-    )
+    request = RouteRequest(row=row, col=col, vehicle_class=vehicle_class)
     began_s = time.monotonic()
     asker = asker_of(OPERATOR, "command")
-    topic = COST if cost else ROUTE
-    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target, asker=asker)
+    replies, failure = replies_to(bus, ROUTE, request, _TIMEOUT_S, target=target, asker=asker)
     took_ms = (time.monotonic() - began_s) * 1e3
     for reply in replies:
-        if isinstance(reply, RouteReply | CostReply):
+        if isinstance(reply, RouteReply):
             return Answer(reply, frame, cell, took_ms)
     if failure is not None and failure != "timeout":
         raise ConfigError(failure)
     raise BusError(f"no planner of target {target!r} answers {where}")
 
 
-def ask_place(bus: Bus, where: object, start: Place, end: Place, *, steps: int, vehicle_class: str) -> Answer:
+def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: str) -> Answer:
     """Asks for the route between two places, until it is known. Raises BusError or ConfigError in one sentence."""
     frame = frame_of_run(bus, where)
     cell, goal = cell_of(start, frame, "--from"), cell_of(end, frame, "--to")
-    request = PlaceRouteRequest(to=goal, cells=[cell], max_cells=steps, vehicle_class=vehicle_class)
+    request = PlaceRouteRequest(to=goal, cells=[cell], vehicle_class=vehicle_class)
     began_s = time.monotonic()
     while True:
         asker = asker_of(OPERATOR, "command")
@@ -162,8 +141,7 @@ def as_json(answer: Answer) -> str:
     fields["crs"] = frame.grid.crs
     fields["from"] = fields_of(frame, answer.start)
     fields["to"] = None if goal is None else fields_of(frame, goal)
-    if isinstance(answer.reply, RouteReply):
-        fields["searching"] = answer.searching
+    fields["searching"] = answer.searching
     if answer.searching:
         fields["last_seen"] = None if last is None else fields_of(frame, last)
     if cells:
@@ -186,7 +164,7 @@ def write(answer: Answer, path: Path) -> None:
 def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
     grid = answer.frame.grid
     path = np.array(cells, np.int64)
-    (route,) = answer.reply.routes  # type: ignore[union-attr]
+    route = answer.route
     return DescribedRoute(
         name=f"{'in search of' if answer.searching else 'to'} {answer.reply.target}",
         grid=grid,
@@ -197,39 +175,19 @@ def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
     )
 
 
-def show(answer: Answer) -> None:
-    """Prints an answer for people."""
-    if isinstance(answer.reply, CostReply):
-        _show_cost(answer, answer.reply)
-    else:
-        _show_route(answer, answer.reply)
-
-
-def _show_cost(answer: Answer, reply: CostReply) -> None:
-    cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
-    start = written(answer.frame, answer.start)
-    if reply.lethal_target is not None:
-        typer.echo(_lethal(answer, reply))
-    elif reply.target_cell is None:
-        typer.echo("no_target: the planner does not know where its target is")
-    elif math.isfinite(cost_s):
-        typer.echo(f"from {start} to {_target(answer)} in {cost_s:.1f} s")
-        _show_pose(reply)
-    else:
-        typer.echo(f"unreachable: {start} has no way to {reply.target}, or is lethal")
-
-
-def _lethal(answer: Answer, reply: RouteReply | CostReply) -> str:
+def _lethal(answer: Answer) -> str:
+    reply = answer.reply
     places = [cell for cell in (reply.lethal_target, reply.nearest_cell) if cell is not None]
     shown = [written(answer.frame, cell) if cell < answer.frame.grid.cells else "outside" for cell in places]
     nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
     return f"{TargetStatus.LETHAL}: {reply.target} is on lethal ground, {shown[0]}; {nearest}"
 
 
-def _show_route(answer: Answer, reply: RouteReply) -> None:
-    (found,) = reply.routes
+def show(answer: Answer) -> None:
+    """Prints an answer for people."""
+    reply, found = answer.reply, answer.route
     if reply.lethal_target is not None:
-        typer.echo(_lethal(answer, reply))
+        typer.echo(_lethal(answer))
         return
     if not _leads(found):
         meaning = {
@@ -249,13 +207,12 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
         typer.echo(f"searching: {reply.target} is unseen; {place} is a place to search, in {found.cost_s:.1f} s")
     else:
         typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
-    rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
     many, turns = len(found.directions), len(found.turns)
     if turns:
         way = f"{turns - 1} straight segments through {many + 1} cells, {found.length_m:.0f} m"
-        typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight{rest}")
+        typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight")
     else:
-        typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
+        typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}")
     age_s = reply.tree_age_ms / 1e3
     grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
     typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
@@ -267,7 +224,7 @@ def _target(answer: Answer) -> str:
     return answer.reply.target if cell is None else f"{answer.reply.target} at {written(answer.frame, cell)}"
 
 
-def _show_pose(reply: RouteReply | CostReply) -> None:
+def _show_pose(reply: RouteReply) -> None:
     """Say how old the pose is that the answer goes by."""
     if reply.pose_age_s is None:
         return

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,6 +29,8 @@ from shared_map.terrain.slope_rules import (
     slope_factor,
     step_limits_deg,
 )
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 from swarm.config.cost_rules import PRESETS, cost_of_preset
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
@@ -37,9 +39,6 @@ from swarm.config.write import toml_value
 from swarm.errors import ConfigError
 from swarm.files import replacing
 from swarm.grid import GridSpec
-
-if TYPE_CHECKING:
-    from shared_map.terrain.terrain import Terrain
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
@@ -88,9 +87,6 @@ def info(
     cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
     elevation_encoding  Encoding of heights, where the file does not state it.
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
         "cover": cover, "cover_codes": cover_codes, "elevation_encoding": elevation_encoding,
@@ -157,8 +153,6 @@ def cost(
     out            Write seconds per metre as GeoTIFF; lethal is -1.
     vehicle_class  Vehicle class of the scenario.
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
     from shared_map.vehicle_class_grounds import class_terrains
 
     check_target(out, "--out", *_TIFF)
@@ -243,8 +237,6 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    from shared_map.terrain.terrain import build_terrain
-
     check_target(out, "--out", *_TIFF, ".npz")
     check_target(photo, "--photo", *_TIFF)
     check_target(picture, "--picture", ".png")
@@ -345,9 +337,6 @@ def classify(
     labels     Learn from these labels (TOML), and compare with them.
     out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
     """
-    from shared_map.terrain.terrain import build_terrain
-    from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-
     check_target(out, "--out", *_TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
@@ -446,6 +435,11 @@ class Curve(NamedTuple):
         found = factor.astype(np.float64)
         return self.cost.flat_speed_m_per_s / found if self.unit == "m/s" else found
 
+    def by_slope(self) -> dict[str, float | None]:
+        """Slope in percent -> value; None where it is too steep."""
+        values = zip(_SLOPES, self.at(SLOPES_PERCENT).round(4).tolist(), strict=True)
+        return {slope: value if 0 < value < math.inf else None for slope, value in values}
+
 
 Shown = dict[str, list[Curve]]
 """Groups of curves under their titles."""
@@ -484,18 +478,10 @@ def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
 
 
 def _rules_fields(shown: Shown) -> dict[str, Any]:
-    """For programs. Slopes that are too steep have no value."""
+    """For programs."""
     return {
         title: [
-            {
-                "name": curve.name,
-                **curve.notes,
-                "unit": curve.unit,
-                "by_slope_percent": {
-                    slope: round(float(value), 4) if 0 < value < math.inf else None
-                    for slope, value in zip(_SLOPES, curve.at(SLOPES_PERCENT), strict=True)
-                },
-            }
+            {"name": curve.name, **curve.notes, "unit": curve.unit, "by_slope_percent": curve.by_slope()}
             for curve in curves
         ]
         for title, curves in shown.items()
@@ -511,8 +497,8 @@ def _show_rules(shown: Shown) -> None:
         for slope in _SLOPES:
             table.add_column(slope, justify="right")
         for curve in curves:
-            values = curve.at(SLOPES_PERCENT)
-            table.add_row(curve.name, *(f"{value:.2f}" if 0 < value < math.inf else "-" for value in values))
+            values = curve.by_slope().values()
+            table.add_row(curve.name, *("-" if value is None else f"{value:.2f}" for value in values))
         console.print(table)
         for curve in curves:
             for key, text in curve.notes.items():

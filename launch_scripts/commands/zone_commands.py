@@ -22,7 +22,7 @@ from launch_scripts.plain_text import Duration
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
 from swarm.errors import ConfigError, TerrainError
-from swarm.places import FORMS, corners_of, fields_of, read_place, written
+from swarm.places import corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
 
@@ -41,7 +41,6 @@ _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 def add(
     where: Where,
     polygon: str | None = None,
-    polygon_m: str | None = None,
     file: Path | None = None,
     layer: str | None = None,
     crs: str | None = None,
@@ -63,7 +62,6 @@ def add(
     itself which of its areas keep in. Elsewhere --kind keep-in closes all but the areas.
 
     polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
-    polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
     file           A file of areas instead, as in a scenario's zones, in any system.
     layer          Layer of a file that has several.
     crs            Coordinate system, if the file names none: EPSG:32632, or local.
@@ -78,25 +76,21 @@ def add(
     if file is None:
         if layer is not None or crs is not None:
             raise ConfigError("zone add: --layer and --crs go with --file")
-        if polygon is None and polygon_m is None:
-            raise ConfigError("give --polygon, --polygon-m or --file; `swarm order zone add -h` shows examples")
-        places = [read_place(word, "--polygon") for word in _words("--polygon", polygon, f", each {FORMS}")]
-        fields["polygon"] = [(0.0, 0.0) for _ in places]
-        fields["polygon_m"] = [_corner(word) for word in _words("--polygon-m", polygon_m, " such as 40,200")]
-        order = checked(ZoneOrder, fields)
+        if polygon is None:
+            raise ConfigError("give --polygon or --file; `swarm order zone add -h` shows examples")
+        places = [read_place(word, "--polygon") for word in polygon.split()]
+        order = checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0) for _ in places]})
 
         def of_places(frame: MapFrame) -> Iterable[ZoneOrder]:
-            if not (places or inside):
-                return [order]
-            corners = corners_of(places or [f"xy:{x},{y}" for x, y in order.polygon_m], frame, "--polygon")
+            corners = corners_of(places, frame, "--polygon")
             if not inside:
                 return [msgspec.structs.replace(order, polygon=corners)]
-            from shared_map.importers.zones.outlines import all_but
+            from shared_map.importers.zones.drawings import all_but
 
             return _zones(fields, all_but(corners, frame.grid, MOST_CORNERS))
 
         return _give(of_places, where, as_json)
-    if polygon is not None or polygon_m is not None:
+    if polygon is not None:
         raise ConfigError("zone add: give either --file or a polygon")
     try:
         check_file(file, FileKind.VECTORS)
@@ -105,7 +99,7 @@ def add(
     checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
 
     def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
-        from shared_map.importers.zones.outlines import outlines_of
+        from shared_map.importers.zones.drawings import outlines_of
 
         zone = ZoneConfig(kind="keep_in" if inside else "forbidden", file=str(file), layer=layer, crs=crs)
         return _zones(fields, outlines_of(zone, frame.grid, MOST_CORNERS))
@@ -118,7 +112,7 @@ def _zones(fields: dict[str, object], outlines: list[list[list[tuple[float, floa
     several = len(outlines) > 1 and fields["name"]
     for number, (border, *holes) in enumerate(outlines, 1):
         name = f"{fields['name']}-{number}" if several else fields["name"]
-        yield checked(ZoneOrder, fields | {"name": name, "polygon": border, "polygon_m": [], "holes": holes})
+        yield checked(ZoneOrder, fields | {"name": name, "polygon": border, "holes": holes})
 
 
 @command(app)
@@ -219,18 +213,3 @@ def _lasts_s(text: str | None) -> float | None:
     if match is None or not float(match[1]) > 0:
         raise ConfigError(f"--for: {text!r} is no time such as 90s, 10m, 2h or 1d")
     return float(match[1]) * _SECONDS[match[2]]
-
-
-def _words(option: str, text: str | None, expected: str) -> list[str]:
-    """The corners as they are written; an option that is given has one at least."""
-    if text is not None and not text.split():
-        raise ConfigError(f"{option}: there is no corner in {text!r}, expected at least three{expected}")
-    return (text or "").split()
-
-
-def _corner(word: str) -> tuple[float, float]:
-    try:
-        one, other = (float(number) for number in word.split(","))
-    except ValueError:
-        raise ConfigError(f"--polygon-m: {word!r} is no corner, expected two numbers such as 40,200") from None
-    return one, other

@@ -17,10 +17,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from launch_scripts.process_table import check_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
 from swarm.files import replacing, write_file, writing
-from swarm.wire.fields import check_id
 
 CA = "ca"
 THIS_MACHINE = ("localhost", "127.0.0.1")
@@ -68,10 +68,7 @@ def issue(
     called  the common name, where it is another: agent.all.a0~2 after the first was revoked
     Raises ConfigError on a name that cannot be one, StoreError where files cannot be written or are there already.
     """
-    try:
-        check_id("name", name)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    check_name("name", name)
     if name == CA:
         raise ConfigError(f"the name {CA} is the authority's own")
     path = folder / f"{name}.pem"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import sys
 import tarfile
@@ -15,7 +14,6 @@ import msgspec
 
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
-from launch_scripts.deploy.hosts import HostName
 from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
@@ -33,21 +31,11 @@ CONTENTS = "contents"
 """The file that names all others of an archive, a line each."""
 
 
-class _ProcessBefore(msgspec.Struct):
-    role: str
-    id: str
-
-
-class _HostBefore(msgspec.Struct):
-    name: HostName
-    processes: tuple[_ProcessBefore, ...]
-
-
 class _Before(msgspec.Struct):
     """Content of an earlier plan."""
 
     run_id: str = ""
-    hosts: tuple[_HostBefore, ...] = ()
+    hosts: tuple[PlannedHost, ...] = ()
 
 
 def write_kits(
@@ -67,7 +55,7 @@ def write_kits(
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
-        texts = {"scenario.toml": scenario_text(scenario, Path()), PLAN: _shown(plan), **render(plan, host)}
+        texts = {"scenario.toml": scenario_text(scenario, Path()), PLAN: as_json(plan), **render(plan, host)}
         if revoked and host.of(ROUTER):
             texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
         files = {**ground, **plugin_files(plan.scenario), f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
@@ -88,12 +76,12 @@ def keep_plan(plan: Plan, out: Path) -> None:
     """Writes the plan for `keepers_before`, and removes archives of machines that only the plan before has: they
     hold keys. Raises StoreError where it cannot."""
     names = {host.name for host in plan.hosts}
-    gone = [_archive_of(out, host.name) for host in _before(out).hosts if host.name not in names]
+    gone = [out / f"{host.name}.tar.gz" for host in _before(out).hosts if host.name not in names]
     with writing(out / PLAN):
         for archive in filter(Path.exists, gone):
             archive.unlink()
             print(f"{archive}: removed, as the plan has no machine of this name", file=sys.stderr)
-        write_file(out / PLAN, _shown(plan).encode())
+        write_file(out / PLAN, as_json(plan).encode())
 
 
 def keepers_before(out: Path, run_id: str) -> dict[str, str]:
@@ -103,10 +91,6 @@ def keepers_before(out: Path, run_id: str) -> dict[str, str]:
     if before.run_id != run_id:
         return {}
     return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
-
-
-def _shown(plan: Plan) -> str:
-    return json.dumps(as_json(plan), indent=1) + "\n"
 
 
 def _before(out: Path) -> _Before:
@@ -132,13 +116,9 @@ def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked:
     return issue(folder, name, hosts, days, renew=True, called=called)
 
 
-def _archive_of(out: Path, name: str) -> Path:
-    return out / f"{name}.tar.gz"
-
-
 def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Path]) -> Path:
     """Only its owner may read it: it holds private keys."""
-    path = _archive_of(out, name)
+    path = out / f"{name}.tar.gz"
 
     def entry(place: str, size: int, mode: int) -> tarfile.TarInfo:
         made = tarfile.TarInfo(f"swarm-{name}/{place}")

@@ -5,6 +5,7 @@ Processes of one job are placed apart, consecutive agents together, load by core
 
 from __future__ import annotations
 
+import json
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
@@ -13,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.deploy.hosts import HostConfig, HostsConfig
+from launch_scripts.deploy.hosts import HostConfig, HostName, HostsConfig
 from launch_scripts.process_table import (
     RECORDED_BESIDE,
     ROLES,
@@ -75,7 +76,7 @@ class PlannedHost(msgspec.Struct, frozen=True, kw_only=True):
     has_files  whether it gets the files of the terrain; others ask a keeper for the base map
     """
 
-    name: str
+    name: HostName
     address: str
     cores: float
     processes: tuple[PlannedProcess, ...]
@@ -274,8 +275,8 @@ def router_name(host: PlannedHost) -> str:
     return f"router-{host.name}"
 
 
-def as_json(plan: Plan) -> dict[str, Any]:
-    """Returns the output of `swarm deploy plan --json`, which is also plan.json in every archive."""
+def plan_fields(plan: Plan) -> dict[str, Any]:
+    """The output of `swarm deploy plan --json`."""
     return {
         "scenario": plan.scenario.name,
         "run_id": plan.run_id,
@@ -285,6 +286,11 @@ def as_json(plan: Plan) -> dict[str, Any]:
         "standbys": msgspec.to_builtins(plan.scenario.standbys),
         "hosts": msgspec.to_builtins(plan.hosts),
     }
+
+
+def as_json(plan: Plan) -> str:
+    """plan.json of every archive."""
+    return json.dumps(plan_fields(plan), indent=1) + "\n"
 
 
 def ids_of(host: PlannedHost, role: str) -> Iterator[str]:

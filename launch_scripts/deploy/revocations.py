@@ -6,33 +6,23 @@ from pathlib import Path
 
 import msgspec
 
+from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import NetworkConfig
 from swarm.config.setting_types import CommonName
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 from swarm.files import write_file
 
 FILE = "revoked"
-_MOST_BYTES = 1 << 20
-"""Room for some 16,000 of the longest names, more than a swarm has certificates; a larger file is some other
-file."""
 
 
 def revoked_in(folder: Path) -> tuple[str, ...]:
     """The names in a folder's file of revoked names, one a line; none where there is no file. Raises ConfigError at
-    a line that is no name in a certificate, StoreError where the file cannot be read."""
+    a line that is no name in a certificate, and where the file cannot be read."""
     path = folder / FILE
-    try:
-        with path.open(encoding="utf-8") as file:
-            text = file.read(_MOST_BYTES + 1)
-    except FileNotFoundError:
+    if not path.exists():
         return ()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not UTF-8 text ({error.reason}), expected names, one a line") from error
-    except OSError as error:
-        raise StoreError(f"cannot read {path}: {error.strerror or error}") from error
-    if len(text) > _MOST_BYTES:
-        raise ConfigError(f"{path}: more than {_MOST_BYTES} characters")
-    names = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = read_text(path, FileKind.REVOKED).splitlines()
+    names = [(number, line.strip()) for number, line in enumerate(lines, 1)]
     return tuple(_checked(name, f"{path}, line {number}") for number, name in names if name)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import importlib
 import logging
 import multiprocessing
 import os
@@ -14,12 +13,14 @@ import threading
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.parent_death import end_with_parent
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
+from swarm.files import discard_output
 from swarm.runtime.health import Board, Health
 from swarm.runtime.role import RoleSetup
 
@@ -73,7 +74,7 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)
     try:
-        load_entry(entry)(setup, lambda: _run_until_launcher_ends(TABLE[setup.role].niceness))
+        resolve_name(entry)(setup, lambda: _run_until_launcher_ends(TABLE[setup.role].niceness))
     except SwarmError as error:
         log.error("%s", error)
         pipe.send(ExitReason(str(error), error.exit_code, refused=True))
@@ -87,12 +88,6 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
         pipe.send(ExitReason("ended as asked", 0))
     log.info("ended as asked")
     _leave(0)
-
-
-def load_entry(entry: str) -> Any:
-    """The function that `module:function` names."""
-    module, _, function = entry.partition(":")
-    return getattr(importlib.import_module(module), function)
 
 
 def wait_for_launcher() -> None:
@@ -131,12 +126,9 @@ def _watch_launcher() -> None:
 def _redirect(log_path: Path, log_format: LogFormat, setup: RoleSetup) -> None:
     """Sends all output of this process, that of native libraries included, to its log file: once that can be
     opened, for a full disk must not keep a process from its start."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
     sys.stdout.flush()
     sys.stderr.flush()
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
-    os.close(nowhere)
+    discard_output(1, 2)
     faulthandler.enable()
     log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
 

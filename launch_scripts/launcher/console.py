@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.plain_text import plain
+from swarm.files import discard_output
 
 log = logging.getLogger(__name__)
 
@@ -55,14 +56,14 @@ REPORTED = {
     "lost": "lost at the end",
     "collisions": "collisions",
     "lethal_entries": "lethal cells entered",
-    "driven_into": "bodies driven into",
-    "hit_by_bodies": "vehicles hit by bodies",
+    "driven_into": "obstacles driven into",
+    "hit_by_obstacles": "vehicles hit by obstacles",
     "certified_gap": "certified gap",
     "learned": "learned, times the prior pace",
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",
     "mark_to_tree_ms": "from mark to tree, ms",
-    "body_ms": "from a body's report to being avoided, ms",
+    "obstacle_ms": "from an obstacle's report to being avoided, ms",
     "messages_per_s": "messages/s",
     "payloads_dropped": "payloads dropped",
 }
@@ -115,13 +116,13 @@ class Terminal:
         """Returns True if the next summary is due."""
         return time.monotonic() >= self._due_s
 
-    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType]) -> None:
-        """Redraws the table, or prints the line if there is no table."""
+    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType] | None = None) -> None:
+        """Redraws the table, which is the line without one. Prints the line where the terminal has no table."""
         self._due_s = time.monotonic() + (_TABLE_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
             self.say(line())
             return
-        table = table_on(self._console)
+        table = Text(line()) if table_on is None else table_on(self._console)
         with contextlib.suppress(OSError):  # of a closed terminal
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
@@ -160,12 +161,6 @@ def _plain(value: Any) -> str:
     if isinstance(value, dict):
         return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
-
-
-def busy_loading(*, as_json: bool, plain: bool) -> contextlib.AbstractContextManager[None]:
-    """Says so while the modules of a launcher are loaded, before there is a run whose terminal could."""
-    console = Console(stderr=as_json, highlight=False)
-    return _busy_line(console, console.print, lambda: "loading", changes=console.is_terminal and not plain)
 
 
 @contextlib.contextmanager
@@ -250,9 +245,7 @@ class OutlivingOutput:
             if error.errno not in _READER_GONE:
                 raise
             log.info("the output has no reader any more: %s", error.strerror or error)
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            discard_output(self._stream.fileno())
 
 
 def make_output_outlive_readers() -> None:

@@ -163,7 +163,7 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
 
     threading.Thread(target=_end_with_launcher, daemon=True).start()
     needed = needed_kernels(scenario)
-    first, others = (missing(needed.first), missing((*needed.classes, *needed.later))) if can_build() else ((), ())
+    first, others = (missing(needed.first), missing(needed.later)) if can_build() else ((), ())
     if tells:
         _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
     for kernels, niceness in ((first, 0), (others, _BACKGROUND)):

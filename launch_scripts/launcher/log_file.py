@@ -16,7 +16,6 @@ from typing import Literal, NamedTuple
 from launch_scripts.plain_text import plain
 
 LogFormat = Literal["text", "json"]
-LOG_FORMATS: tuple[LogFormat, ...] = ("text", "json")
 
 MAX_BYTES = 16 << 20
 """A longer log is renamed to NAME.1, in the place of the previous one, and begun again."""

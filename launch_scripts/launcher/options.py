@@ -23,6 +23,7 @@ from launch_scripts.process_table import (
     TABLE,
     ProcessSpec,
     certificate_name,
+    check_name,
     processes_of,
     spec_of,
 )
@@ -39,7 +40,6 @@ from swarm.errors import ConfigError, StoreError
 from swarm.files import writing
 from swarm.journal import digest_of
 from swarm.liveness import split_rank
-from swarm.wire.fields import check_id
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
@@ -190,9 +190,6 @@ def new_run_id() -> str:
 _HIGHEST = 1 << 61
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
-_LATER_KEYS = (("map", "plot_regions"), ("planner", "places"))
-"""Sections and keys that the version before does not know: at their default they change no id, so that parts of
-both versions agree on one."""
 
 
 def common_run_id(scenario: Scenario) -> str:
@@ -200,10 +197,7 @@ def common_run_id(scenario: Scenario) -> str:
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )
-    settings, defaults = (msgspec.to_builtins(each, order="deterministic") for each in (same, Scenario()))
-    for section, key in _LATER_KEYS:
-        if settings[section][key] == defaults[section][key]:
-            del settings[section][key]
+    settings = msgspec.to_builtins(same, order="deterministic")
     digest = hashlib.blake2b(msgspec.json.encode(settings), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"
 
@@ -212,10 +206,7 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     """Returns the folder of a run on this machine: files of the run, such as a keeper's store, are found there when
     its processes restart. Raises ConfigError on an id that no folder may have, StoreError where the folder cannot
     be made."""
-    try:
-        check_id("run id", run_id)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    check_name("run id", run_id)
     if run_id in (".", "..", LAST):
         raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
     run_dir = runs / run_id
@@ -264,16 +255,16 @@ def _hex_digest(content: bytes) -> bytes:
 class UpOptions:
     """Options of a run.
 
-    table          the processes to start here, in order of start
-    joins          there is a router elsewhere: none is started here
-    run_id         the run to take part in; if None it is made or found
-    began_s        time.monotonic() at which the command was given
-    metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
+    table            the processes to start here, in order of start
+    joins            there is a router elsewhere: none is started here
+    run_id           the run to take part in; if None it is made or found
+    began_s          time.monotonic() at which the command was given
+    metrics_port     where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
-    log_format     of all logs of this machine
-    record_inputs  of every process, for `swarm runs replay`
-    takes_over     from the launcher that runs this part of the run here
-    stays_watched  goes on beyond the scenario's seconds while a viewer is connected
+    log_format       of all logs of this machine
+    record_inputs    of every process, for `swarm runs replay`
+    takes_over       from the launcher that runs this part of the run here
+    stays_watched    goes on beyond the scenario's seconds while a viewer is connected
     """
 
     scenario: Scenario
@@ -345,10 +336,7 @@ def chosen_processes(
             ids = [spec.id for spec in processes_of(scenario, (role,))]
             if id not in ids and not TABLE[role].any_id:
                 raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
-            try:
-                check_id("--only", id)
-            except ValueError as error:
-                raise ConfigError(str(error)) from error
+            check_name("--only", id)
             every = [spec_of(role, id)]
         chosen |= {spec.name: spec for spec in every}
     if not chosen:

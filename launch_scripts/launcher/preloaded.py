@@ -16,29 +16,22 @@ import signal
 
 from launch_scripts.launcher.forkserver import LOADS, ROLES_AND_KERNELS
 from launch_scripts.parent_death import end_with_parent
+from launch_scripts.process_table import TABLE
 
-MODULES = (
-    "launch_scripts.launcher.child_process",
-    "launch_scripts.launcher.router",
-    "shared_map.keeper.main",
-    "vehicle_agent.main",
-    "launch_scripts.simulation.world.main",
-    "launch_scripts.monitor.main",
-    # Modules which these import at run time, each for itself otherwise.
-    "encodings.idna",
-    "numpy.ma",
-    "psutil",
-)
+_AT_RUN_TIME = ("encodings.idna", "numpy.ma", "psutil")
+"""Modules which roles import at run time, each for itself otherwise."""
 
 loads = os.environ.pop(LOADS, "")
 if loads:
     end_with_parent(signal.SIGKILL)  # with the launcher, even after kill -9 while kernels compile
 gc.disable()  # all that is made here stays: to look for what may go takes a tenth of the time
 try:
-    for name in MODULES:
+    entries = [
+        row.entry.partition(":")[0] for row in TABLE.values() if loads == ROLES_AND_KERNELS or not row.kernels
+    ]
+    for name in ("launch_scripts.launcher.child_process", *entries, *_AT_RUN_TIME):
         importlib.import_module(name)
     if loads == ROLES_AND_KERNELS:
-        importlib.import_module("planner_service.main")
         importlib.import_module("planner_service.kernel_build").load_what_is_there()
 except Exception:  # a role that cannot be loaded says so better in its own log
     logging.getLogger(__name__).exception("cannot load what roles share")

@@ -134,12 +134,12 @@ class MachineSignals:
             with suppress(BusError):  # the launcher before still has the port
                 self._open()
         if self._metrics is not None:
-            from launch_scripts.web.prometheus import Figures, Run, families
+            from launch_scripts.web.prometheus import Run, families
 
             run = Run(*self._run, started_ns) if up is None else None
             alive = observed.up() if up is None else up
             status = observed.status if up is None else {}  # a part hears it until a route is served
-            self._metrics.answer(lambda: families(Figures(run, observed, status, alive)))
+            self._metrics.answer(lambda: families(run, observed, status, alive))
 
     def ends(self) -> None:
         """The run ends from now on; figures are answered no more."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +74,6 @@ _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {REC
 """Said by all others."""
 
 
-class _RefusedError(SwarmError):
-    """A process of this run refused to start, with its reason."""
-
-    def __init__(self, ending: Ending) -> None:
-        super().__init__(f"{ending.spec.name}: {ending.sentence}")
-        self.exit_code = ending.exit_code
-
-
 def run_swarm(options: UpOptions) -> int:
     """Runs to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
@@ -101,17 +93,6 @@ def run_swarm(options: UpOptions) -> int:
     finally:
         if options.is_new and (run is None or not run.begun):
             shutil.rmtree(run_dir, ignore_errors=True)
-
-
-def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
-    """The processes that are started here, in words."""
-    return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
-
-
-def _how_busy() -> str:
-    """The load of this machine, in words."""
-    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    return f"the machine is {'' if load > cores else 'not '}overloaded: load {load:.1f} on {cores} cores"
 
 
 def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
@@ -223,11 +204,9 @@ class _Run:
             with open_bus(network, authenticator=authenticator_of(network, self._run_id)) as bus:
                 self._join(bus)
                 self._say_begin()
-                known: Recorder | OwnPart
+                known: Recorder | OwnPart = OwnPart(self._terrain.grid, self._started_ns)
                 if self._options.records:
                     known = Recorder(self._scenario, self._terrain.grid, self._started_ns)
-                else:
-                    known = OwnPart(self._terrain.grid, self._started_ns)
                 self._known = known
                 watcher = Watcher(bus, known, MonotonicClock())
                 watcher.begin()
@@ -244,7 +223,7 @@ class _Run:
             self._swarm.kill()
         if self._startup_s is None and not self._stop_asked:
             missing = ", ".join(self._missing(watcher)) or "routes"
-            failures.append(f"the swarm was never whole: missing {missing}; {_how_busy()}")
+            failures.append(f"the swarm was never whole: missing {missing}")
         has_run = isinstance(known, OwnPart) or known.routed or not failures
         code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
@@ -284,7 +263,7 @@ class _Run:
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
         incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
-        if self._known is not None and self._take_over is None:  # else the lives before are its own, too
+        if self._known is not None and self._take_over is None:  # else those before are its own, too
             self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,
@@ -415,9 +394,9 @@ class _Run:
         if isinstance(known, OwnPart):
             up = f"{known.well} of this machine's"
             title = self._title(up, elapsed_s)
-            self._terminal.show(lambda: known.line(title, now_ns), lambda on: known.table(title, now_ns, on))
+            self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
-        state = known.shown(now_ns)
+        state = known.summary(now_ns)
         title = self._title(facts.fact("processes_well").shown(state), elapsed_s)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
@@ -434,7 +413,9 @@ class _Run:
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
             if ending.restart_in_s is None:
-                raise _RefusedError(ending)
+                error = SwarmError(f"{ending.spec.name}: {ending.sentence}")
+                error.exit_code = ending.exit_code
+                raise error
             if ending.times <= 3 or ending.times % 10 == 0:
                 again = f"starts again in {ending.restart_in_s:g} s" + (
                     f", time {ending.times}" * (ending.times > 1)
@@ -474,10 +455,10 @@ class _Run:
         return 0 if whole and not self._swarm.cut_short else self._stop_asked.exit_code
 
     def _say_begin(self) -> None:
-        self._terminal.say(
-            f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
-            f"{_counted(self._swarm.by_role())}"
-        )
+        many = Counter(spec.role for spec in self._options.table)
+        processes = ", ".join(f"{number} {role}" for role, number in many.items())
+        scenario = self._scenario
+        self._terminal.say(f"run {self._run_id}: scenario {scenario.name}, seed {scenario.seed}, {processes}")
         router = self._scenario.network.connect[0]
         if self._options.records:
             self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
@@ -490,7 +471,8 @@ class _Run:
         as_json = self._options.as_json
         if isinstance(known, OwnPart):
             if as_json:
-                self._terminal.print_json(json.dumps(known.report(**measured), indent=2))
+                part = {**measured, "recorded": False, "restarts": self._swarm.restarts}
+                self._terminal.print_json(json.dumps(part, indent=2))
             else:
                 self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
             return True

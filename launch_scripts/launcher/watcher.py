@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
-from typing import Any
 
-from rich.console import Console, Group
-from rich.text import Text
-
-from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS, loads_table
+from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS
 from launch_scripts.observe.fact_table import lines_of
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
-from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import alarms_of
 from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
@@ -33,10 +28,6 @@ _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
 """Topics of all processes that a launcher receives if another one records the run: routes until one is served."""
 _READ_S = 0.1
 """Longest time for which the launcher reads at once: it has processes to look after."""
-
-
-_OTHER_LINES = 4
-"""Other lines of the table: title, empty line, labels, and the line of the prompt."""
 
 
 class OwnPart(LatestState):
@@ -69,36 +60,13 @@ class OwnPart(LatestState):
         """Returns the number of living processes, in words."""
         return f"{len(self.own_up())} of {len(self.own)}"
 
-    def own_loads(self) -> list[ProcessLoad]:
-        """Returns the load of each process that has published any."""
-        own = {spec.name for spec in self.own}
-        return [line for line in self.loads.lines(self.own_up()) if line.name in own]
-
     def own_alarms(self, now_ns: int) -> list[str]:
         """Returns their alarms, in lines for people."""
         alarms = alarms_of(self, self.plan.targets, now_ns)
         return lines_of([alarm for alarm in alarms if alarm.lasts], self.grid, SHOWN_ALARMS)
 
-    def report(self, *, run_id: str, seconds: float, startup_s: float | None) -> dict[str, Any]:
-        """Returns for programs: these processes, and a note that another launcher reports all others."""
-        return {
-            "run_id": run_id,
-            "recorded": False,
-            "seconds": seconds,
-            "startup_s": startup_s,
-            "restarts": sum(line.restarts for line in self.own_loads()),
-            "processes": sorted(spec.name for spec in self.own),
-        }
-
-    def table(self, title: str, now_ns: int, console: Console) -> Group:
-        """All of it: each process, or each role where the console has too few lines."""
-        alarms, lines = self.own_alarms(now_ns), self.own_loads()
-        table = loads_table(lines, each=len(lines) <= console.height - len(alarms) - _OTHER_LINES)
-        return Group(Text(title, style="bold"), *(Text(line, style="red") for line in alarms), Text(), table)
-
-    def line(self, title: str, now_ns: int) -> str:
-        """The same in one line."""
-        restarts = sum(line.restarts for line in self.own_loads())
+    def line(self, title: str, now_ns: int, restarts: int) -> str:
+        """All of it in one line."""
         alarms = "".join(f"; {line}" for line in self.own_alarms(now_ns))
         return f"{title}: processes {self.well}, restarts {restarts}{alarms}"
 

@@ -23,7 +23,6 @@ from launch_scripts.monitor.movers.styles import FOLLOWED_ENTITY, HINT, HUES, Le
 from launch_scripts.monitor.view_outputs import Colour, Pen, in_markdown, screen, shown
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe import palette
-from launch_scripts.observe.history import Sample
 from launch_scripts.observe.run_alarms import KINDS
 from launch_scripts.observe.run_state import RunState
 from swarm.config.scenario import Scenario
@@ -304,15 +303,17 @@ class FiguresPanel:
         ):
             self._pen.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=hues, widths=1.5), static=True)
 
-    def plots(self, sample: Sample) -> None:
+    def plots(self, state: RunState) -> None:
         """Logs a point of each line whose value is known."""
-        excess = {id: (gap - 1) * 100 for id, gap in sample.gaps.items()}
+        of = {line.id: line for line in state.targets}
+        lines = [of.get(id) for id in self._target_ids]
+        gaps = [None if line is None or line.gap is None else line.gap.mean for line in lines]
         charts: dict[str, Sequence[float | None]] = {
-            "states": [float(n) for n in sample.states],
-            "captures_and_marks": [sample.captures, None if sample.marks is None else sample.marks / 100],
-            "gap": [excess.get(id) for id in self._target_ids],
-            "growth_ms": [sample.growth_ms.get(id) for id in self._target_ids],
-            "messages": [sample.messages_per_s],
+            "states": [float(n) for n in state.states.values()],
+            "captures_and_marks": [state.captures, None if state.marks is None else state.marks / 100],
+            "gap": [None if gap is None else (gap - 1) * 100 for gap in gaps],
+            "growth_ms": [None if line is None else line.growth_ms for line in lines],
+            "messages": [state.messages_per_s],
         }
         for chart, values in charts.items():
             if any(value is not None for value in values):

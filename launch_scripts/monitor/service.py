@@ -1,7 +1,7 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
 It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
-process waits for it. It loads rerun, so it is imported while the monitor takes part in its run already.
+process waits for it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable
-from functools import partial
 
 from PIL import Image
 
@@ -25,8 +24,9 @@ from launch_scripts.monitor.live_layout import (
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.recorder import RunFigures
+from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
+from launch_scripts.observe.run_state import state_of
 from launch_scripts.web.live_page import LivePage
 from launch_scripts.web.server import Audience
 from shared_map.array_files import give_back_memory
@@ -47,12 +47,12 @@ from swarm.runtime.stats import VIEWERS, Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, NOTE, SIGHTED, Topic
+from swarm.wire.topics import BELIEVED, COST, FLEET, FOLLOWED, NOTE, OBSTACLE, SIGHTED, Topic
 
 log = logging.getLogger(__name__)
 
 _READ: dict[Topic, float] = {
-    **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5
+    **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, OBSTACLE: 0.0, BELIEVED: 0.5
 }  # fmt: skip
 """Topics on show, and the interval at which the newest of each key is taken; 0 for each frame. Marks come by way of
 the map's sync."""
@@ -74,7 +74,6 @@ class MonitorService:
     web_port   port of the live view's page on this machine; 0: it has none
     recording  watches the file of the recording, if there is one
     audience   viewers of the stream; if not given, there is always one
-    member     one that has joined already; None: one that joins when the service starts
     """
 
     def __init__(
@@ -88,27 +87,25 @@ class MonitorService:
         web_port: int = 0,
         recording: RecordingWatch | None = None,
         audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
-        member: Member | None = None,
     ) -> None:
         scenario = setup.scenario
-        self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
+        self.observed = LatestState(plan_of(scenario, setup.started_ns), terrain.grid)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
         self.said: list[str] = []
         """The newest figures in lines, for the start page. Read by other threads, too."""
         self._setup, self._bus, self._post, self._pen = setup, bus, post, scene.pen
         self._recording, self._audience = recording, audience
-        self._joins = member is None
-        self._member = member or Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
         self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._panel = FiguresPanel(scene.pen, scenario.target_ids)
-        self._movers = MoversView(scene.pen, scenario, self.figures, self.counters, replica.filter)
+        self._movers = MoversView(scene.pen, scenario, self.observed, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
-        self._observer = RunObserver(bus, post, self.figures, _READ)
+        self._observer = RunObserver(bus, post, self.observed, _READ)
         self._watched = False
         self._drawn_for = 0
         """Number of viewers that had ever connected at the last complete redraw."""
@@ -117,7 +114,6 @@ class MonitorService:
         """Ticks so far, and those in which something was drawn."""
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._last_sample_s = -1.0
         self._member.needs("the shared map", lambda: self._sync.joined)
 
     def lacks(self) -> list[str]:
@@ -125,11 +121,10 @@ class MonitorService:
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
-        if self._joins:
-            self._member.join()
+        self._member.join()
         self._observer.keep_samples()
         self._observer.ask_gone()
-        self.figures.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
+        self.observed.alive(self._member.peer, True, now_ns)  # others receive it, and no process receives itself
         self._sync.start(now_ns)
         self._pen.set_time(0, 0.0)
         self._begin_drawing()
@@ -163,7 +158,7 @@ class MonitorService:
     def stop(self, now_ns: int) -> None:
         for heard in self._observer.due(now_ns, all=True):
             self._hear(heard, now_ns)
-        self.figures.finish(now_ns)
+        self.observed.touch(now_ns)
         self._limit.all_due()
         self._ground.finish()
         self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
@@ -189,17 +184,14 @@ class MonitorService:
                 self._panel.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        self.figures.alive(peer, up, now_ns)
+        self.observed.alive(peer, up, now_ns)
         if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
             self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
     def _watch_recording(self, now_ns: int) -> None:
-        if self._recording is None:
-            return
-        sentence, begun = self._recording.check(now_ns)
-        if begun:
+        if self._recording is not None and (path := self._recording.check(now_ns)) is not None:
             self._begin_drawing()
-        if sentence is not None:
+            sentence = f"the recording had ended, and goes on in {path}"
             log.warning("%s", sentence)
             self._member.note(now_ns, "recording", sentence)
 
@@ -234,15 +226,12 @@ class MonitorService:
             self._pen.flush()
 
     def _draw_plots(self, now_ns: int) -> None:
-        sample = self.figures.samples.last
-        if sample is not None and sample.time_s != self._last_sample_s:
-            self._last_sample_s = sample.time_s
-            self._panel.plots(sample)
         if self._limit.due("figures", now_ns):  # by our own clock: a swarm that says nothing any more is news, too
-            summary = self.figures.shown(now_ns)
-            self._movers.summarised(summary)
-            self._panel.summary(summary_markdown(self._setup, summary))
-            self.said = [facts.fact("elapsed_s").said(summary), *facts.lines(summary)]
+            state = state_of(self.observed, now_ns)
+            self._movers.summarised(state)
+            self._panel.plots(state)
+            self._panel.summary(summary_markdown(self._setup, state))
+            self.said = [facts.fact("elapsed_s").said(state), *facts.lines(state)]
 
 
 def load_view(
@@ -252,10 +241,8 @@ def load_view(
     post: Post,
     closing: contextlib.ExitStack,
     page: LivePage | None = None,
-) -> Callable[[Member], MonitorService]:
-    """Prepares drawing, opens the recording and the live view's ports, and returns the factory of the service.
-
-    Called on a thread of its own, so what it returns is called by the thread that owns the service.
+) -> MonitorService:
+    """Prepares drawing, opens the recording and the live view's ports, and makes the service.
 
     closing  closes what it opens
     page     of the live view, which is served already
@@ -278,14 +265,12 @@ def load_view(
     scene = Scene(Pen(sinks.streams, mesh), layers, truth, scenario_areas(scenario, terrain.grid))
     watch = None if path is None else RecordingWatch(path, sinks.begin_file)
 
-    def make(member: Member) -> MonitorService:
-        served = partial(MonitorService, web_port=sinks.web_port, audience=sinks.audience)
-        service = served(setup, terrain, bus, post, scene, recording=watch, member=member)
-        give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
-        life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
-        told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
-        if sinks.page is not None:
-            sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
-        return service
-
-    return make
+    service = MonitorService(
+        setup, terrain, bus, post, scene, web_port=sinks.web_port, recording=watch, audience=sinks.audience
+    )
+    give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
+    life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
+    told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
+    if sinks.page is not None:
+        sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
+    return service

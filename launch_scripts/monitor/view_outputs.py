@@ -26,7 +26,6 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.observe.run_folder import SAY_EVERY_S
 from launch_scripts.web import LOOPBACK
 from launch_scripts.web.live_page import LivePage, when_free
 from launch_scripts.web.server import Audience, Server
@@ -238,11 +237,6 @@ class Sinks:
             self.rec.set_sinks(*live, default_blueprint=blueprint)
 
     @property
-    def stream_url(self) -> str | None:
-        """Address for a native viewer."""
-        return None if self.gate is None else f"rerun+{self.gate.url}/proxy"
-
-    @property
     def web_port(self) -> int:
         """Port of the live view's page on this machine; 0 without one."""
         return 0 if self.page is None else self.page.server.port
@@ -317,8 +311,10 @@ class RateLimit:
 
 
 class RecordingWatch:
-    """Notices that a recording has ended for want of space, says so, and begins another when there is some. Rerun's
-    file sink ends at the first error, with a line in its own log only.
+    """Notices that a recording has ended for want of space, and begins another when there is some.
+
+    Rerun's file sink ends at the first error, with a line in its own log only. The launcher says that the disk is
+    full (`DiskWatch`).
 
     begin  sends later drawings to this file as well; raises StoreError if it cannot
     """
@@ -328,23 +324,18 @@ class RecordingWatch:
         self._begin = begin
         self._size, self._still = -1, 0
         """Bytes of the file, and checks that found as many, without a break."""
-        self._limit = RateLimit({"look": 1.0, "try": _RETRY_S, "say": SAY_EVERY_S})
+        self._limit = RateLimit({"look": 1.0, "try": _RETRY_S})
 
-    def check(self, now_ns: int) -> tuple[str | None, bool]:
-        """Returns a sentence to report, if any, and whether a new file has begun, which is empty yet."""
-        if not self._limit.due("look", now_ns) or not self._has_ended():
-            return None, False
-        if self._limit.due("say", now_ns):
-            return f"the recording {self._path} has ended: {self._why()}; another begins when there is space", False
-        if self._limit.due("try", now_ns):
+    def check(self, now_ns: int) -> Path | None:
+        """Returns the new file, if one has begun, which is empty yet."""
+        if self._limit.due("look", now_ns) and self._has_ended() and self._limit.due("try", now_ns):
             with contextlib.suppress(StoreError):
                 check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
                 self._begin(self._path)
                 self._size, self._still = -1, 0
-                self._limit.all_due()
-                return f"the recording goes on in {self._path}", True
-        return None, False
+                return self._path
+        return None
 
     def _has_ended(self) -> bool:
         before = self._size
@@ -352,13 +343,6 @@ class RecordingWatch:
             self._size = self._path.stat().st_size
         self._still = self._still + 1 if self._size == before else 0
         return self._still >= STILL_CHECKS
-
-    def _why(self) -> str:
-        try:
-            check_space(self._path.parent)
-        except StoreError as error:
-            return str(error).rpartition(": ")[2]  # which file it is stands before
-        return "it does not grow"
 
 
 def check_space(folder: Path) -> None:

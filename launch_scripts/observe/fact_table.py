@@ -131,10 +131,10 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
     Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),
     Fact(
-        "driven_into", "bodies driven into", count,
-        "Vehicles that drove into a body which had said in time where it is; must be 0.",
+        "driven_into", "obstacles driven into", count,
+        "Vehicles that drove into an obstacle which had said in time where it is; must be 0.",
     ),
-    Fact("hit_by_bodies", "vehicles hit by bodies", count, "The bodies' own fault."),
+    Fact("hit_by_obstacles", "vehicles hit by obstacles", count, "The obstacles' own fault."),
     Fact(
         "processes_well", "processes", of_all,
         "Processes that are alive, or ended as asked, of those that the run needs.", of="well",
@@ -177,12 +177,9 @@ def fact(name: str) -> Fact[RunState]:
     return _BY_NAME[name]
 
 
-def table(state: RunState, *, whole: bool = False) -> tuple[list[str], list[list[str]]]:
-    """The labels of the columns, and a row for each target.
-
-    whole  with the columns that `swarm status` alone has
-    """
-    columns = [column for column in TARGET_FACTS if whole or column.always]
+def table(state: RunState) -> tuple[list[str], list[list[str]]]:
+    """The labels of the columns that every table of targets has, and a row for each target."""
+    columns = [column for column in TARGET_FACTS if column.always]
     rows = [[column.shown(line) for column in columns] for line in state.targets]
     return [column.label for column in columns], rows
 
@@ -196,7 +193,7 @@ LINES: tuple[tuple[str, ...], ...] = (
 """Lines in which the facts of a run are set."""
 IF_ANY = ("learned", "sent")
 """Facts that have a line of their own, where there is anything to say."""
-MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
+MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "payloads_dropped")
 """Facts that are shown only where they are not 0."""
 
 

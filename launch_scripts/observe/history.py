@@ -71,6 +71,7 @@ def buckets_of(buckets: Mapping[int, int]) -> Buckets:
 class Sample:
     """The run at one instant. `states` counts vehicles per VehicleState; totals are None until published.
 
+    growth_ms              of the last growth of a tree, mean over targets
     gap_excess             the histogram of certified gaps - 1 of all routes that were begun until then
     waiting_s, standing_s  of all vehicles together until `driven_s`, as `Driven` counts them
     driven_s               UNIX time of the last count of these; 0 before
@@ -80,12 +81,8 @@ class Sample:
     states: tuple[int, ...]
     captures: int | None
     marks: int | None
-    reroute_requests: int | None
-    routes_served: int | None
     messages_per_s: float | None
-    alive: int
-    gaps: dict[str, float]
-    growth_ms: dict[str, float]
+    growth_ms: float | None
     gap_excess: Buckets = field(default_factory=lambda: buckets_of({}))
     waiting_s: float = 0.0
     standing_s: float = 0.0

@@ -1,8 +1,7 @@
 """The recorder of a run: takes messages, returns numbers. Launcher and simulation share it.
 
-`RunFigures` keeps the figures of a run at successive instants, which is all that the live view needs. `Recorder`
-keeps tracks, routes, captures and notes, too, and makes the report. Pure: time is an argument, and the owner of a
-bus passes it messages on `HEARD` or `RECORDED`.
+It keeps samples, tracks, routes, captures and notes beside the newest state, and makes the report. Pure: time is an
+argument, and the owner of a bus passes it messages on `RECORDED`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,75 +35,8 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
-_SHOWN_NS = 5 * NS_PER_S // 4
-"""Largest age of shown values: a sample is taken with the first message after its second."""
-
-
-class RunFigures:
-    """Samples of a run, in memory which does not grow with the rate of messages."""
-
-    def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
-        """started_ns  when the run began; None: with the first message"""
-        self.scenario = scenario
-        self.grid = grid
-        self.observed = LatestState(plan_of(scenario, started_ns), grid)
-        self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
-        self._sample_due_ns = 0
-        self._sampled: tuple[int, RunState] | None = None
-        """Time when the last sample was taken or shown, and of which state."""
-
-    def heard(self, message: Message, now_ns: int) -> None:
-        """Takes in one message."""
-        if self.observed.heard(message, now_ns) is not None:
-            self._look(now_ns)
-
-    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        """A liveliness token rose or fell."""
-        self.observed.alive(peer, up, now_ns)
-        self._look(now_ns)
-
-    def finish(self, now_ns: int) -> None:
-        """The run is over: its last sample is of its end."""
-        self.observed.touch(now_ns)
-        self._add_sample(now_ns)
-
-    def summary(self, now_ns: int) -> RunState:
-        """Returns the state of the run at a time."""
-        return state_of(self.observed, now_ns)
-
-    def shown(self, now_ns: int) -> RunState:
-        """Returns the state for displays: that of the last sample, so that it is made once a second for all. It is
-        made again if the swarm has been silent since, as that is news, too."""
-        if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
-            self._sampled = now_ns, self.summary(now_ns)
-        return self._sampled[1]
-
-    def _look(self, now_ns: int) -> None:
-        if now_ns >= self._sample_due_ns:
-            self._add_sample(now_ns)
-
-    def _add_sample(self, now_ns: int) -> None:
-        self._sample_due_ns = now_ns + _SAMPLE_NS
-        state = self.summary(now_ns)
-        self._sampled = now_ns, state
-        self.samples.add(self._sample(state))
-
-    def _sample(self, state: RunState) -> Sample:
-        return Sample(
-            time_s=state.elapsed_s,
-            states=tuple(state.states.values()),
-            captures=state.captures,
-            marks=state.marks,
-            reroute_requests=state.reroute_requests,
-            routes_served=state.routes_served,
-            messages_per_s=state.messages_per_s,
-            alive=state.alive,
-            gaps={line.id: line.gap.mean for line in state.targets if line.gap and line.gap.mean is not None},
-            growth_ms={line.id: line.growth_ms for line in state.targets if line.growth_ms is not None},
-            gap_excess=history.buckets_of(self.observed.histogram("followed_gap_excess").buckets),
-        )
-
-
+_POINTS = 120
+"""Instants in a report: a shard of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000
@@ -126,12 +58,17 @@ class Capture:
 _ON_THE_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
 
 
-class Recorder(RunFigures):
+class Recorder:
     """Samples, tracks, routes, captures and notes of a run, in memory which does not grow with the rate of
     messages."""
 
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
-        super().__init__(scenario, grid, started_ns)
+        """started_ns  when the run began; None: with the first message"""
+        self.scenario = scenario
+        self.grid = grid
+        self.observed = LatestState(plan_of(scenario, started_ns), grid)
+        self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
+        self._sample_due_ns = 0
         self.ready_ns: int | None = None
         """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
@@ -159,6 +96,20 @@ class Recorder(RunFigures):
                 self.notes.append((self.seconds(now_ns), message))
         self._look(now_ns)
 
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        """A liveliness token rose or fell."""
+        self.observed.alive(peer, up, now_ns)
+        self._look(now_ns)
+
+    def finish(self, now_ns: int) -> None:
+        """The run is over: its last sample is of its end."""
+        self.observed.touch(now_ns)
+        self._add_sample(now_ns)
+
+    def summary(self, now_ns: int) -> RunState:
+        """Returns the state of the run at a time."""
+        return state_of(self.observed, now_ns)
+
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
@@ -180,7 +131,8 @@ class Recorder(RunFigures):
         tracks_due, sample_due = self.vehicle_tracks.due(now_ns), now_ns >= self._sample_due_ns
         if tracks_due:
             self._sample_tracks(now_ns, self.observed.vehicles())
-        super()._look(now_ns)
+        if sample_due:
+            self._add_sample(now_ns)
         if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.observed.missing():
             self.ready_ns = now_ns
 
@@ -195,10 +147,24 @@ class Recorder(RunFigures):
         places = [self.observed.place_m(pose) for _, pose in poses]
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
 
-    def _sample(self, state: RunState) -> Sample:
+    def _add_sample(self, now_ns: int) -> None:
+        self._sample_due_ns = now_ns + _SAMPLE_NS
+        state = self.summary(now_ns)
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
-        driven_s = (self.driven.at_ns or 0) / NS_PER_S
-        return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s, driven_s=driven_s)
+        self.samples.add(
+            Sample(
+                time_s=state.elapsed_s,
+                states=tuple(state.states.values()),
+                captures=state.captures,
+                marks=state.marks,
+                messages_per_s=state.messages_per_s,
+                growth_ms=_mean(line.growth_ms for line in state.targets if line.growth_ms is not None),
+                gap_excess=history.buckets_of(self.observed.histogram("followed_gap_excess").buckets),
+                waiting_s=waiting_s,
+                standing_s=standing_s,
+                driven_s=(self.driven.at_ns or 0) / NS_PER_S,
+            )
+        )
 
     def report(
         self,
@@ -225,14 +191,14 @@ class Recorder(RunFigures):
             "vehicles": self.scenario.vehicle_count,
             "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
             "targets": len(self.scenario.target_ids),
-            "processes": state.expected,
+            "processes": state.well[1],
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),
             "tracking": observed.tracking(),
-            "stranded": state.states["stranded"] if observed.any_vehicles else None,
-            "lost": state.states["lost"] if observed.any_vehicles else None,
-            "marked_cells": len(self.observed.marked().cells) if observed.any_marks else None,
+            "stranded": state.states["stranded"] if observed.fleet_ns is not None else None,
+            "lost": state.states["lost"] if observed.fleet_ns is not None else None,
+            "marked_cells": len(observed.marked().cells) or None,
             **{name: observed.total(name) for name in _TOTALS},
             "gap": self._gap(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
@@ -242,11 +208,11 @@ class Recorder(RunFigures):
         numbers = {name: _rounded(value) for name, value in fields.items()}
         return {"verdict": verdict(numbers, failures), **numbers}
 
-    def series(self, points: int = 120) -> dict[str, list[Any]]:
-        """The run over time, at about `points` instants at most: lists with one value per `t_s`."""
+    def series(self) -> dict[str, list[Any]]:
+        """The run over time, at about `_POINTS` instants at most: lists with one value per `t_s`."""
         samples = self.samples.all()
-        samples = samples[:: max(1, -(-len(samples) // points))]
-        names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
+        samples = samples[:: max(1, -(-len(samples) // _POINTS))]
+        names = ("captures", "marks", "messages_per_s")
         gaps = history.certified_gaps(samples)
         fields: dict[str, list[Any]] = {
             "t_s": [sample.time_s for sample in samples],
@@ -256,8 +222,7 @@ class Recorder(RunFigures):
             "routes_begun": [gap["routes"] for gap in gaps],
             "waiting_at_once": history.at_once(samples, lambda sample: sample.waiting_s),
             "standing_at_once": history.at_once(samples, lambda sample: sample.standing_s),
-            "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
-            "messages_per_s": [sample.messages_per_s for sample in samples],
+            "growth_ms_mean": [sample.growth_ms for sample in samples],
         }
         return {name: [_rounded(value) for value in values] for name, values in fields.items()}
 
@@ -288,7 +253,7 @@ _TOTALS = (
 """Counts that are reported, summed over all processes."""
 DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
 """Histograms that are reported whole."""
-TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "obstacle_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 

@@ -5,7 +5,6 @@ A `DiskWatch` says when the folder takes no more data.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import importlib.metadata
 import json
@@ -27,7 +26,7 @@ RUNS = Path("runs")
 """The folder of all runs, if no other is given. Commands look there beside the registry: runs of earlier versions
 are not registered."""
 LAST = "LAST"
-"""In the folder of all runs: a link to the newest; where links are impossible a file that holds its name."""
+"""In the folder of all runs: a link to the newest."""
 _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
 
 
@@ -92,37 +91,24 @@ def run_facts(folder: Path) -> dict[str, Any]:
 
 
 def point_last(folder: Path) -> str | None:
-    """Makes `LAST` beside a run's folder mean that run, at one instant. Returns a sentence the first time that it
-    cannot be a link, and whenever it cannot be at all."""
-    last = folder.parent / LAST
-    partial = folder.parent / f".{LAST}.{os.getpid()}"
-    was_file = last.is_file()
+    """Makes `LAST` beside a run's folder a link to that run, at one instant. Returns a sentence if that is
+    impossible."""
+    last, partial = folder.parent / LAST, folder.parent / f".{LAST}.{os.getpid()}"
     try:
         partial.unlink(missing_ok=True)
         partial.symlink_to(folder.name, target_is_directory=True)
         partial.replace(last)
-    except (OSError, NotImplementedError):
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        try:
-            write_file(last, f"{folder.name}\n".encode())
-        except StoreError as error:
-            return f"{error}; it still means another run"
-        if not was_file:
-            return f"no links can be made in {folder.parent}: {LAST} is a file there that holds the run's name"
+    except OSError as error:
+        return f"{last} cannot be made a link to this run: {error.strerror or error}"
     return None
 
 
 def find_run(name: str, runs: Path) -> Path:
-    """The folder of a run: a path, or its name in `runs`, where `LAST` may be a file. In the usual folder also the
-    name of a registered run, of which `LAST` is the newest. Raises ConfigError."""
+    """The folder of a run: a path, or its name in `runs`. In the usual folder also the name of a registered run, of
+    which `LAST` is the newest. Raises ConfigError."""
     for path in (Path(name), runs / name):
         if os.path.isdir(path):  # unlike `Path.is_dir` also of a name that is too long
             return path
-        if path.name == LAST and path.is_file():
-            named = path.parent / read_text(path, FileKind.RUN).strip()
-            if named.is_dir():
-                return named
     known = [run.folder for run in registered() if name in (run.name, LAST)] if runs == RUNS else []
     if name != LAST and len(known) > 1:
         folders = ", ".join(map(str, known))

@@ -67,13 +67,14 @@ class RunState:
     elapsed_s       time of the run, since it began
     states          vehicles that are driven, by VehicleState
     classes         the same by class, "ground" first
-    alive           processes that are as they should be: alive, or ended because they were asked to
-    expected        processes that the run needs
-    crew            role -> (alive, expected)
+    driven          vehicles that an agent drives, and all of the run
+    well            processes that are as they should be (alive, or ended because they were asked to), and all that
+                    the run needs
+    crew            the same by role
     learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
                     whose prior does not stand
     goals           progress of the vehicles that were sent to places
-    beside          processes that are alive and not needed: routers, monitors, agents of guests
+    beside          processes that are alive and not needed: routers, monitors, agents of external vehicles
     messages_per_s  that all processes send now
     """
 
@@ -81,21 +82,19 @@ class RunState:
     targets: tuple[TargetLine, ...]
     states: dict[str, int]
     classes: dict[str, int]
-    vehicles: int
-    vehicles_planned: int
+    driven: tuple[int, int]
     following: int
     captures: int | None
     collisions: int | None
     lethal_entries: int | None
     driven_into: int | None
-    hit_by_bodies: int | None
+    hit_by_obstacles: int | None
     reroute_requests: int | None
     routes_served: int | None
     marks: int | None
     messages_per_s: float | None
     payloads_dropped: int | None
-    alive: int
-    expected: int
+    well: tuple[int, int]
     restarts: int
     crew: dict[str, tuple[int, int]]
     beside: dict[str, int]
@@ -107,19 +106,9 @@ class RunState:
     grid: GridSpec
 
     @property
-    def driven(self) -> tuple[int, int]:
-        """Vehicles that an agent drives, and all of the run."""
-        return self.vehicles, max(self.vehicles_planned, self.vehicles)
-
-    @property
     def sent(self) -> dict[str, int]:
         """Vehicles that were sent to places, by the state of their goals."""
         return dict(Counter(goal.state for goal in self.goals))
-
-    @property
-    def well(self) -> tuple[int, int]:
-        """Processes that are as they should be, and all that the run needs."""
-        return self.alive, self.expected
 
     @property
     def standing_alarms(self) -> tuple[Alarm, ...]:
@@ -133,8 +122,8 @@ def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int
 
 
 _TOTALS = (
-    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_bodies", "reroute_requests", "routes_served",
-    "marks", "payloads_dropped",
+    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests",
+    "routes_served", "marks", "payloads_dropped",
 )  # fmt: skip
 """Fields of a `RunState` which are counts of that name, summed over all processes."""
 
@@ -155,12 +144,10 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         targets=_lines(latest, targets, vehicles, now_ns),
         states=vehicles.count_states(),
         classes=_by_class(vehicles.ids, latest.classes()),
-        vehicles=len(vehicles),
-        vehicles_planned=latest.plan.vehicles,
+        driven=(len(vehicles), max(latest.plan.vehicles, len(vehicles))),
         following=int(np.count_nonzero(vehicles.targets >= 0)),
         messages_per_s=latest.now_of(MESSAGES_PER_S),
-        alive=sum(well),
-        expected=len(crew),
+        well=(sum(well), len(crew)),
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),

@@ -7,7 +7,7 @@ and `swarm status`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -27,38 +27,42 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
     return sum(told) if told else None
 
 
-_MOST_LIVES = 1 << 13
-"""Lives of processes that are counted: names may be made up by strangers."""
+_MOST_GENERATIONS = 1 << 13
+"""Generations of processes that are counted: names may be made up by strangers."""
 
 
 class Counts:
-    """The newest counts of every incarnation of every process."""
+    """The newest counts of every process, and of its earlier generations only what no later one carries on: an hour
+    of kills takes no more memory than a minute."""
 
     def __init__(self) -> None:
-        self._stats: dict[tuple[str, str, int], Stats] = {}
-        self._counting: list[Stats] | None = None
-        """Lives that are summed; None since the last that was new."""
+        self._generations: dict[tuple[str, str], dict[int, Stats]] = {}
+        """(role, id) -> incarnation -> what it has said last."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
-        """(role, id) -> begin and end of the longest time without counts in one life, if that was long."""
+        """(role, id) -> begin and end of the longest time without counts in one generation, if that was long."""
 
     def count(self, stats: Stats) -> None:
         """Takes in what a process says."""
-        key = (stats.role, stats.id, stats.incarnation)
-        known = self._stats.get(key)
-        if known is None and len(self._stats) >= _MOST_LIVES:
+        of = (stats.role, stats.id)
+        generations = self._generations.get(of, {})
+        known = generations.get(stats.incarnation)
+        if known is None:
+            if any(_carries(each, stats.incarnation) for each in generations.values()):
+                return
+            if sum(map(len, self._generations.values())) >= _MOST_GENERATIONS:
+                return
+            self._generations[of] = generations = {
+                generation: each for generation, each in generations.items() if not _carries(stats, generation)
+            }
+        elif stats.stamp_ns < known.stamp_ns:
             return
-        if known is None or stats.stamp_ns >= known.stamp_ns:
-            self._stats[key] = stats
-            self._counting = None
-            of = (stats.role, stats.id)
-            newest = self._newest.get(of)
-            if newest is None or stats.incarnation >= newest.incarnation:
-                self._newest[of] = stats
-            began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
-            if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
-                self.silences[of] = (known.stamp_ns, stats.stamp_ns)
+        generations[stats.incarnation] = stats
+        self._newest[of] = generations[max(generations)]
+        began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
+        if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
+            self.silences[of] = (known.stamp_ns, stats.stamp_ns)
 
     def newest_stats(self, role: str, id: str) -> Stats | None:
         """Returns the last `Stats` of a process's newest incarnation."""
@@ -68,17 +72,8 @@ class Counts:
         """(role, id) -> what its newest incarnation has said last, in order."""
         return dict(sorted(self._newest.items()))
 
-    def _summed(self) -> list[Stats]:
-        """Returns the summed counts: of lives whose counts a later one carries on only the later."""
-        if self._counting is None:
-            self._counting = []
-            before: dict[tuple[str, str], int] = {}
-            """(role, id) -> the incarnation from which on all is counted."""
-            for (role, id, incarnation), stats in sorted(self._stats.items(), reverse=True):
-                if incarnation < before.get((role, id), incarnation + 1):
-                    self._counting.append(stats)
-                    before[role, id] = min(stats.since or incarnation, incarnation)
-        return self._counting
+    def _summed(self) -> Iterator[Stats]:
+        return (stats for generations in self._generations.values() for stats in generations.values())
 
     def total(self, name: str) -> int | None:
         """A count, summed over processes and incarnations; None if no process has published it."""
@@ -112,6 +107,11 @@ class Counts:
     def histogram(self, name: str) -> Histogram:
         """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._summed())
+
+
+def _carries(stats: Stats, incarnation: int) -> bool:
+    """Returns True if a generation counts on where an earlier one ended."""
+    return 0 < stats.since <= incarnation < stats.incarnation
 
 
 # --- the certified gap --------------------------------------------------------------------------------------------

@@ -41,10 +41,13 @@ def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
 
 
 def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
-    """Versions and machines that are not the same."""
-    made = [_table(run.report.get("made")) for run in runs]
-    found = _that_differ([_flat({name: each.get(name) for name in ("versions", "machine")}, "") for each in made])
-    return [row for row in found if "." in row[0]]
+    """Versions, machines, terrains, and kinds of run that are not the same: what makes figures incomparable."""
+    told = []
+    for report in (run.report for run in runs):
+        made, digest = _table(report.get("made")), _table(report.get("terrain")).get("digest")
+        of = {name: _flat(made.get(name) or {}, name) for name in ("versions", "machine")}
+        told.append({**of["versions"], **of["machine"], "terrain": digest, "simulated": "simulated" in report})
+    return _that_differ(told)
 
 
 def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
@@ -55,29 +58,6 @@ def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
         for key in dict.fromkeys(key for each in known for key in each)
         if _differ(each.get(key) for each in known)
     ]
-
-
-def remarks(runs: Sequence[LeftRun]) -> list[str]:
-    """Returns notes on differences that affect a comparison, in sentences."""
-    terrains = [_table(run.report.get("terrain")).get("digest") for run in runs]
-    seeds, seconds, scales = ([run.report.get(name) for run in runs] for name in ("seed", "seconds", "time_scale"))
-    simulated = [bool(run.report.get("simulated")) for run in runs]
-    lengths = [value for value in seconds if isinstance(value, int | float)]
-    said = (
-        (_differ(terrains), "The terrains differ: costs, distances and gaps are of other ground."),
-        (_differ(seeds), f"The seeds differ ({_each(seeds)}): part of each difference is chance."),
-        (
-            bool(lengths) and max(lengths) > 1.05 * min(lengths),
-            f"The runs lasted {_each(f'{value:.0f}' for value in lengths)} s: counts grow with time.",
-        ),
-        (_differ(scales), f"Motion was {_each(scales)} times real motion: the same seconds are not the same way."),
-        (_differ(simulated), "Some ran live and some in a simulation: their response times are not comparable."),
-    )
-    return [sentence for differs, sentence in said if differs]
-
-
-def _each(values: Iterable[Any]) -> str:
-    return ", ".join(str(value) for value in values)
 
 
 def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:

@@ -6,11 +6,13 @@ import base64
 import io
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import msgspec
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 from markupsafe import Markup
 from matplotlib.axes import Axes
@@ -107,14 +109,7 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
     began = (report.get("made") or {}).get("began")
     began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
-    told = [
-        Alarm(
-            row["kind"], row["about"], row["text"], row["since_s"], row["over_s"],
-            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"], row.get("heard_s"),
-            began_ns,
-        )
-        for row in report.get("alarms") or []
-    ]  # fmt: skip
+    told = [replace(each, began_ns=began_ns) for each in msgspec.convert(report.get("alarms") or [], list[Alarm])]
     groups = [
         (line, alarms[0].serious, [each.line(grid) for each in alarms] if len(alarms) > 1 else [])
         for line, alarms in grouped(told, grid)

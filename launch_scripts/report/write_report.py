@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[str, Any]:
-    """The numbers of a run.
+    """The numbers of a run, its terrain and its course.
 
     measured  what the caller knows better than the recorder, as `Recorder.report` takes it
     """

@@ -24,7 +24,6 @@ from prometheus_client.metrics_core import HistogramMetricFamily as HistogramOf
 from prometheus_client.metrics_core import InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web import LOOPBACK, Reply
 from launch_scripts.web.health_verdict import Process, health_pages
@@ -61,26 +60,6 @@ class Run(NamedTuple):
     started_ns: int
 
 
-class Figures(NamedTuple):
-    """Metrics that an observer knows of a run.
-
-    run  None where it knows a part of the run only
-    up   (role, id) of the processes that are alive
-    """
-
-    run: Run | None
-    counts: Counts
-    status: Mapping[str, PlannerStatus]
-    up: Collection[tuple[str, str]]
-
-
-def figures_of(run: RunInfo | None, latest: LatestState | None) -> Figures:
-    """The figures of a run which is observed from outside; none before it is found."""
-    if run is None or latest is None:
-        return Figures(None, Counts(), {}, [])
-    return Figures(Run(run.run_id, run.scenario, run.started_ns), latest, latest.status, latest.up())
-
-
 class _Families:
     """Metric families by name. The first to add a name owns it: counters of processes have names from the network,
     and none of them replaces one of ours."""
@@ -104,38 +83,43 @@ class _Families:
             family.add_metric(tuple(labels.values()), *value)
 
 
-def families(figures: Figures) -> list[Metric]:
-    """All metric families, each once, in order of name."""
+def families(
+    run: Run | RunInfo | None, counts: Counts, status: Mapping[str, PlannerStatus], up: Collection[tuple[str, str]]
+) -> list[Metric]:
+    """All metric families of what an observer knows, each once, in order of name.
+
+    run  None where it knows a part of the run only
+    up   (role, id) of the processes that are alive
+    """
     made = _Families()
-    if figures.run is not None:
-        told = {"run_id": figures.run.run_id, "scenario": figures.run.scenario}
-        made.add(InfoMetricFamily, "run", {}, told)
-        made.add(Gauge, "run_start_time_seconds", {}, figures.run.started_ns / NS_PER_S)
-    _add_targets(made, figures)
-    _add_processes(made, figures)
+    if run is not None:
+        made.add(InfoMetricFamily, "run", {}, {"run_id": run.run_id, "scenario": run.scenario})
+        made.add(Gauge, "run_start_time_seconds", {}, run.started_ns / NS_PER_S)
+    _add_targets(made, counts, status)
+    _add_processes(made, counts, up)
     return [family for _, (_, family) in sorted(made.made.items(), key=lambda item: item[0])]
 
 
-def _add_targets(made: _Families, figures: Figures) -> None:
-    for target, count in figures.counts.counts_by(CAPTURES_OF).items():
+def _add_targets(made: _Families, counts: Counts, status: Mapping[str, PlannerStatus]) -> None:
+    for target, count in counts.counts_by(CAPTURES_OF).items():
         made.add(Counter, "target_captures", {"target": target}, count)
-    for target, gaps in figures.counts.histograms_by(GAPS_TO).items():
+    for target, gaps in counts.histograms_by(GAPS_TO).items():
         made.add(HistogramOf, "target_certified_gap_ratio", {"target": target}, *_buckets(gaps.buckets, 1.0))
-    for target, status in sorted(figures.status.items()):
+    for target, told in sorted(status.items()):
         for name, value in {
-            "vehicles_following": status.following,
-            "tree_age_seconds": status.tree_age_ms * 1e-3,
-            "pose_age_seconds": status.pose_age_s,
-            "lost": float(status.tracker_lost),
+            "vehicles_following": told.following,
+            "tree_age_seconds": told.tree_age_ms * 1e-3,
+            "pose_age_seconds": told.pose_age_s,
+            "lost": float(told.tracker_lost),
         }.items():
             if value is not None:
                 made.add(Gauge, f"target_{name}", {"target": target}, value)
 
 
-def _add_processes(made: _Families, figures: Figures) -> None:
-    newest = {key: ({"role": key[0], "id": key[1]}, stats) for key, stats in figures.counts.newest().items()}
-    for role, id in sorted({*figures.up, *newest}):
-        made.add(Gauge, "process_up", {"role": role, "id": id}, float((role, id) in figures.up))
+def _add_processes(made: _Families, counts: Counts, up: Collection[tuple[str, str]]) -> None:
+    newest = {key: ({"role": key[0], "id": key[1]}, stats) for key, stats in counts.newest().items()}
+    for role, id in sorted({*up, *newest}):
+        made.add(Gauge, "process_up", {"role": role, "id": id}, float((role, id) in up))
     for process, stats in newest.values():
         made.add(Gauge, "process_start_time_seconds", process, stats.incarnation / NS_PER_S)
         made.add(Gauge, "process_reported_timestamp_seconds", process, stats.stamp_ns / NS_PER_S)

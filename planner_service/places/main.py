@@ -36,7 +36,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             bus,
             inbox.post,
             boundary.worker(worker),
-            boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
+            boundary.function("all kernels", lambda: kernels.complete, bool),
         )
 
     with closing(ThreadWorker("grow-places", inbox)) as worker:

@@ -274,18 +274,6 @@ class CostGrid:
             frozen.cell_cost[part] = self.cell_cost[part]
         return frozen
 
-    @property
-    def shared(self) -> Self | None:
-        """A snapshot as of `share`; None where nothing is shared."""
-        if self._shared is None:
-            return None
-        first = copy.copy(self)
-        first._make_scratch()
-        first.cell_cost = private_copy(self._shared)
-        first._find_range()
-        first.rounding = Rounding.of(first.cell_cost)
-        return first
-
     def changes_since(self, older: Floats) -> Changes:
         """Returns the changes since an earlier snapshot of this grid."""
         if self._shared is None:

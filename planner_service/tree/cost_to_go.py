@@ -167,12 +167,9 @@ class CostToGoTree:
 
         far  cells; how far from the root
         The least stride is for distances up to twice as far as the window reaches, the next for twice that, and so
-        on. Returns cells visited. Raises OutsideGridError on a window that is not inside the grid, ValueError on
-        networks of another map.
+        on. Returns cells visited. Raises OutsideGridError on a window that is not inside the grid.
         """
         grid = self.cost_grid
-        if network.size != grid.size:
-            raise ValueError(f"networks of {network.size} padded cells, the map has {grid.size}")
         box = box_of(grid, window)
         row, col = divmod(self.root, grid.grid.cols)
         half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)

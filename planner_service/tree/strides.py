@@ -1,19 +1,18 @@
-"""Networks of strides on which far cells are planned (section 3.3.3): found, shared, and rebuilt."""
+"""Networks of strides on which far cells are planned (section 3.3.3), and how they are found."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import stride_network
 from planner_service.kernels.stride_growth import Network
-from planner_service.tree.cost_changes import Cells, Changes
+from planner_service.tree.cost_changes import Cells
 from planner_service.tree.cost_grid import CostGrid
-from shared_map.array_files import Bools, Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 
 LEAST = 4
 """Doublings of the least stride that has a network: 16 cells. Shorter strides are single steps, near the target: a
@@ -22,150 +21,18 @@ FINE = 8
 """Strides below the least one serve this multiple of the narrowest window: there all cells are searched."""
 MOST_SHARE = 8
 """The largest stride is at most such a share of the map's side (docs/design/windows-and-strides.md)."""
-STALE_SHARE = 16
-"""Networks are rebuilt when cells have changed in one block of the least stride in this number
-(docs/design/windows-and-strides.md)."""
-
-_HEADER = 32
-"""Bytes: four numbers of eight."""
-_DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.uint8, np.uint8)
 
 
-class StrideNetwork:
+class StrideNetwork(NamedTuple):
     """Nodes, links and their ways, of every stride: what a coarse growth goes along.
 
     Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. Marks
     therefore never make it wrong, only less good.
 
     arrays  for kernels
-    size    padded cells of the map that it is of
     """
 
-    def __init__(self, arrays: Network, size: int) -> None:
-        self.arrays = arrays
-        self.size = size
-        self._changed: Bools = np.empty(0, np.bool_)
-        """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
-
-    def learn(self, cost_grid: CostGrid, changes: Changes) -> bool:
-        """Cells have changed. False once the networks should be rebuilt."""
-        across = (cost_grid.stride >> LEAST) + 1
-        if not self._changed.size:
-            self._changed = np.zeros(((cost_grid.size // cost_grid.stride >> LEAST) + 1) * across, np.bool_)
-        rows, cols = np.divmod(changes.cells, cost_grid.stride)
-        self._changed[(rows >> LEAST) * across + (cols >> LEAST)] = True
-        return int(np.count_nonzero(self._changed)) * STALE_SHARE <= self._changed.size
-
-    def packed(self) -> Bytes:
-        """All of it as uint8, for a file."""
-        centre, doublings, first, other, price, begin, steps, paths = self.arrays
-        counts = np.array((centre.size, other.size, paths.size, self.size), np.int64)
-        parts = (counts, centre, first, other, price, begin, steps, doublings, paths)
-        return np.concatenate([part.view(np.uint8) for part in parts])
-
-    @classmethod
-    def unpacked(cls, packed: Bytes) -> StrideNetwork:
-        """Reads the output of `packed`, whose memory it shares."""
-        nodes, links, steps, size = packed[:_HEADER].view(np.int64).tolist()
-        sizes = (nodes, nodes + 1, links, links, links, links, nodes, steps)
-        lengths = [many * np.dtype(dtype).itemsize for many, dtype in zip(sizes, _DTYPES, strict=True)]
-        parts = np.split(packed[_HEADER:], np.cumsum(lengths)[:-1])
-        centre, first, other, price, begin, signed, doublings, paths = (
-            part.view(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)
-        )
-        return cls((centre, doublings, first, other, price, begin, signed, paths), size)
-
-
-class StrideShelf(Protocol):
-    """Shared store of the networks of the map before any mark, so that one planner of a machine finds them for
-    all."""
-
-    def load(self) -> Bytes | None:
-        """Returns the stored network, as `StrideNetwork.packed`; the caller may write to it."""
-        ...
-
-    def claim(self) -> bool:
-        """Returns True if the caller is the one to find them: true again at its next call, until `leave` or its
-        end."""
-        ...
-
-    def leave(self, packed: Bytes) -> None:
-        """Stores the found network for all."""
-        ...
-
-
-class StrideSearch:
-    """Finds the networks of a map, the least stride first, each from the ways of the one before.
-
-    A step finds those of one stride, so that a worker has time for other work between them. With a shelf, a step
-    may do nothing while another process is finding the same.
-
-    cost_grid  a snapshot
-    network    None until the search has ended
-    """
-
-    def __init__(self, cost_grid: CostGrid, shelf: StrideShelf | None = None) -> None:
-        self.cost_grid = cost_grid
-        self.network: StrideNetwork | None = None
-        self._shelf = shelf
-        self._strides: Iterator[StrideNetwork | None] | None = None
-
-    def step(self) -> StrideSearch:
-        """Come a step nearer to `network`, which is None now. Returns itself."""
-        if self._strides is None:
-            if self._shelf is not None:
-                packed = self._shelf.load()
-                if packed is not None:
-                    self.network = StrideNetwork.unpacked(packed)
-                if packed is not None or not self._shelf.claim():
-                    return self
-            self._strides = _find(self.cost_grid)
-        self.network = next(self._strides)
-        if self._shelf is not None and self.network is not None:
-            self._shelf.leave(self.network.packed())
-        return self
-
-    def run(self) -> StrideSearch:
-        """All steps at once; not for a search that may wait for another process."""
-        while self.network is None:
-            self.step()
-        return self
-
-
-class StrideUpkeep:
-    """The networks of one tree, from search to search.
-
-    network  None until found, and again once too much has changed
-    """
-
-    def __init__(self) -> None:
-        self.network: StrideNetwork | None = None
-        self._searching = self._found_before = False
-
-    @property
-    def wanted(self) -> bool:
-        """Returns True if a search should begin."""
-        return self.network is None and not self._searching
-
-    def search(self, cost_grid: CostGrid, shelf: StrideShelf | None) -> StrideSearch:
-        """The first search is on the map as it was before any mark, if that is shared, so that all planners of a
-        machine can take the same. Later ones, of networks that have become stale, are on the map as it is."""
-        self._searching = True
-        shared = None if self._found_before else cost_grid.shared
-        self._found_before = True
-        return StrideSearch(cost_grid.snapshot()) if shared is None else StrideSearch(shared, shelf)
-
-    def take(self, cost_grid: CostGrid, search: StrideSearch) -> None:
-        """Uses the found network; later changes count as learnt."""
-        assert search.network is not None
-        self._searching = False
-        self.network = search.network
-        self.learn(cost_grid, cost_grid.changes_since(search.cost_grid.cell_cost))
-
-    def learn(self, cost_grid: CostGrid, changes: Changes) -> None:
-        """The map has changed."""
-        if self.network is not None and changes.cells.size and not self.network.learn(cost_grid, changes):
-            self.network = None
+    arrays: Network
 
 
 def one_stride(cost_grid: CostGrid, stride: int) -> tuple[NDArray[np.uint32], Links]:
@@ -193,21 +60,19 @@ def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
     return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
 
 
-def _find(grid: CostGrid) -> Iterator[StrideNetwork | None]:
-    """Finds one stride at a time; the last item is the network."""
+def find_strides(grid: CostGrid) -> StrideNetwork:
+    """Finds the network of a map: the least stride first, each from the ways of the one before."""
     node = _all_cells(grid)
     centres: list[NDArray[np.uint32]] = []
     links: list[Links] = []
     side = max(grid.grid.rows, grid.grid.cols)
     most = max(LEAST, (side // MOST_SHARE).bit_length() - 1)
     for doublings in range(LEAST, most + 1):
-        if centres:
-            yield None
         below = centres[-1].astype(np.int64) if centres else np.empty(0, np.int64)
         centre, found = _find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
         centres.append(centre)
         links.append(found)
-    yield StrideNetwork(_joined(centres, links), grid.size)
+    return StrideNetwork(_joined(centres, links))
 
 
 def _find_stride(

@@ -9,8 +9,9 @@ known by how it begins. Guarantees of each reader:
 4. Nothing is guessed. If a file may have several meanings, the error names the setting that decides.
 5. Changes to the data are listed in `Source.notes`.
 
-A kind of file has one module: `rasters` with `encoded_heights`, `array_grids`, `xyz_grids`. `raster_files` opens
-and guards all rasters; `georeference` says where they lie, and `onto_grid` brings them onto the grid.
-`level_ground` finds water and voids in a file's own cells, before anything is resampled. Land cover is in `cover`,
-vector zones in `zones`; codes, colours and classes of ways are data beside their readers.
+`raster_files` opens and guards all rasters; those which GDAL does not read, or not as they are, become datasets
+in memory: `xyz_grids` and the archives of `array_grids`, which has maps without heights, too. `rasters` tells what
+a raster holds; `georeference` says where it lies, and `onto_grid` brings it onto the grid. `level_ground` finds
+water and voids in a file's own cells, before anything is resampled. Land cover and photos are in `cover`, vector
+zones in `zones`; codes, colours and classes of ways are data beside their readers.
 """

@@ -11,107 +11,102 @@ import itertools
 import math
 import warnings
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
+import yaml
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
+from PIL import Image
+from rasterio import CRS
+from rasterio.transform import from_origin
 
-from shared_map.array_files import Bytes, Floats
-from shared_map.importers.raster_files import LONGEST_REASON
+from shared_map.array_files import Floats
+from shared_map.importers.georeference import METRES
+from shared_map.importers.raster_files import LONGEST_REASON, Numbers
+from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
 
-_NPZ_ARRAYS = ("elevation", "photo", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
+_NPZ_ARRAYS = ("elevation", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
 _HEADER_BYTES = 4096
 _MOST_TABLE_BYTES = 1 << 20
 """Limit of an archive's table of contents."""
 _SHOWN_MEMBERS = 10
+MAX_STEP = 1e7
+"""Metres or degrees: a quarter of the way around the Earth."""
 SCALE_FACTOR = 9.0
 """ROS `scale` mode: pace grows by up to this many times between free and occupied."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlainGrid:
-    """Header of a plain file.
+class LevelMap(NamedTuple):
+    """A map without heights.
 
-    heights      float32 (rows, cols) in the file's unit, NaN is a void; None for a map without heights
-    factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown; None if all is open
-    step         width and height of a cell, in metres, or in degrees if `degrees`; (0, 0) if the file does not say
-    west, north  outer corner of cell (0, 0), in the same unit
-    photo        uint8 (rows, cols, 3), red, green, blue
-    notes        the format found, for people
+    factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown
+    step_m       side of a cell; 0 if the file does not say
+    west, north  outer corner of cell (0, 0), in metres
+    note         the format found, for people
     """
 
-    heights: Floats | None
-    factor: Floats | None
-    step: tuple[float, float]
-    west: float = 0.0
-    north: float = 0.0
-    degrees: bool = False
-    photo: Bytes | None = None
-    notes: tuple[str, ...] = ()
+    factor: Floats
+    step_m: float
+    west: float
+    north: float
+    note: str
 
 
-def check_cells(rows: int, cols: int, path: Path) -> None:
+def check_cells(rows: int, cols: int, what: str) -> None:
     """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
     if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
-        raise TerrainError(f"terrain {path}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
+        raise TerrainError(f"{what}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
 
 
 # --- numpy's archives ---------------------------------------------------------------------------------------
 
 
-def read_npz(path: Path) -> PlainGrid:
+def read_npz(path: Path, what: str) -> Numbers:
     """Arrays in an archive of NumPy's.
 
     elevation           (rows, cols), numbers; row 0 is in the north
     resolution_m        side of a cell, or
     dx, dy, xmin, ymin  in degrees, as in matplotlib's samples; `ymin` is the north latitude
-    photo               uint8 (rows, cols, 3), optional
 
     Raises
     ------
     TerrainError
         If the file cannot be read, its arrays would unpack to more than the file may have, or are not as above.
     """
-    arrays, held = _members(path)
-    heights = arrays.get("elevation")
+    arrays, held = _members(path, what)
+    heights = arrays.pop("elevation", None)
     if heights is None:
-        raise TerrainError(f"terrain {path} has no `elevation`; it has {held}")
+        raise TerrainError(f"{what} has no `elevation`; it has {held}")
     if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
         found = f"{heights.shape} {heights.dtype}"
-        raise TerrainError(f"terrain {path}: elevation is {found}; expected numbers in two dimensions")
-    check_cells(heights.shape[0], heights.shape[1], path)
-    photo = arrays.get("photo")
-    if photo is not None and (photo.shape != (*heights.shape, 3) or photo.dtype != np.uint8):
-        raise TerrainError(f"terrain {path}: photo is {photo.shape} {photo.dtype}, not {(*heights.shape, 3)} uint8")
-    heights = heights.astype(np.float32)
+        raise TerrainError(f"{what}: elevation is {found}; expected numbers in two dimensions")
+    check_cells(heights.shape[0], heights.shape[1], what)
+    heights, notes = heights.astype(np.float32), ("arrays of NumPy",)
     try:
-        numbers = {name: float(array) for name, array in arrays.items() if name not in ("elevation", "photo")}
+        numbers = {name: float(array) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
-        raise TerrainError(f"terrain {path}: its cell size is no single number: {error}") from error
+        raise TerrainError(f"{what}: its cell size is no single number: {error}") from error
     for name in {"resolution_m", "dx", "dy"} & numbers.keys():
-        check_step(numbers[name], path)
+        if not 0 < numbers[name] < MAX_STEP:
+            raise TerrainError(f"{what}: the size of a cell is {numbers[name]:g}; it must be positive")
     if "resolution_m" in numbers:
-        return PlainGrid(heights, None, (numbers["resolution_m"],) * 2, photo=photo)
+        side_m = numbers["resolution_m"]
+        return Numbers(heights, from_origin(0.0, 0.0, side_m, side_m), CRS.from_wkt(METRES), notes)
     if {"dx", "dy", "xmin", "ymin"} <= numbers.keys():
         # matplotlib's jacksboro file calls the northern latitude ymin and the southern one ymax.
         north = max(numbers["ymin"], numbers.get("ymax", -math.inf))
-        steps = (numbers["dx"], numbers["dy"])
-        return PlainGrid(heights, None, steps, numbers["xmin"], north, degrees=True, photo=photo)
-    return PlainGrid(heights, None, (0.0, 0.0), photo=photo)
+        place = from_origin(numbers["xmin"], north, numbers["dx"], numbers["dy"])
+        return Numbers(heights, place, CRS.from_epsg(4326), notes)
+    return Numbers(heights, notes=notes)
 
 
-def check_step(step: float, path: Path) -> None:
-    """Raises TerrainError unless a cell has a size."""
-    if not 0 < step < 1e7:
-        raise TerrainError(f"terrain {path}: the size of a cell is {step:g}; it must be positive")
-
-
-def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], str]:
     """The arrays of `_NPZ_ARRAYS` in an .npz, and the names of what it holds. Others are never unpacked."""
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
@@ -124,13 +119,11 @@ def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
                 raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
             held = ", ".join(name[:40] for name in sorted(archive.files)[:_SHOWN_MEMBERS])
             return {name: archive[name] for name in wanted}, held or "nothing"
-    except TerrainError:
+    except (TerrainError, OSError):
         raise
-    except OSError as error:
-        raise kind.unreadable(path, error) from error
     except Exception as error:  # of damaged headers numpy raises whatever it runs into
         why = str(error).partition("\n")[0][:LONGEST_REASON]
-        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {why}") from error
+        raise TerrainError(f"{what} is truncated or no .npz of numbers: {why}") from error
 
 
 class _ShortReads(io.FileIO):
@@ -146,7 +139,7 @@ class _ShortReads(io.FileIO):
 # --- maps without heights -----------------------------------------------------------------------------------
 
 
-def read_map(path: Path) -> PlainGrid:
+def read_map(path: Path) -> LevelMap:
     """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot. Its `factor` is 1 or inf.
 
     Raises
@@ -163,10 +156,8 @@ def read_map(path: Path) -> PlainGrid:
         if marker != "map":
             raise ValueError(marker)
     except (ValueError, KeyError) as error:
-        raise TerrainError(
-            f"terrain {path} is no MovingAI map: it must begin with type, height, width, map"
-        ) from error
-    check_cells(rows, cols, path)
+        raise TerrainError(f"terrain {path} is no MovingAI map, which has type, height, width, map") from error
+    check_cells(rows, cols, f"terrain {path}")
     letters = np.full(256, np.nan, np.float32)
     letters[list(b".GS")], letters[list(b"@OTW")] = 1.0, np.inf
     factor = np.empty((rows, cols), np.float32)
@@ -182,10 +173,22 @@ def read_map(path: Path) -> PlainGrid:
             raise TerrainError(f"terrain {path}, line {row + 4}, column {col + 1}: {line[col]!r} is no ground")
     if row < rows:
         raise TerrainError(f"terrain {path} has {row} rows; its header says {rows}")
-    return PlainGrid(None, factor, (0.0, 0.0), notes=(f"MovingAI map of type {kind}",))
+    return LevelMap(factor, 0.0, 0.0, 0.0, f"MovingAI map of type {kind}")
 
 
-def read_ros(path: Path) -> PlainGrid:
+class _RosMap(Struct, frozen=True):
+    """The keys of a map_server's YAML; `origin` is the south-western corner and how far the image is turned."""
+
+    image: str
+    resolution: Annotated[float, Meta(gt=0, lt=MAX_STEP)]
+    origin: Annotated[list[float], Meta(min_length=2)]
+    occupied_thresh: Annotated[float, Meta(ge=0, le=1)]
+    free_thresh: Annotated[float, Meta(ge=0, le=1)]
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
+    negate: bool = False
+
+
+def read_ros(path: Path) -> LevelMap:
     """ROS map_server: a yaml that names an image, its resolution, origin and thresholds.
 
     Its `factor` is 1 on free, inf on occupied cells. Between the thresholds it is NaN in the mode `trinary`, and
@@ -196,62 +199,46 @@ def read_ros(path: Path) -> PlainGrid:
     TerrainError
         If a file cannot be read, a key is missing or out of range, or the origin is turned.
     """
-    values = _yaml(path)
+    raw = _yaml(path)
     try:
-        image = path.parent / str(values["image"])
-        resolution_m, occupied, free = (
-            float(values[key]) for key in ("resolution", "occupied_thresh", "free_thresh")
-        )
-        west, south, *turned = map(float, values["origin"])
-        mode = str(values.get("mode", "trinary")).lower()
-        negate = bool(int(values.get("negate", 0)))  # YAML's true and false count, too
-    except KeyError as error:
-        raise TerrainError(f"terrain {path} is no ROS map: {error.args[0]} is missing") from error
-    except (ValueError, TypeError, OverflowError) as error:
-        raise TerrainError(f"terrain {path}: {str(error)[:200]}") from error
-    check_step(resolution_m, path)
-    if mode not in ("trinary", "scale", "raw"):
-        raise TerrainError(f"terrain {path}: mode is {mode[:40]!r}; trinary, scale and raw are known")
+        found = msgspec.convert(raw, _RosMap, strict=False)
+    except msgspec.ValidationError as error:
+        raise TerrainError(f"terrain {path} is no ROS map: {explain(str(error), raw, _RosMap, 'map')}") from error
+    west, south, *turned = found.origin
+    image, occupied, free = path.parent / found.image, found.occupied_thresh, found.free_thresh
     if turned and abs(turned[0]) > 1e-9:
-        raise TerrainError(
-            f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image and set it to 0"
-        )
-    if not 0 <= free <= occupied <= 1:
-        raise TerrainError(
-            f"terrain {path}: thresholds free {free:g}, occupied {occupied:g}: 0 <= free <= occupied <= 1"
-        )
+        raise TerrainError(f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image instead")
+    if free > occupied:
+        raise TerrainError(f"terrain {path}: thresholds are {free:g}, {occupied:g}; expected free <= occupied")
     if not image.is_file():
-        raise TerrainError(f"terrain {path} names the image {values['image']}, but there is no file {image}")
+        raise TerrainError(f"terrain {path} names the image {found.image}, but there is no file {image}")
     pixels, brightest = _grey(image)
-    if negate:
+    if found.negate:
         pixels = brightest - pixels
     factor = np.full(pixels.shape, np.nan, np.float32)
-    known = pixels <= (100 if mode == "raw" else brightest)
-    taken = pixels / np.float32(100) if mode == "raw" else np.float32(1) - pixels / np.float32(brightest)
+    is_raw = found.mode == "raw"
+    known = pixels <= (100 if is_raw else brightest)
+    taken = pixels / np.float32(100) if is_raw else np.float32(1) - pixels / np.float32(brightest)
     factor[known & (taken < free)] = 1.0
-    if mode != "trinary":
+    if found.mode != "trinary":
         between = known & (taken >= free) & (taken <= occupied)
         share = (taken[between] - np.float32(free)) / np.float32(max(occupied - free, 1e-6))
         factor[between] = np.float32(1) + np.float32(SCALE_FACTOR) * share
     factor[known & (taken > occupied)] = np.inf
-    north = south + pixels.shape[0] * resolution_m
-    notes = (f"ROS map, mode {mode}, {np.isnan(factor).mean():.1%} unknown",)
-    return PlainGrid(None, factor, (resolution_m, resolution_m), west, north, notes=notes)
+    north = south + pixels.shape[0] * found.resolution
+    note = f"ROS map, mode {found.mode}, {np.isnan(factor).mean():.1%} unknown"
+    return LevelMap(factor, found.resolution, west, north, note)
 
 
-def _yaml(path: Path) -> dict[str, Any]:
-    import yaml
+def _yaml(path: Path) -> Any:
 
     try:
-        values = yaml.safe_load(read_text(path, FileKind.ROS_MAP))
+        return yaml.safe_load(read_text(path, FileKind.ROS_MAP))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "context_mark", None) or getattr(error, "problem_mark", None)
         where = "" if mark is None else f", line {mark.line + 1}"
         why = str(getattr(error, "problem", None) or error).splitlines()[0][:200]
         raise TerrainError(f"terrain {path}{where}: no YAML: {why}") from error
-    if not isinstance(values, dict):
-        raise TerrainError(f"terrain {path} is no ROS map: it has no lines of key: value")
-    return values
 
 
 def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
@@ -269,12 +256,10 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     TerrainError
         If the file cannot be read, is no such image, or is shorter than its header says.
     """
-    from PIL import Image
-
     check_bytes(path, FileKind.IMAGE)
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
-            check_cells(image.height, image.width, path)
+            check_cells(image.height, image.width, f"image {path}")
             if image.mode in ("L", "I", "I;16"):
                 return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
             colours = np.asarray(image.convert("RGBA"), np.float32)

@@ -10,12 +10,15 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import rasterio
+from rasterio.errors import CRSError
+from rasterio.transform import array_bounds
+from rasterio.warp import transform as to_crs
+from rasterio.warp import transform_bounds
 
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
-_SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
 MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
 MOST_STRETCH = 0.02
@@ -23,6 +26,8 @@ MOST_STRETCH = 0.02
 _LIKE_WGS84 = (4326, 4258, 4269)
 """Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
 _EARTH_M = 6_371_000.0
+METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
+"""Coordinate system of what has no place on Earth."""
 HIGHEST_DEG = 85.0
 """Degrees nearer to a pole than this are not put on metres."""
 
@@ -51,9 +56,6 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 def system_named(text: str, what: str) -> Any:
     """rasterio's CRS of a text. Raises TerrainError, which `what` begins, if it is none."""
-    import rasterio
-    from rasterio.errors import CRSError
-
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
             return rasterio.CRS.from_user_input(text)
@@ -61,25 +63,46 @@ def system_named(text: str, what: str) -> Any:
         raise TerrainError(f"{what} {text!r} is no coordinate system; write EPSG:32632 or alike") from error
 
 
-def crs_of(found: Any, given: str | None, what: str) -> Any:
-    """The coordinate system that the scenario names for a file (`given`), else the file's own (`found`).
+def crs_of(found: Any, given: str | None, what: str, key: str = "terrain.crs") -> Any:
+    """The coordinate system that the scenario names for a file (`given`, the value of `key`), else the file's own.
 
     Raises TerrainError if `given` is not one, or if there is neither; `what` names the file.
     """
     if given is not None:
-        return system_named(given, "terrain.crs")
+        return system_named(given, f"{what}: {key}")
     if not found:
         raise TerrainError(
-            f"{what} does not say in which coordinate system it is; set terrain.crs, for example 'EPSG:32632'"
+            f"{what} does not say in which coordinate system it is; set {key}, for example 'EPSG:32632', or 'local'"
+            " for metres of the terrain's own map"
         )
     return found
+
+
+def systems_of(grid: GridSpec, own: Any, given: str | None, what: str, key: str) -> tuple[Any, Any]:
+    """(the terrain's system, a file's); (None, None) if the file is in the terrain's own metres.
+
+    own    the file's system as it says; None if it does not
+    given  what the scenario says that it is, the value of `key`
+    """
+    if given == "local":
+        return None, None
+    found = crs_of(own, given, what, key)
+    if grid.crs == "local":
+        if is_local(found):
+            return None, None
+        raise TerrainError(
+            f"{what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local' if"
+            " its coordinates are metres of the terrain's own map"
+        )
+    if not found.is_geographic and not found.is_projected:
+        raise TerrainError(f"{what} is in {crs_name(found)}, which has no place on the Earth; set {key}")
+    return rasterio.CRS.from_user_input(grid.crs), found
 
 
 def overruled(found: Any, given: str | None) -> tuple[str, ...]:
     """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`)."""
     if given is None or not found or not (found.is_geographic or found.is_projected):
         return ()
-    import rasterio
 
     counts = rasterio.CRS.from_user_input(given)
     if counts == found:
@@ -93,8 +116,6 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
 
     `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
     """
-    import rasterio
-
     if is_local(crs):
         return crs
     local = rasterio.CRS.from_proj4(
@@ -118,8 +139,6 @@ def _scale(crs: Any, local: Any) -> float:
 
     local  a system that is true around its origin
     """
-    from rasterio.warp import transform as to_crs
-
     xs, ys = to_crs(local, crs, [0.0, 1000.0, 0.0], [0.0, 0.0, 1000.0])
     sides = [math.hypot(xs[n] - xs[0], ys[n] - ys[0]) / 1000.0 for n in (1, 2)]
     return max(sides, key=lambda side: abs(math.log(side)) if 0 < side < math.inf else math.inf)
@@ -138,8 +157,6 @@ def is_local(crs: Any) -> bool:
 
 def degrees_of(crs: Any) -> Any:
     """Latitude and longitude on the body on which a system lies: WGS 84 on the Earth."""
-    import rasterio
-
     return rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
 
 
@@ -155,64 +172,18 @@ def _shape_of(crs: Any) -> str:
 
 
 def crs_name(crs: Any) -> str:
-    """Returns the name of a rasterio CRS for people: EPSG:32632, or +proj=..., or the beginning of its text."""
-    if is_local(crs):
-        return "a local system"
-    text = str(crs.to_string())
-    if not text.startswith("EPSG:") and crs.to_epsg() is None:
-        known = crs.to_dict()
-        if known.get("proj"):
-            text = " ".join(f"+{key}={known[key]}" for key in ("proj", *_SHOWN) if known.get(key))
+    """Returns the name of a rasterio CRS for people: EPSG:32632, or the beginning of its text."""
+    text = "a local system" if is_local(crs) else _system(crs)
     return text if len(text) < 60 else text[:57] + "..."
 
 
-def _placed(transform: Any, at_row: NDArray[Any], at_col: NDArray[Any]) -> tuple[list[float], list[float]]:
-    xs = transform.a * at_col + transform.b * at_row + transform.c
-    ys = transform.d * at_col + transform.e * at_row + transform.f
-    return [float(x) for x in xs], [float(y) for y in ys]
-
-
-def _border(transform: Any, rows: int, cols: int) -> tuple[list[float], list[float]]:
-    """Points all around a raster, in its own coordinates."""
-    along = np.linspace(0.0, 1.0, 21)
-    zero, one = np.zeros(21), np.ones(21)
-    at_col = np.concatenate([along, one, along, zero]) * cols
-    at_row = np.concatenate([zero, along, one, along]) * rows
-    return _placed(transform, at_row, at_col)
-
-
-def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what: str) -> tuple[float, ...]:
-    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`.
-
-    Raises TerrainError if `crs` is not defined everywhere on its border.
-    """
-    from rasterio.warp import transform as to_crs
-
-    xs, ys = _border(transform, rows, cols)
+def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float, float, float]:
+    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`; degrees count on
+    beyond 180."""
+    west, south, east, north = array_bounds(rows, cols, transform)
     if target != crs:
-        xs, ys = to_crs(crs, target, xs, ys)
-    if not np.isfinite([xs, ys]).all():
-        raise TerrainError(f"{what} reaches where its coordinate system {crs_name(crs)} is not defined; crop it")
-    return min(xs), min(ys), max(xs), max(ys)
-
-
-def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, what: str) -> tuple[float, float]:
-    """(west, east) of a raster of metres with 180 degrees counted on from there: 179 to 181, not -180 to 180.
-
-    Raises TerrainError if it reaches beyond the edge of its system's map, where a place has other metres.
-    """
-    from rasterio.warp import transform as to_crs
-
-    xs, ys = _border(transform, rows, cols)
-    found = to_crs(crs, degrees, xs, ys)
-    back = to_crs(degrees, crs, found[0], found[1])
-    if not np.allclose(back[0], xs, rtol=0, atol=abs(transform.a) + abs(transform.b)):
-        raise TerrainError(
-            f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
-            " brings it onto one map"
-        )
-    lon = np.asarray(found[0]) % 360
-    return float(lon.min()), float(lon.max())
+        west, south, east, north = transform_bounds(crs, target, west, south, east, north)
+    return west, south, east + 360.0 * (target.is_geographic and east < west), north
 
 
 def check_metres(step: float, west: float, what: str) -> None:
@@ -235,11 +206,9 @@ def is_kept(width_m: float, height_m: float, cells: int, resolution_m: float | N
 
 def pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
     """Width and height in metres of the pixel in the middle."""
-    from rasterio.warp import transform as to_crs
-
-    at_row, at_col = np.array([0.0, 0.0, 1.0]) + rows / 2, np.array([0.0, 1.0, 0.0]) + cols / 2
-    xs, ys = _placed(transform, at_row, at_col)
-    if target is not None and target != crs:
+    places = [transform @ (cols / 2 + right, rows / 2 + down) for right, down in ((0, 0), (1, 0), (0, 1))]
+    xs, ys = zip(*places, strict=True)
+    if target != crs:
         xs, ys = to_crs(crs, target, xs, ys)
     return math.hypot(xs[1] - xs[0], ys[1] - ys[0]), math.hypot(xs[2] - xs[0], ys[2] - ys[0])
 
@@ -273,24 +242,27 @@ def plan_grid(
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
     if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
-        raise TerrainError(
-            f"{what} has pixels without a size ({tuple(transform)[:6]}); its georeference is damaged"
-        )
+        raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
     if not crs.is_geographic and not crs.is_projected and not is_local(crs):
         raise TerrainError(
-            f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
-            " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
+            f"{what} is in {crs_name(crs)}, without metres or degrees: reproject it, or set terrain.crs"
         )
     degrees = crs if is_local(crs) else degrees_of(crs)
-    west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
-    if not is_local(crs) and east - west > 180 and not crs.is_geographic:
-        west, east = _around_180(transform, rows, cols, crs, degrees, what)
+    west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
+    if east > 180 and crs.is_projected:
+        ends, _ = to_crs(crs, degrees, *zip(transform @ (0, 0), transform @ (cols, rows), strict=True))
+        back, _ = to_crs(degrees, crs, ends, [south, south])
+        if abs(back[1] - back[0]) > 2 * abs(transform.a * cols) + abs(transform.b * rows):
+            raise TerrainError(
+                f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
+                " brings it onto one map"
+            )
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
     if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:
         raise TerrainError(
             f"{what} lies around latitude {(south + north) / 2:.4g}, where degrees of longitude have no width;"
-            " reproject it to a polar system (gdalwarp -t_srs EPSG:3413, in the south EPSG:3031)"
+            " gdalwarp -t_srs EPSG:3413 (in the south EPSG:3031) helps"
         )
     target = metric_crs(crs, (west + east) / 2, (south + north) / 2, north - south)
     if (
@@ -299,7 +271,7 @@ def plan_grid(
     ):
         raise TerrainError(
             f"{what} spans {north - south:.4g} x {east - west:.4g} degrees: no flat grid is true over more than"
-            f" {MAX_SPAN_DEG:g}; crop it, or reproject it to metres yourself"
+            f" {MAX_SPAN_DEG:g}; crop it"
         )
     width, height = pixel_m(transform, rows, cols, crs, target)
     notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
@@ -314,12 +286,10 @@ def plan_grid(
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
         return grid, None, notes
     resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
-    west, south, east, north = bounds_in(transform, rows, cols, crs, target, what)
+    west, south, east, north = bounds_in(transform, rows, cols, crs, target)
     high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
     if high < 1 or wide < 1:
-        raise TerrainError(
-            f"{what} is {north - south:.3g} m x {east - west:.3g} m: no cell of {resolution:g} m fits"
-        )
+        raise TerrainError(f"{what} is {north - south:.3g} x {east - west:.3g} m: no cell of {resolution:g} m fits")
     check_size(high, wide, what)
     notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
     return GridSpec(high, wide, resolution, west, north, _system(target)), target, notes
@@ -327,11 +297,11 @@ def plan_grid(
 
 def _system(crs: Any) -> str:
     """Text of a system in a GridSpec: as short as means the same."""
-    import rasterio
-
+    if is_local(crs):
+        return "local"
     short = crs.to_proj4().replace("=True", "")
-    is_short = not crs.to_epsg() and not is_local(crs) and rasterio.CRS.from_proj4(short) == crs
-    return "local" if is_local(crs) else short if is_short else str(crs.to_string())
+    is_short = short and not crs.to_epsg() and rasterio.CRS.from_proj4(short) == crs
+    return short if is_short else str(crs.to_string())
 
 
 def check_size(rows: int, cols: int, what: str) -> None:

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import rasterio
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import RasterioError
+from rasterio.transform import from_origin
+from rasterio.vrt import WarpedVRT
+from rasterio.warp import Resampling
 
-from shared_map.importers.georeference import bounds_in, crs_name, crs_of, pixel_m
+from shared_map.importers.georeference import METRES, bounds_in, crs_name, pixel_m, systems_of
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 
-def transform_of(grid: GridSpec, row0: int = 0) -> Any:
-    """The affine transform from (col, row) of a grid, counted from a row on, to metres."""
-    from rasterio.transform import from_origin
-
-    north = grid.north_m - row0 * grid.resolution_m
-    return from_origin(grid.west_m, north, grid.resolution_m, grid.resolution_m)
+def transform_of(grid: GridSpec) -> Any:
+    """The affine transform from (col, row) of a grid to metres."""
+    return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +31,9 @@ class Placed:
     """Transformation of a raster onto the grid of a terrain.
 
     transform, crs  affine transform and coordinate system of the raster
-    target          the grid's system; None if the raster's pixels are the terrain's cells
+    target          the grid's system
     share           of the terrain, within the raster's frame
+    is_cells        whether the raster's pixels are the terrain's cells, which then are taken as they are
     """
 
     dataset: Any
@@ -38,6 +42,7 @@ class Placed:
     crs: Any
     target: Any
     share: float = 1.0
+    is_cells: bool = False
 
     @property
     def grows(self) -> bool:
@@ -46,76 +51,56 @@ class Placed:
         width, height = pixel_m(self.transform, *size, self.crs, self.target)
         return self.grid.resolution_m >= 1.5 * max(width, height)
 
-    def warp(self, source: Any, onto: NDArray[Any], how: str, row0: int = 0, **given: Any) -> NDArray[Any]:
-        """Brings a band, or an array in its place, onto rows of the grid, in place.
+    @contextmanager
+    def on_grid(self, how: str) -> Iterator[Any]:
+        """The raster as a dataset of float32 whose pixels are the cells of the grid; NaN where it shows nothing.
 
-        Parameters
-        ----------
-        source : int or array (rows, cols)
-            Number of a band, or any number of cells over the same ground as the raster.
-        onto : array (rows, grid.cols)
-            Cells that the source does not reach become `dst_nodata`, or stay as they are.
-        how : str
-            The name of one of rasterio's resamplings.
-        row0 : int
-            Row of the grid that is the first of `onto`.
-        **given
-            For `rasterio.warp.reproject`.
+        how  the name of one of rasterio's resamplings
         """
-        import rasterio
-        from rasterio.transform import Affine
-        from rasterio.vrt import WarpedVRT
-        from rasterio.warp import Resampling, reproject
-
-        place = {"src_crs": self.crs, "dst_crs": self.target, "dst_transform": transform_of(self.grid, row0)}
-        with contextlib.ExitStack() as files:
-            dataset = self.dataset
-            if (dataset.crs, dataset.transform) != (self.crs, self.transform):
-                # Of a band, GDAL takes the file's own place, whatever it is told.
-                frame = {"transform": self.transform, "width": dataset.width, "height": dataset.height}
-                said = {"src_crs": self.crs, "src_transform": self.transform, "crs": self.crs}
-                dataset = files.enter_context(WarpedVRT(dataset, **said, **frame))
-            if isinstance(source, int):
-                source = rasterio.band(dataset, source)
-            else:
-                rows, cols = source.shape
-                stretch = Affine.scale(dataset.width / cols, dataset.height / rows)
-                place["src_transform"] = self.transform @ stretch
-            threads = os.cpu_count() or 1
-            reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=threads)
-        return onto
+        grid, dataset = self.grid, self.dataset
+        is_real = np.dtype(dataset.dtypes[0]).kind == "f"
+        void = math.nan if dataset.nodata is None and is_real else dataset.nodata
+        resampling = Resampling.nearest if self.is_cells else Resampling[how]
+        place = transform_of(grid)
+        own = place if self.is_cells else self.transform
+        size = {"width": grid.cols, "height": grid.rows, "dtype": "float32", "nodata": math.nan}
+        source = {"src_crs": self.crs, "src_transform": own, "src_nodata": void}
+        # A photo shows nothing only where no band does.
+        target = {"crs": self.target, "transform": place, "NUM_THREADS": "ALL_CPUS", "UNIFIED_SRC_NODATA": "YES"}
+        with WarpedVRT(dataset, resampling=resampling, **source, **target, **size) as cells:
+            yield cells
 
 
-def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> Placed:
+def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: str = "terrain.crs") -> Placed:
     """Returns the transformation of a file onto the terrain's grid.
+
+    given  its system, as the value of `key` in the scenario; "local" is that of a terrain without a place
 
     Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
     which system it is (nor does `given`), or does not overlap the terrain.
     """
-    import rasterio
-
     same_shape = (dataset.height, dataset.width) == grid.shape
-    if not (dataset.crs or not dataset.transform.is_identity) or grid.crs == "local":
+    has_place = bool(dataset.crs) or not dataset.transform.is_identity
+    if not has_place or (grid.crs == "local" and given is None):
         if not same_shape:
             raise TerrainError(
                 f"{what} has {dataset.height} x {dataset.width} pixels and no place in common with the terrain of"
                 f" {grid.rows} x {grid.cols} cells; georeference both, or make them the same size"
             )
-        return Placed(dataset, grid, dataset.transform, None, None)
-    crs = crs_of(dataset.crs, given if not dataset.crs else None, what)
-    target = rasterio.CRS.from_user_input(grid.crs)
-    share = overlap(dataset, crs, target, grid, what)
+        metres = rasterio.CRS.from_wkt(METRES)
+        return Placed(dataset, grid, dataset.transform, metres, metres, is_cells=True)
+    target, crs = systems_of(grid, dataset.crs, given, what, key)
+    if target is None:
+        target = crs = rasterio.CRS.from_wkt(METRES)
+    share = _overlap(dataset, crs, target, grid, what)
     is_cells = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
-    return Placed(dataset, grid, dataset.transform, crs, None if is_cells else target, share)
+    return Placed(dataset, grid, dataset.transform, crs, target, share, is_cells)
 
 
-def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
     """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
-    from rasterio._err import CPLE_BaseError
-    from rasterio.errors import RasterioError
-
     try:
-        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target)
     except (RasterioError, CPLE_BaseError) as error:
         names = crs_name(crs), crs_name(target)
         raise TerrainError(
@@ -131,11 +116,3 @@ def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> f
             f" the terrain x {grid.west_m:.7g}..{grid_east:.7g}, y {grid_south:.7g}..{grid.north_m:.7g}"
         )
     return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
-
-
-def nearest(array: NDArray[Any], grid: GridSpec) -> tuple[Any, ...]:
-    """An index into an array over the same ground as a grid: the cell nearest to each cell of the grid."""
-    rows, cols = array.shape[:2]
-    at_row = ((np.arange(grid.rows) + 0.5) * rows / grid.rows).astype(np.intp)
-    at_col = ((np.arange(grid.cols) + 0.5) * cols / grid.cols).astype(np.intp)
-    return np.ix_(at_row, at_col)

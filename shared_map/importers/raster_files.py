@@ -12,23 +12,23 @@ import itertools
 import lzma
 import math
 import re
-import stat
 import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
-from swarm.config.input_files import FileKind, check_bytes, read_text, size
+from swarm.config.input_files import FileKind, check_bytes, check_file, read_text, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -44,9 +44,12 @@ _HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGN
 _SURFER_LINES = 5
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
-_HEAD_BYTES = 16
-AS_TEXT = "AS_TEXT"
-"""Tag of grids as text: few of these files say in which coordinate system they are."""
+_HEAD_BYTES = 4096
+"""Room for the comments before the root of an XML."""
+NOTES = "NOTES"
+"""Tag of numbers which we have read ourselves: what people should know of them, a line each."""
+PLAIN = (".npz", ".csv", ".xyz")
+"""Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md)."""
 BAD_ARCHIVE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
     KeyError, OverflowError,
@@ -67,11 +70,26 @@ _MAX_BANDS = 256
 describes in memory."""
 
 
+class Numbers(NamedTuple):
+    """Numbers which we have read ourselves, and where they lie.
+
+    numbers    float32 (rows, cols), NaN where there is none
+    transform  affine; None if the file does not say how large a cell is
+    crs        rasterio's; None if the file does not say it
+    notes      for people
+    """
+
+    numbers: Floats
+    transform: Any = None
+    crs: Any = None
+    notes: tuple[str, ...] = ("numbers which are read without GDAL",)
+
+
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
     if not path.is_file():  # a pipe would wait for ever
         return False
-    if path.suffix.lower() in (*_NAMELESS, ".zip"):
+    if path.suffix.lower() in (*_NAMELESS, *PLAIN, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:
         return _magic_driver(file.read(_HEAD_BYTES)) is not None
@@ -91,18 +109,16 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    if not path.is_file():
-        raise TerrainError(f"{what} {path} does not exist")
+    check_file(path, FileKind.IMAGE)
     try:
-        name, driver = _kind_of(path, what)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             # A .vrt names other files: none of them may be somewhere on the network.
             with (
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
-                _georeferenced(name, driver, path, f"{what} {path}") as dataset,
+                contextlib.ExitStack() as files,
             ):
-                yield dataset
+                yield _georeferenced(path, what, files)
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
@@ -110,59 +126,64 @@ def opened(path: Path, what: str) -> Iterator[Any]:
         raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
 
 
-@contextmanager
-def _georeferenced(name: str | Path, driver: str, path: Path, what: str) -> Iterator[Any]:
+def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     """A dataset of a size that fits and of real numbers. Where control points place it, it is warped by them."""
     import rasterio
     from rasterio.vrt import WarpedVRT
 
-    with contextlib.ExitStack() as files:
-        dataset = files.enter_context(rasterio.open(name, driver=driver))
-        _check_size(dataset, what)
-        if "text" in _FORMATS[driver]:
-            if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
-                cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
-                raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-            beside = _system_beside(path, what) if str(name).startswith("/vsisubfile/") else None
-            dataset = _in_memory(dataset, *_text_numbers(dataset, path, what), beside, files)
-        if dataset.transform.is_identity and dataset.gcps[0]:
-            dataset = files.enter_context(WarpedVRT(dataset))
-        yield dataset
+    if path.suffix.lower() in PLAIN:
+        return in_memory(_plain(path, f"{what} {path}"), files)
+    what = f"{what} {path}"
+    name, driver = _kind_of(path, what)
+    dataset = files.enter_context(rasterio.open(name, driver=driver))
+    _check_size(dataset, what)
+    if "text" in _FORMATS[driver]:
+        if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
+            cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
+            raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
+        crs = dataset.crs or (_system_beside(path, what) if str(name).startswith("/vsisubfile/") else None)
+        notes = (f"a grid as text, {driver}",)
+        return in_memory(Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, notes), files)
+    if dataset.transform.is_identity and dataset.gcps[0]:
+        return files.enter_context(WarpedVRT(dataset))
+    return dataset
+
+
+def _plain(path: Path, what: str) -> Numbers:
+    if path.suffix.lower() == ".npz":
+        from shared_map.importers.array_grids import read_npz
+
+        return read_npz(path, what)
+    from shared_map.importers.xyz_grids import read_text_grid
+
+    return read_text_grid(path, what)
 
 
 def _system_beside(path: Path, what: str) -> Any:
     """The system of a .prj, which GDAL does not find beside a part of a file."""
-    import rasterio
+    from shared_map.importers.georeference import system_named
 
     found = path.with_suffix(".prj")
-    if not found.is_file():
-        return None
-    try:
-        return rasterio.CRS.from_wkt(read_text(found, FileKind.SYSTEM), morph_from_esri_dialect=True)
-    except ValueError as error:
-        raise TerrainError(f"{what}: {found} holds no coordinate system") from error
+    return system_named(read_text(found, FileKind.SYSTEM), f"{what}: {found}") if found.is_file() else None
 
 
-def _in_memory(
-    dataset: Any, numbers: NDArray[Any], nodata: float | None, beside: Any, files: contextlib.ExitStack
-) -> Any:
-    """The same raster with other numbers."""
+def in_memory(given: Numbers, files: contextlib.ExitStack) -> Any:
+    """A dataset of numbers, of which NaN is no-data."""
     from rasterio import MemoryFile
 
     memory = files.enter_context(MemoryFile())
-    profile = {"count": 1, "height": dataset.height, "width": dataset.width, "dtype": numbers.dtype}
-    place = {"crs": dataset.crs or beside, "transform": dataset.transform, "nodata": nodata}
-    with memory.open(driver="GTiff", BIGTIFF="YES", **profile, **place) as copy:
-        copy.write(numbers, 1)
-        copy.update_tags(**{AS_TEXT: dataset.driver})
+    rows, cols = given.numbers.shape
+    profile = {"count": 1, "height": rows, "width": cols, "dtype": "float32", "nodata": math.nan}
+    with memory.open(driver="GTiff", BIGTIFF="YES", crs=given.crs, transform=given.transform, **profile) as copy:
+        copy.write(given.numbers, 1)
+        copy.update_tags(**{NOTES: "\n".join(given.notes)})
     return files.enter_context(memory.open())
 
 
-def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], float | None]:
-    """The numbers of a grid as text, int32 if all are whole, else float32, and which of them states a void.
+def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
+    """The numbers of a grid as text, NaN for none.
 
-    GDAL reads its header only: its drivers read text that is no number, and numbers that are missing, as 0, and its
-    first 100 kB decide whether all of it is whole.
+    GDAL reads its header only: its drivers read text that is no number, and numbers that are missing, as 0.
     """
     numbers = np.empty(dataset.height * dataset.width, np.float32)
     expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
@@ -173,14 +194,12 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
             text = rest + piece
             words = text.replace(b",", b".").split()
             rest = words.pop() if words and not text[-1:].isspace() else b""
-            fits = words[: numbers.size - count]
+            fits = [b"nan" if each == void else each for each in words[: numbers.size - count]]
             try:
-                numbers[count : count + len(fits)] = np.array(
-                    [each if each != void else "nan" for each in fits], np.float64
-                )
+                numbers[count : count + len(fits)] = np.array(fits, np.float64)
                 wrong = len(fits)
             except ValueError:
-                wrong = next(n for n, each in enumerate(fits) if each != void and not _is_number(each))
+                wrong = next(n for n, each in enumerate(fits) if not _is_number(each))
             if wrong < len(words):
                 at = next(itertools.islice(re.finditer(rb"\S+", text), wrong, None)).start()
                 shown = words[wrong][:40].decode("ascii", "replace")
@@ -190,14 +209,11 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> tuple[NDArray[Any], fl
             lines += piece.count(b"\n")
     if count < numbers.size:
         raise TerrainError(f"{what} has {count} numbers; {expected}")
-    whole = bool((np.abs(numbers) < 2**24).all() and (numbers == np.rint(numbers)).all())
-    nodata = math.nan if void is not None and not _is_number(void) else dataset.nodata
+    if dataset.nodata is not None:
+        with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
+            numbers[numbers == np.float32(dataset.nodata)] = np.nan
     grid = numbers.reshape(dataset.height, dataset.width)
-    grid = grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
-    stated = None if nodata is None or (whole and not abs(nodata) < 2**24) else nodata
-    with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
-        stored = None if stated is None else float(np.float32(stated))
-    return (grid.astype(np.int32) if whole else grid), stored
+    return grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
 
 
 def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:
@@ -220,9 +236,7 @@ def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | N
     if driver == "GRASSASCIIGrid":  # of which GDAL reads a part only
         turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(said.get(key, b""))]
         if turned or said.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
-            raise TerrainError(
-                f"{what}: its header has degrees and minutes or a multiplier; r.out.gdal writes a .tif"
-            )
+            raise TerrainError(f"{what}: its header has degrees and minutes or a multiplier; write it as a .tif")
     return number, void
 
 
@@ -238,14 +252,9 @@ def _check_size(dataset: Any, what: str) -> None:
     """Refuses what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
     if dataset.count == 0:
         held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
-        raise TerrainError(
-            f"{what} holds several rasters ({', '.join(held)}), expected one: gdal_translate takes one out"
-        )
+        raise TerrainError(f"{what} holds several rasters ({', '.join(held)}): gdal_translate takes one out")
     if any(dtype.startswith("complex") for dtype in dataset.dtypes):
-        raise TerrainError(
-            f"{what} holds complex numbers ({dataset.dtypes[0]}), expected real ones: gdal_calc --calc 'A.real'"
-            " makes such a file"
-        )
+        raise TerrainError(f"{what} holds complex numbers ({dataset.dtypes[0]}), expected real ones")
     rows, cols = dataset.height, dataset.width
     most = _MAX_PIXELS if "by_rows" in _FORMATS[dataset.driver] else MAX_CELLS
     if rows * cols > most:
@@ -266,29 +275,55 @@ def _check_size(dataset: Any, what: str) -> None:
 def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
     """Returns GDAL's name for a file, or for the one raster in it, and the driver that reads it.
 
-    Raises TerrainError on a file that is not a raster; `what` names the file. Raises OSError as `open` does.
+    Raises TerrainError on a file that is not a raster; `what` names it. Raises OSError as `open` does.
     """
-    if path.suffix.lower() == ".zip":
-        return _in_archive(path, what)
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    driver = _driver(head, path.suffix.lower(), f"{what} {path}")
+    head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
+    if member is not None:
+        driver = _driver(head, Path(member).suffix.lower(), f"{what}: {member}")
+        if driver == "VRT":
+            raise TerrainError(f"{what}: {member} names other files; unpack it")
+        return f"/vsizip/{{{path}}}/{member}", driver
+    driver = _driver(head, path.suffix.lower(), what)
     length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
-        raise TerrainError(
-            f"{what} {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
-            f" {_HGT_BYTES[0]}, one of 3601 has {_HGT_BYTES[1]}"
-        )
+        raise TerrainError(f"{what} is truncated or no .hgt: it has {length} bytes, expected one of {_HGT_BYTES}")
     if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
-        raise TerrainError(f"{what} {path}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
+        raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
-        _check_virtual(path, f"{what} {path}", {})
+        _check_virtual(path, what, {})
     if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
         return f"/vsisubfile/3,{path}", driver
     header = path.with_suffix(".hdr")
     if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
     return path, driver
+
+
+def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> tuple[bytes, str | None, int]:
+    """The first bytes of a file; of a .zip those of the one file in it with such an ending, its name, and the size
+    of all parts of that file.
+
+    Raises TerrainError if there are several such files, or they are larger than the kind allows.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    if not head.startswith(b"PK"):
+        return head, None, 0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            files = [each for each in archive.infolist() if not each.is_dir()]
+            named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
+            if len(named) != 1:
+                raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")
+            parts = [each for each in files if Path(each.filename).stem == Path(named[0]).stem]
+            unpacked = sum(each.file_size for each in parts)
+            if unpacked > kind.most_bytes:
+                most = f"at most {size(kind.most_bytes)} are read"
+                raise TerrainError(f"{what}: {named[0]} has {size(unpacked)}, {most}: unpack it, and crop it")
+            with archive.open(named[0]) as member:
+                return member.read(_HEAD_BYTES), named[0], unpacked
+    except BAD_ARCHIVE as error:
+        raise TerrainError(f"{what} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
 
 
 def _magic_driver(head: bytes) -> str | None:
@@ -320,20 +355,12 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
     for node in root.iter():
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
             continue
-        name = (node.text or "").strip()
-        try:
-            ordinary = not name.startswith("/vsi") and stat.S_ISREG((path.parent / name).stat().st_mode)
-        except (OSError, ValueError):
-            ordinary = False
-        if not ordinary:
-            raise TerrainError(f"{what} names {name[:LONGEST_REASON]!r}; expected a file that lies on this machine")
-        source = path.parent / name
+        source = path.parent / (node.text or "").strip()
+        check_file(source, FileKind.VIRTUAL_RASTER)
         with source.open("rb") as file:
-            head = file.read(4096)
-        # GDAL knows other kinds, also of the network.
-        _driver(head[:_HEAD_BYTES], source.suffix.lower(), f"{what}: {source}")
-        virtual = b"<VRTDataset" in head  # anywhere, for GDAL
-        if virtual:
+            head = file.read(_HEAD_BYTES)
+        _driver(head, source.suffix.lower(), f"{what}: {source}")  # GDAL knows other kinds, also of the network
+        if b"<VRTDataset" in head:  # anywhere, for GDAL
             if depth >= _DEEPEST:
                 raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
             if source not in known:
@@ -342,10 +369,7 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
             nested = max(nested, known[source])
     times = nested * max((_painted(root, band) for band in root.iter("VRTRasterBand")), default=1.0)
     if times > _MOST_TIMES:
-        raise TerrainError(
-            f"{what} paints its pixels {times:.0f} times over, as its sources overlap; at most {_MOST_TIMES} times"
-            " are read: gdal_translate makes one file of it"
-        )
+        raise TerrainError(f"{what} paints its pixels {times:.0f} times over; at most {_MOST_TIMES} times are read")
     return times
 
 
@@ -353,58 +377,27 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     """Returns how many times over the pixels of a band are painted, at least once."""
     try:
         cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
-        sources = [node for node in band if node.tag.endswith("Source")]
-        painted = 0.0
-        for source in sources:
-            place = source.find("DstRect")
-            if place is None:
-                painted += cells
-            else:
-                painted += abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
+        places = [node.find("DstRect") for node in band if node.tag.endswith("Source")]
+        painted = cells * places.count(None)
+        for place in places:
+            painted += 0 if place is None else abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
     except ValueError:
         return 1.0  # GDAL states the fault
     return max(painted / cells, 1.0)
 
 
-def _in_archive(path: Path, what: str) -> tuple[str, str]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            files = [each for each in archive.infolist() if not each.is_dir()]
-            named = [each for each in files if Path(each.filename).suffix.lower() in _ZIPPED]
-            if len(named) != 1:
-                raise TerrainError(
-                    f"{what} {path} holds {len(named)} rasters ({', '.join(_ZIPPED)}), expected one: unpack it"
-                )
-            (member,) = named
-            if member.file_size > FileKind.IMAGE.most_bytes:
-                raise TerrainError(
-                    f"{what} {path}: {member.filename} has {size(member.file_size)}; unpack it, and crop it"
-                )
-            with archive.open(member) as file:
-                head = file.read(_HEAD_BYTES)
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"{what} {path} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
-    driver = _driver(head, Path(member.filename).suffix.lower(), f"{what} {path}: {member.filename}")
-    if driver == "VRT":
-        raise TerrainError(f"{what} {path}: {member.filename} names other files; unpack it")
-    return f"/vsizip/{{{path}}}/{member.filename}", driver
-
-
 # --- read ---------------------------------------------------------------------------------------------------
 
 
-def thinned(read: Callable[..., NDArray[Any]], dataset: Any, bands_read: Any, every: int) -> NDArray[Any]:
-    """Returns every n-th row and column of a dataset's `read`. GDAL's own way to read fewer cells unpacks a tile
-    again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
-    from rasterio.windows import Window
-
-    if every == 1:
-        return np.asarray(read(bands_read))
+def sampled(dataset: Any, indexes: int | tuple[int, ...], most_cells: int) -> Any:
+    """Every n-th row and column of bands, at most `most_cells`: a masked array, as stored. GDAL's own way to read
+    fewer cells unpacks a tile again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
+    every = math.ceil(math.sqrt(max(dataset.height * dataset.width / most_cells, 1.0)))
     parts = []
     for row0, row1 in bands(dataset.height, every * max(READ_ROWS // every, 1)):
-        window = Window(0, row0, dataset.width, row1 - row0)
-        parts.append(read(bands_read, window=window)[..., ::every, ::every].copy())
-    return np.concatenate(parts, axis=-2)
+        rows = dataset.read(indexes, window=((row0, row1), (0, dataset.width)), masked=True)
+        parts.append(rows[..., ::every, ::every].copy())
+    return np.ma.concatenate(parts, axis=-2)  # type: ignore[no-untyped-call]
 
 
 def middle_of(dataset: Any, most_side: int) -> Any:

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import DRIVERS_BY_ENDING, is_raster
+from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
-from swarm.errors import TerrainError
+from swarm.config.input_files import FileKind, check_file
+from swarm.errors import TerrainError, require
 from swarm.grid import GridSpec
+
+if TYPE_CHECKING:
+    from shared_map.importers.cover.photos import Photo
 
 JACKSBORO_RESOLUTION_M = 75.0
 """Its heights are 3 arc seconds apart, at 36.6 degrees north 74.5 m from west to east and 92.5 m from north to
@@ -36,8 +40,7 @@ class Source:
     classes      uint8 (rows, cols), TerrainClass
     readings     uint8 (rows, cols), possible classes of an unknown cell, bits of `layers.READABLE`; 0 where none is
                  known; None without readings
-    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
-    drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
+    photo        the colour photo, uint8 (rows, cols, 3); black where it shows nothing
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
     level        bool (rows, cols), flat cells of the file, before any resampling; None if not examined
     notes        origin and processing steps, for people
@@ -49,8 +52,6 @@ class Source:
     _: KW_ONLY
     readings: Bytes | None = None
     photo: Bytes | None = None
-    seen: Bools | None = None
-    drawn: str | None = None
     factor: Floats | None = None
     level: Bools | None = None
     notes: tuple[str, ...] = ()
@@ -82,14 +83,16 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
     if config.photo is not None and config.cover is None and config.labels is None:
-        from shared_map.importers.cover.cover_meaning import is_drawn
+        from shared_map.importers.cover.land_cover import is_drawn
 
         if is_drawn(Path(config.photo), config):
             config = msgspec.structs.replace(config, photo=None, cover=config.photo)
     if config.photo is not None:
-        source = with_photo(source, Path(config.photo), config, progress)
-    if source.photo is not None:
-        source = classified(source, config, progress)
+        from shared_map.importers.cover.photos import read_photo
+
+        source = with_photo(
+            source, read_photo(Path(config.photo), source.grid, config.crs, progress), config, progress
+        )
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
@@ -114,14 +117,12 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.importers.array_grids import read_npz
-    from shared_map.importers.rasters import read_array
+    from shared_map.importers.rasters import read_raster
     from shared_map.terrain.synthetic.landscape import cover
 
-    path = _jacksboro_path()
     resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
     config = msgspec.structs.replace(config, resolution_m=resolution_m, crs=None)
-    source = read_array(read_npz(path), path, config, no_progress)
+    source = read_raster(_jacksboro_path(), config, no_progress)
     classes = cover(source.elevation_m, source.grid.resolution_m, seed)
     if config.level_is == "water":
         classes[source.level] = TerrainClass.WATER
@@ -131,80 +132,54 @@ def _jacksboro(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro_path() -> Path:
     # Not matplotlib.cbook.get_sample_data: importing it takes 0.8 s.
+    require("terrain.source = 'jacksboro'", "matplotlib")
     spec = importlib.util.find_spec("matplotlib")
-    if spec is None or spec.origin is None:
-        raise TerrainError("terrain.source = 'jacksboro' comes with matplotlib, which is not installed")
-    path = Path(spec.origin).parent / "mpl-data" / "sample_data" / JACKSBORO_FILE
-    if not path.is_file():
-        raise TerrainError(f"matplotlib is installed without its sample data: {path} is missing")
-    return path
+    return Path(str(spec and spec.origin)).parent / "mpl-data" / "sample_data" / JACKSBORO_FILE
 
 
 # --- files --------------------------------------------------------------------------------------------------
 
 
 def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    if not path.exists():
-        raise TerrainError(f"terrain {path} does not exist: no such file; give one, or jacksboro or synthetic")
-    if path.is_dir():
-        raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
-    if not path.is_file():
-        raise TerrainError(f"terrain {path} is a pipe or a device; give a file: {FILE_KINDS}")
+    check_file(path, FileKind.TEXT_GRID)
     suffix = path.suffix.lower()
-    if suffix not in _READERS and not is_raster(path):
+    if suffix not in _ENDINGS and not is_raster(path):
         found = suffix or "a file without ending"
         others = "`gdal_translate FILE out.tif` converts most others"
         raise TerrainError(f"terrain {path}: {found} is unknown; give {FILE_KINDS}; {others}")
-    return _READERS.get(suffix, _raster)(path, config, progress)
-
-
-def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    if suffix in _LEVEL:
+        return _map(path, config)
     from shared_map.importers.rasters import read_raster
 
     return read_raster(path, config, progress)
 
 
-def _array(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.array_grids import read_npz
-    from shared_map.importers.rasters import read_array
-    from shared_map.importers.xyz_grids import read_text_grid
-
-    plain = read_npz(path) if path.suffix.lower() == ".npz" else read_text_grid(path)
-    return read_array(plain, path, config, progress)
-
-
-def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from shared_map.importers.array_grids import read_map, read_ros
 
-    plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
-    assert plain.factor is not None
-    resolution_m = plain.step[0] or config.resolution_m or 1.0
+    found = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
+    resolution_m = found.step_m or config.resolution_m or 1.0
     if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
         raise TerrainError(
-            f"terrain {path} has cells of {resolution_m:g} m and cannot be resampled without closing gaps;"
-            " leave terrain.resolution_m out"
+            f"terrain {path} cannot be resampled without closing gaps; leave terrain.resolution_m out"
         )
-    factor = plain.factor.copy()
+    factor = found.factor
     factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
-    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, plain.west, plain.north)
+    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, found.west, found.north)
     level = np.zeros(factor.shape, np.float32)
-    notes = (str(path), *plain.notes)
-    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=notes)
+    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=(str(path), found.note))
 
 
-_READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
-    **dict.fromkeys((*DRIVERS_BY_ENDING, ".zip"), _raster),
-    **dict.fromkeys((".npz", ".csv", ".xyz"), _array),
-    **dict.fromkeys((".map", ".yaml", ".yml"), _map),
-}
-"""Ending -> reader. A new kind of file is a row here; a raster of any other name is known by how it begins."""
-FILE_KINDS = ", ".join(_READERS)
+_LEVEL = (".map", ".yaml", ".yml")
+_ENDINGS = (*DRIVERS_BY_ENDING, ".zip", *PLAIN, *_LEVEL)
+"""Endings of terrains; a raster of any other name is known by how it begins."""
+FILE_KINDS = ", ".join(_ENDINGS)
 
 
 def is_terrain(path: Path) -> bool:
     """Returns True if a file is named as one that holds a terrain, or begins as a raster."""
-    return path.suffix.lower() in _READERS or is_raster(path)
+    return path.suffix.lower() in _ENDINGS or is_raster(path)
 
 
 # --- what covers the ground ---------------------------------------------------------------------------------
@@ -212,7 +187,7 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.level_ground import HIGHEST_M, fill_voids, voids_of
+    from shared_map.importers.level_ground import fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
@@ -225,8 +200,7 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     if share == 1.0 and np.isfinite(some_m).any():
         found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
         raise TerrainError(
-            f"terrain {config.source} has heights of {found} m, expected at most {HIGHEST_M:g}: of centimetres set"
-            " terrain.height_scale = 0.01"
+            f"terrain {config.source} has heights of {found} m: of centimetres set terrain.height_scale = 0.01"
         )
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
@@ -255,41 +229,28 @@ def with_water(source: Source, config: TerrainConfig) -> Source:
     return replace(source, classes=classes, notes=notes)
 
 
-def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.cover.photos import read_photo
+def with_photo(source: Source, photo: Photo, config: TerrainConfig, progress: Progress) -> Source:
+    """The source with a photo, and with the classes that it shows unless it is no true-colour one."""
+    from shared_map.importers.cover.classify import class_readings, learnt, read_labels
 
-    photo = read_photo(path, source.grid, config.crs, progress)
-    notes = (*source.notes, str(path), *photo.notes)
-    return replace(source, photo=photo.rgb, seen=photo.seen, drawn=photo.drawn, notes=notes)
-
-
-def classified(source: Source, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.cover.classify import class_readings, learnt
-    from shared_map.importers.cover.photos import why_not_true_colour
-
-    assert source.photo is not None
-    inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
-    seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
-    other = source.drawn or why_not_true_colour(source.photo, seen)
-    if config.labels is None and other is not None:
+    inputs = (photo.rgb, source.elevation_m, source.grid.resolution_m)
+    classes, readings = source.classes, None
+    if config.labels is not None:
+        labels = read_labels(Path(config.labels), source.grid)
+        classes = learnt(*inputs, labels.classes, photo.seen, progress)
+        note = f"classes from the photo, learnt from {labels.count} labels"
+    elif photo.other is not None:
         note = (
-            f"the photo is {other}; no classes are read from it: give a true-colour one, terrain.labels, or its"
-            " codes as terrain.cover"
+            f"the photo is {photo.other}; no classes are read from it: give a true-colour one, terrain.labels, or"
+            " its codes as terrain.cover"
         )
-        return replace(source, notes=(*source.notes, note))
-    readings = None
-    if config.labels is None:
-        classes, readings = class_readings(*inputs, source.seen, progress)
-        doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
+    else:
+        classes, readings = class_readings(*inputs, photo.seen, progress)
+        doubtful = float((classes[photo.seen] == TerrainClass.UNKNOWN).mean())
         note = (
             f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
             " exposed a little differently, is unknown and costs as the costliest of these classes: see"
             " terrain.labels and cost.class_factor.unknown"
         )
-    else:
-        from shared_map.importers.cover.classify import read_labels
-
-        labels = read_labels(Path(config.labels), source.grid)
-        classes = learnt(*inputs, labels.classes, source.seen, progress)
-        note = f"classes from the photo, learnt from {labels.count} labels"
-    return replace(source, classes=classes, readings=readings, notes=(*source.notes, note))
+    notes = (*source.notes, *photo.notes, note)
+    return replace(source, classes=classes, readings=readings, photo=photo.rgb, notes=notes)

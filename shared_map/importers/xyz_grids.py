@@ -13,12 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio import CRS
+from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
-from shared_map.importers.array_grids import PlainGrid, check_cells
+from shared_map.importers.array_grids import check_cells
+from shared_map.importers.raster_files import Numbers
 from swarm.config.input_files import MAX_LINE_BYTES, FileKind, check_bytes, size
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS
 
 _KIND = FileKind.POINTS
 _CHUNK_BYTES = 4 << 20
@@ -48,19 +50,22 @@ Points = NDArray[np.float64]
 class _Layout(NamedTuple):
     """Layout of a text.
 
+    what       names the file in sentences
     delimiter  between numbers; None is any blank
     header     number of the line that names columns; 0 if there is none
     columns    of x, y and z; None for rows of heights
     degrees    whether x and y are longitude and latitude
     """
 
+    path: Path
+    what: str
     delimiter: str | None
-    header: int
-    columns: tuple[int, int, int] | None
+    header: int = 0
+    columns: tuple[int, int, int] | None = None
     degrees: bool = False
 
 
-def read_text_grid(path: Path) -> PlainGrid:
+def read_text_grid(path: Path, what: str) -> Numbers:
     """Heights of a text.
 
     Parameters
@@ -69,29 +74,32 @@ def read_text_grid(path: Path) -> PlainGrid:
         Numbers between commas, semicolons, tabs or blanks; a header may name x, y and z (or lon, lat ...). Points
         may come in any order, and coordinates are those of the middles of cells. Without a header, three columns
         (in .xyz: the first three) are x, y, z; any other number of columns are rows of heights, from the north.
+    what : str
+        Names the file in sentences.
 
     Returns
     -------
-    PlainGrid
+    Numbers
         Missing points and empty fields are NaN.
 
     Raises
     ------
     TerrainError
-        If the file cannot be read, a line holds what is no number, or the points lie on no regular grid.
+        If a line holds what is no number, or the points lie on no regular grid. Raises OSError, and
+        UnicodeDecodeError where it is no text.
     """
     check_bytes(path, _KIND)
-    layout = _layout(path)
-    return _rows_of_heights(path, layout) if layout.columns is None else _points(path, layout)
+    layout = _layout(path, what)
+    return _rows_of_heights(layout) if layout.columns is None else _points(layout)
 
 
 # --- text to numbers ----------------------------------------------------------------------------------------
 
 
-def _layout(path: Path) -> _Layout:
+def _layout(path: Path, what: str) -> _Layout:
     number, first = next((each for lines in _lines(path) for each in lines.items()), (0, ""))
     if not first:
-        raise TerrainError(f"terrain {path} holds no numbers")
+        raise TerrainError(f"{what} holds no numbers")
     delimiter = next((each for each in ";\t," if each in first), None)
     words = [word.strip(" \"'").lower() for word in first.split(delimiter)]
     try:
@@ -99,39 +107,32 @@ def _layout(path: Path) -> _Layout:
     except ValueError:
         x, y, z = (next((words.index(name) for name in names if name in words), None) for names in (_X, _Y, _Z))
         if x is None or y is None or z is None:
-            raise TerrainError(
-                f"terrain {path}, line {number}: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
-            ) from None
+            raise TerrainError(f"{what}, line {number}: {first[:60]!r} names no x, y, z or lon, lat, z") from None
         degrees = words[x] in _DEGREES and words[y] in _DEGREES
-        return _Layout(delimiter, number, (x, y, z), degrees)
-    is_xyz = path.suffix.lower() == ".xyz"
+        return _Layout(path, what, delimiter, number, (x, y, z), degrees)
+    is_xyz = path.suffix.lower() == ".xyz" or words[3:] in ([], [""])
     if is_xyz and len(words) < 3:
-        raise TerrainError(f"terrain {path}: its first line has {len(words)} numbers; expected x, y and z")
-    return _Layout(delimiter, 0, (0, 1, 2) if is_xyz or words[3:] in ([], [""]) else None)
+        raise TerrainError(f"{what}: its first line has {len(words)} numbers; expected x, y and z")
+    return _Layout(path, what, delimiter, columns=(0, 1, 2) if is_xyz else None)
 
 
 def _lines(path: Path) -> Iterator[dict[int, str]]:
     """Number -> line of those that are neither empty nor a comment, piece by piece."""
     number, rest, last = 1, b"", False
-    try:
-        with path.open("rb") as file:
-            while not last:
-                piece = file.read(_CHUNK_BYTES)
-                last = not piece
-                whole, newline, rest = (rest + piece + b"\n" * last).rpartition(b"\n")
-                if len(rest) > MAX_LINE_BYTES:
-                    raise _KIND.refusal(path, f"a line is longer than {size(MAX_LINE_BYTES)}")
-                lines = whole.decode("utf-8-sig" if number == 1 else "utf-8").split("\n") if newline else []
-                stripped = {n: line.strip(" \r") for n, line in enumerate(lines, number)}
-                yield {n: line for n, line in stripped.items() if line and not line.startswith("#")}
-                number += len(lines)
-    except OSError as error:
-        raise _KIND.unreadable(path, error) from error
-    except UnicodeDecodeError as error:
-        raise TerrainError(f"terrain {path} is not text: {error.reason}") from error
+    with path.open("rb") as file:
+        while not last:
+            piece = file.read(_CHUNK_BYTES)
+            last = not piece
+            whole, newline, rest = (rest + piece + b"\n" * last).rpartition(b"\n")
+            if len(rest) > MAX_LINE_BYTES:
+                raise _KIND.refusal(path, f"a line is longer than {size(MAX_LINE_BYTES)}")
+            lines = whole.decode("utf-8-sig" if number == 1 else "utf-8").split("\n") if newline else []
+            stripped = {n: line.strip(" \r") for n, line in enumerate(lines, number)}
+            yield {n: line for n, line in stripped.items() if line and not line.startswith("#")}
+            number += len(lines)
 
 
-def _numbers(path: Path, layout: _Layout) -> Iterator[Points]:
+def _numbers(layout: _Layout) -> Iterator[Points]:
     """float64 (lines, columns) of the text, piece by piece; empty fields are NaN."""
     mark = layout.delimiter
     empty = None if mark is None else re.compile(f"(?:(?<={mark})|^) *(?={mark}|$)")
@@ -140,34 +141,29 @@ def _numbers(path: Path, layout: _Layout) -> Iterator[Points]:
         filled = lines if empty is None else [empty.sub("nan", line) for line in lines]
         return np.loadtxt(filled, np.float64, delimiter=mark, usecols=layout.columns, ndmin=2, comments=None)
 
-    for lines in _lines(path):
+    for lines in _lines(layout.path):
         lines.pop(layout.header, None)
         if not lines:
             continue
         try:
             yield numbers_of(lines.values())
         except _NO_NUMBERS as error:
-            expected = "heights" if layout.columns is None else "x, y and z"
-            raise _bad_line(path, lines, numbers_of, expected) from error
+            raise _bad_line(layout, lines, numbers_of) from error
 
 
-def _bad_line(
-    path: Path, lines: dict[int, str], numbers_of: Callable[[list[str]], Points], expected: str
-) -> TerrainError:
+def _bad_line(layout: _Layout, lines: dict[int, str], numbers_of: Callable[[list[str]], Points]) -> TerrainError:
     """The error that names the first line that is not as the others, in numpy's words."""
-    widths = []
+    expected, width = "heights" if layout.columns is None else "x, y and z", 0
     for number, line in lines.items():
         try:
-            widths.append(numbers_of([line]).shape[1])
+            found = numbers_of([line]).shape[1]
         except _NO_NUMBERS as error:
-            why = re.sub(r"could not convert string (.*) to float64", r"\1 is no number", str(error))
-            why = re.split(r" at row|: row", why)[0][:120]
-            return TerrainError(f"terrain {path}, line {number}: {why}; expected {expected}")
-        if widths[-1] != widths[0]:
-            return TerrainError(
-                f"terrain {path} is ragged: line {number} has {widths[-1]} heights, others {widths[0]}"
-            )
-    return TerrainError(f"terrain {path} holds text that is not a number")
+            why = re.split(r" at row|: row", str(error))[0][:120]
+            return TerrainError(f"{layout.what}, line {number}: {why}; expected {expected}")
+        width = width or found
+        if found != width:
+            break
+    return TerrainError(f"{layout.what} is ragged: line {number} has {found} heights, others {width}")
 
 
 def _heights(numbers: Points) -> Floats:
@@ -179,20 +175,17 @@ def _heights(numbers: Points) -> Floats:
 # --- rows of heights ----------------------------------------------------------------------------------------
 
 
-def _rows_of_heights(path: Path, layout: _Layout) -> PlainGrid:
+def _rows_of_heights(layout: _Layout) -> Numbers:
     parts: list[Floats] = []
-    cells = 0
-    for part in _numbers(path, layout):
-        if parts and part.shape[1] != parts[0].shape[1]:
-            both = f"{parts[0].shape[1]} and of {part.shape[1]}"
-            raise TerrainError(f"terrain {path} is ragged: it has lines of {both} heights")
-        cells += part.size
-        if cells > MAX_CELLS:
-            raise TerrainError(f"terrain {path} has more than {MAX_CELLS} heights; crop it")
+    for part in _numbers(layout):
         parts.append(_heights(part))
+        if part.shape[1] != parts[0].shape[1]:
+            both = f"{parts[0].shape[1]} and of {part.shape[1]}"
+            raise TerrainError(f"{layout.what} is ragged: it has lines of {both} heights")
+        check_cells(sum(map(len, parts)), part.shape[1], layout.what)
     heights = np.concatenate(parts)
     note = f"{heights.shape[0]} lines of {heights.shape[1]} heights, the first taken for the north"
-    return PlainGrid(heights, None, (0.0, 0.0), notes=(note,))
+    return Numbers(heights, notes=(note,))
 
 
 # --- points -------------------------------------------------------------------------------------------------
@@ -207,25 +200,24 @@ class _Axis(NamedTuple):
     cells: int
 
 
-def _points(path: Path, layout: _Layout) -> PlainGrid:
+def _points(layout: _Layout) -> Numbers:
+
+    what, total = layout.what, 0
     xs = ys = np.zeros(0)
-    total = 0
-    for part in _numbers(path, layout):
+    for part in _numbers(layout):
         xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
         if not ((np.abs(xs) <= _FURTHEST).all() and (np.abs(ys) <= _FURTHEST).all()):
-            raise TerrainError(f"terrain {path}: a point has no x or no y, or one beyond {_FURTHEST:g}")
+            raise TerrainError(f"{what}: a point has no x or no y, or one beyond {_FURTHEST:g}")
         total += len(part)
         if max(len(xs), len(ys)) > _MOST_STEPS:
-            raise _irregular(path, f"x and y have more than {_MOST_STEPS} different values")
-    across, down = _axis(xs, "x", path), _axis(ys, "y", path)
-    cells = down.cells * across.cells
+            raise _irregular(what, f"x and y have more than {_MOST_STEPS} different values")
+    across, down = _axis(xs, "x", what), _axis(ys, "y", what)
+    cells, steps = down.cells * across.cells, f"{across.step:g} x {down.step:g}"
     if total < _LEAST_FILLED * cells:
-        raise _irregular(
-            path, f"{total} points are {total / cells:.1%} of a grid of {across.step:g} x {down.step:g}"
-        )
-    check_cells(down.cells, across.cells, path)
+        raise _irregular(what, f"{total} points are {total / cells:.1%} of a grid of {steps}")
+    check_cells(down.cells, across.cells, what)
     heights = np.full(cells, np.nan, np.float32)
-    for part in _numbers(path, layout):  # a second time: to hold the points would take ten times their grid
+    for part in _numbers(layout):  # a second time: to hold the points would take ten times their grid
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
         row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
         at, z = row * across.cells + col, _heights(part[:, 2])
@@ -234,31 +226,32 @@ def _points(path: Path, layout: _Layout) -> PlainGrid:
         other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))
         if other.any():
             x, y, height_m = part[int(other.argmax())]
-            raise TerrainError(f"terrain {path}: two heights at x {x:g}, y {y:g}, of which one is {height_m:g}")
+            raise TerrainError(f"{what}: two heights at x {x:g}, y {y:g}, of which one is {height_m:g}")
     missing = int(np.isnan(heights).sum())
-    notes = [f"{total} points x, y, z, {across.step:g} x {down.step:g} apart, the middles of cells"]
+    notes = [f"{total} points x, y, z, {steps} apart, the middles of cells"]
     if missing:
         notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
     west, north = across.first - across.step / 2, down.last + down.step / 2
-    grid, steps = heights.reshape(down.cells, across.cells), (across.step, down.step)
-    return PlainGrid(grid, None, steps, west, north, degrees=layout.degrees, notes=tuple(notes))
+    place = from_origin(west, north, across.step, down.step)
+    crs = CRS.from_epsg(4326) if layout.degrees else None
+    return Numbers(heights.reshape(down.cells, across.cells), place, crs, tuple(notes))
 
 
-def _axis(values: NDArray[np.float64], name: str, path: Path) -> _Axis:
+def _axis(values: NDArray[np.float64], name: str, what: str) -> _Axis:
     """The even steps that the different values along an axis lie on. Raises TerrainError if they lie on none."""
     span = float(values[-1] - values[0]) if len(values) else 0.0
     apart = values[np.concatenate(([True], np.diff(values) > _SAME * span))]
     gaps = np.diff(apart)
     if span <= 0 or not len(gaps):
-        raise TerrainError(f"terrain {path}: all points have the same {name}; a grid has at least two of each")
+        raise TerrainError(f"{what}: all points have the same {name}; a grid has at least two of each")
     # Printed coordinates are rounded: the step is the whole extent over the number of steps, not the smallest gap.
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
     at = np.concatenate(([0], np.cumsum(np.rint(gaps / step))))
     step = float(apart[-1] - apart[0]) / float(at[-1])
     if np.abs(apart - apart[0] - at * step).max() > _OFF_STEP * step:
-        raise _irregular(path, f"{name} has gaps from {gaps.min():g} to {gaps.max():g}, of no common step")
+        raise _irregular(what, f"{name} has gaps from {gaps.min():g} to {gaps.max():g}, of no common step")
     return _Axis(float(apart[0]), float(apart[-1]), step, int(at[-1]) + 1)
 
 
-def _irregular(path: Path, why: str) -> TerrainError:
-    return TerrainError(f"terrain {path}: its points lie on no regular grid: {why}; gdal_grid makes one of them")
+def _irregular(what: str, why: str) -> TerrainError:
+    return TerrainError(f"{what}: its points lie on no regular grid: {why}; gdal_grid makes one of them")

@@ -333,18 +333,6 @@ def keep(key: str, files: Iterable[Path]) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def keep_beside(key: str, file: Path) -> None:
-    """Keeps one more file of a kept terrain, which follows from it and took long to find."""
-    folder = kept_root() / key
-    try:
-        with _locked(folder):
-            sums = json.loads((folder / _SUMS).read_text(encoding="utf-8")) | {file.name: _sum(file)}
-            _link(file, folder / file.name)
-            write_file(folder / _SUMS, json.dumps(sums, indent=1).encode())
-    except (OSError, StoreError, ValueError, TypeError) as error:
-        log.info("%s is not kept in %s: %s", file.name, folder, error)
-
-
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     itself = os.open(folder, os.O_RDONLY)

@@ -51,11 +51,11 @@ class Orders:
         places  as commands have them: "46.81,9.84", "xy:X,Y" or "cell:ROW,COL"
         then    after the last: "hold" there, "chase" targets again, or "repeat" from the first
         """
-        return self._operator.send(_checked(SendVehicle, vehicle=vehicle, places=list(places), then=then))[1]
+        return self._operator.give(_checked(SendVehicle, vehicle=vehicle, places=list(places), then=then))[1]
 
     def recall(self, vehicle: str) -> Acknowledged:
         """Returns it to the chase of targets."""
-        return self._operator.send(_checked(SendVehicle, vehicle=vehicle, off=True))[1]
+        return self._operator.give(_checked(SendVehicle, vehicle=vehicle, off=True))[1]
 
     def goals(self) -> list[VehicleGoals]:
         """The places to which vehicles were sent."""

@@ -71,7 +71,7 @@ class Route:
                 target_cell=reply.to_cell,
             )  # fmt: skip
         return cls(
-            frame, reply.target, status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
+            frame, reply.target or "", status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
             age_s, lost, turns, reply.target_cell, nearest,
         )  # fmt: skip
 

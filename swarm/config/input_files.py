@@ -31,6 +31,7 @@ class FileKind(Enum):
     HOSTS = ("hosts", 1 << 19, ConfigError)
     STUDY = ("study", 1 << 19, ConfigError)
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
+    REVOKED = ("revoked names", 1 << 20, ConfigError)  # room for some 16,000 of the longest names
     SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)
     COVER_TABLE = ("cover codes", 4 << 20, TerrainError)
@@ -49,7 +50,7 @@ class FileKind(Enum):
     RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
-    LIVES = ("lives", 1 << 20, StoreError)
+    GENERATIONS = ("lives", 1 << 20, StoreError)
     RECORDING = ("recording", 256 << 20, StoreError)
 
     def __init__(self, what: str, most_bytes: int, error: type[SwarmError]) -> None:

@@ -54,7 +54,7 @@ class Head(Record, frozen=True, tag=0):
 
     scenario  as TOML, with every setting
     terrain   digest
-    before    what its earlier lives have counted, as a payload; empty if that is not known
+    before    what its earlier generations have counted, as a payload; empty if that is not known
     versions  package -> version of what made it
     """
 

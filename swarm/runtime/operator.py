@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from msgspec.structs import replace
 
@@ -52,7 +53,11 @@ _LEAVE_S = 0.3
 _MOST_REPLIES = 1 << 16
 """More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
 _MOST_SEEN = 1 << 12
-"""The holder of a certificate may raise tokens of any number of lives, one after the other."""
+"""The holder of a certificate may raise tokens of any number of generations, one after the other."""
+
+
+AnyOrder = GiveOrder | SendVehicle | ZoneOrder
+M = TypeVar("M", Zones, Orders, Goals)
 
 
 @dataclass(frozen=True)
@@ -86,62 +91,46 @@ class Operator:
 
     def zones(self) -> Zones:
         """The zones that stand. Raises BusError without a keeper."""
-        return self._order_zone(ZoneOrder(action="list"), self._keeper())
+        return self._order(ZONES, ZoneOrder(action="list"), Zones)
 
     def zone(self, order: ZoneOrder) -> tuple[Zones, Acknowledged]:
         """Adds or removes a zone, and waits until it is in the maps of all agents and the trees of all planners.
 
         Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
         """
-        members = self._members()
-        keeper, began_s = self._keeper(members), time.monotonic()
-        zones = self._order_zone(order, keeper)
+        members, began_s = self._members(), time.monotonic()
+        zones = self._order(ZONES, order, Zones, members)
         author = f"operator.{zones.changed}"
         return zones, self._obeyed(Obey(author=author, sets=zones.sets[:_MOST_SETS]), members, began_s)
 
     def orders(self) -> Orders:
         """Returns the orders in force. Raises BusError without a keeper."""
-        reply = self._order(GIVE_ORDER, GiveOrder(), self._keeper())
-        assert isinstance(reply, Orders)
-        return reply
+        return self._order(GIVE_ORDER, GiveOrder(), Orders)
 
-    def give(self, order: GiveOrder) -> tuple[Order, Acknowledged]:
-        """Pause, stop, say whom to chase, add targets, change settings, or take that back; wait until all obey.
+    def goals(self) -> Goals:
+        """Returns where vehicles are sent. Raises BusError without a keeper."""
+        return self._order(SEND_VEHICLE, SendVehicle(), Goals)
+
+    def give(self, order: GiveOrder | SendVehicle) -> tuple[Order | VehicleGoals, Acknowledged]:
+        """Pauses, stops, names targets, changes settings, sends a vehicle to places, or takes that back;
+        waits until all which it concerns obey.
 
         Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
         """
-        members = self._members()
-        keeper, began_s = self._keeper(members), time.monotonic()
-        reply = self._order(GIVE_ORDER, replace(order, stamp_ns=time.time_ns()), keeper)
-        assert isinstance(reply, Orders)
-        given = reply.given
+        members, began_s = self._members(), time.monotonic()
+        if isinstance(order, SendVehicle):
+            goals = self._order(SEND_VEHICLE, order, Goals, members).given
+            assert goals is not None
+            obey = Obey(subject="vehicle", name=goals.name, stamp_ns=goals.stamp_ns, goals=True)
+            agent = agent_of(goals.name)
+            hosts = [each for each in members if (each.role, each.id) == ("agent", agent)]
+            return goals, self._obeyed(obey, hosts, began_s, role="agent", id=agent)
+        given = self._order(GIVE_ORDER, order, Orders, members).given
         assert given is not None
         obey = Obey(subject=given.subject, name=given.name, stamp_ns=given.stamp_ns)
         if given.subject == "target" and given.off:  # its planner ends, and may not answer any more
             members = [each for each in members if (each.role, job_of(each.id)) != ("planner", given.name)]
         return given, self._obeyed(obey, members, began_s)
-
-    def goals(self) -> Goals:
-        """Returns where vehicles are sent. Raises BusError without a keeper."""
-        reply = self._order(SEND_VEHICLE, SendVehicle(), self._keeper())
-        assert isinstance(reply, Goals)
-        return reply
-
-    def send(self, order: SendVehicle) -> tuple[VehicleGoals, Acknowledged]:
-        """Sends a vehicle to places, or recalls it; waits until its agent obeys.
-
-        Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
-        """
-        members = self._members()
-        keeper, began_s = self._keeper(members), time.monotonic()
-        reply = self._order(SEND_VEHICLE, replace(order, stamp_ns=time.time_ns()), keeper)
-        assert isinstance(reply, Goals)
-        given = reply.given
-        assert given is not None
-        obey = Obey(subject="vehicle", name=given.name, stamp_ns=given.stamp_ns, goals=True)
-        agent = agent_of(given.name)
-        hosts = [each for each in members if (each.role, each.id) == ("agent", agent)]
-        return given, self._obeyed(obey, hosts, began_s, role="agent", id=agent)
 
     # --- asking ---------------------------------------------------------------------------------------------
 
@@ -161,14 +150,13 @@ class Operator:
             raise BusError(f"no keeper answers in namespace {self._bus.namespace!r}, and orders need one")
         return keepers[0]
 
-    def _order_zone(self, order: ZoneOrder, keeper: str) -> Zones:
-        reply = self._order(ZONES, replace(order, stamp_ns=time.time_ns()), keeper)
-        assert isinstance(reply, Zones)
-        return reply
-
-    def _order(self, topic: Topic, order: Message, keeper: str) -> Message:
-        replies, failure = replies_to(self._bus, topic, order, _ORDER_S, keeper=keeper)
+    def _order(self, topic: Topic, order: AnyOrder, kind: type[M], members: list[RunInfo] | None = None) -> M:
+        """The answer of a keeper to an order."""
+        keeper = self._keeper(members)
+        stamped = replace(order, stamp_ns=time.time_ns())
+        replies, failure = replies_to(self._bus, topic, stamped, _ORDER_S, keeper=keeper)
         if replies:
+            assert isinstance(replies[0], kind)
             return replies[0]
         if failure is not None and failure != "timeout":
             raise ConfigError(failure)

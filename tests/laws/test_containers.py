@@ -16,7 +16,7 @@ import pytest
 import yaml
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from laws.test_deploy_plan import SCENARIOS, machines, planned
+from laws.test_deploy_plan import PLANS
 from support.effort import few
 
 from launch_scripts.cli import command
@@ -26,7 +26,6 @@ from launch_scripts.process_table import TABLE
 from swarm.config.load import parse_scenario
 
 LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
-PLANS = st.builds(planned, SCENARIOS, machines()).filter(lambda plan: plan is not None)
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "kubernetes" / "swarm.yaml"
 OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all(EXAMPLE.read_text(encoding="utf-8")))
 

@@ -64,14 +64,23 @@ def planned(
     return None
 
 
+Made = tuple[Scenario, HostsConfig, Plan]
+
+
+def carried(hosts: st.SearchStrategy[HostsConfig]) -> st.SearchStrategy[Made]:
+    """Scenarios, machines that carry them, and their plans."""
+    made = st.builds(lambda scenario, hosts: (scenario, hosts, planned(scenario, hosts)), SCENARIOS, hosts)
+    return made.filter(lambda each: each[2] is not None)  # type: ignore[return-value]
+
+
+MADE = carried(machines())
+PLANS = MADE.map(lambda made: made[2])
+
+
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines())
-def test_every_process_runs_once_where_it_may_and_apart_from_those_that_do_the_same_job(
-    scenario: Scenario, hosts: HostsConfig
-) -> None:
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
+@given(MADE)
+def test_every_process_runs_once_where_it_may_and_apart_from_those_that_do_the_same_job(made: Made) -> None:
+    _, hosts, plan = made
     ran = Counter((process.role, process.id) for _, process in plan.processes)
     assert set(ran.values()) == {1}
     routers = {("router", str(n)) for n in range(sum("router" in host.roles for host in hosts.hosts))}
@@ -93,24 +102,18 @@ def test_every_process_runs_once_where_it_may_and_apart_from_those_that_do_the_s
 
 
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines())
-def test_consecutive_agents_run_together(scenario: Scenario, hosts: HostsConfig) -> None:
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
-    order = [each.id for each in plan_agents(scenario)]
+@given(PLANS)
+def test_consecutive_agents_run_together(plan: Plan) -> None:
+    order = [each.id for each in plan_agents(plan.scenario)]
     runs = [[order.index(agent.id) for agent in host.of("agent")] for host in plan.hosts]
     for run in filter(None, runs):
         assert run == list(range(run[0], run[-1] + 1))
 
 
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines(st.just(HOST_ROLES)))
-def test_machines_have_agents_by_their_cores(scenario: Scenario, hosts: HostsConfig) -> None:
+@given(carried(machines(st.just(HOST_ROLES))).map(lambda made: made[2]))
+def test_machines_have_agents_by_their_cores(plan: Plan) -> None:
     """A machine that has agents is as full of router, launcher and agents as the others, to one agent."""
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
     largest = max(process.cores for _, process in plan.processes if process.role == "agent")
     full = {
         host.name: LAUNCHER_CORES + sum(process.cores for process in host.of("router") + host.of("agent"))
@@ -141,11 +144,8 @@ def test_like_machines_are_equally_loaded_but_for_a_process_of_each_job(
 
 
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines())
-def test_planners_of_an_added_target_start_on_one_machine_each(scenario: Scenario, hosts: HostsConfig) -> None:
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
+@given(PLANS)
+def test_planners_of_an_added_target_start_on_one_machine_each(plan: Plan) -> None:
     ranks = []
     for host in plan.hosts:
         words = [process.selector for process in host.processes]
@@ -160,13 +160,8 @@ def test_planners_of_an_added_target_start_on_one_machine_each(scenario: Scenari
 
 
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines())
-def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(
-    scenario: Scenario, hosts: HostsConfig
-) -> None:
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
+@given(PLANS)
+def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(plan: Plan) -> None:
     records = []
     for host in plan.hosts:
         words = [process.selector for process in host.processes]
@@ -177,13 +172,8 @@ def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(
 
 
 @settings(max_examples=few(150), deadline=None)
-@given(SCENARIOS, machines())
-def test_each_two_routers_have_one_link_and_every_process_a_router_that_admits_it(
-    scenario: Scenario, hosts: HostsConfig
-) -> None:
-    plan = planned(scenario, hosts)
-    if plan is None:
-        return
+@given(PLANS)
+def test_each_two_routers_have_one_link_and_every_process_a_router_that_admits_it(plan: Plan) -> None:
     reached = {f"tls/{host.address}:{plan.port}": host.name for host in plan.hosts if host.listen}
     links: dict[frozenset[str], int] = defaultdict(int)
     for host in plan.hosts:

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import slow_twins as naive
-from support.kernel_oracle import find_strides, inner, unpadded
+from support.kernel_oracle import inner, unpadded
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import stride_growth
 from planner_service.tree import cost_to_go, strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import StrideNetwork
+from planner_service.tree.strides import StrideNetwork, find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 

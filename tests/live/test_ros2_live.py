@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import subprocess
 import sys
 import time
@@ -20,7 +19,7 @@ from support.processes import eventually
 from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.gateways.ros2.rmw import Attachment, Qos
+from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS, TABLE, Direction
@@ -128,26 +127,6 @@ def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.
         f"a{agent}_{n:02}/odom" for agent in (0, 1) for n in range(6)
     }
     node.close()
-
-
-def test_each_message_has_33_bytes_that_name_sender_number_and_time(
-    running: Gateway, session: zenoh.Session
-) -> None:
-    attachments: list[bytes] = []
-
-    def hear(sample: zenoh.Sample) -> None:
-        assert sample.attachment is not None
-        attachments.append(sample.attachment.to_bytes())
-
-    session.declare_subscriber(f"0/a0_01/odom/*/{TYPES.hash_of(ROWS['odom'].type_name)}", hear)
-    eventually(lambda: len(attachments) >= 3, 15, "three messages")
-    read = [Attachment.of(each) for each in attachments[:3]]
-    assert {len(each) for each in attachments} == {33}
-    assert attachments[0][16] == 16
-    assert struct.unpack_from("<q", attachments[0]) == (read[0].sequence,)
-    assert [each.sequence - read[0].sequence for each in read] == [0, 1, 2]
-    assert len({each.gid for each in read}) == 1
-    assert read[0].stamp_ns == pytest.approx(time.time_ns(), abs=60e9)
 
 
 def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(

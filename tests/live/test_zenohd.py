@@ -24,9 +24,8 @@ from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig
 from swarm.errors import BusError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind
-from swarm.wire.messages.processes import Stats
-from swarm.wire.topics import DIGEST, MARKS, STATS
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
+from swarm.wire.topics import MARKS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]
 
@@ -114,60 +113,6 @@ def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_
         bus.publish(MARKS, newer, region=0, tile=0, author="a0.1")  # as the author or a keeper says it again
         late.run(0.5)
         assert [each.seq for each in late.replica.held.of_tile(0)] == [5 * SEQ_STEP]
-
-
-def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_nothing(tmp_path: Path) -> None:
-    certs = tmp_path / "certs"
-    for name, hosts in (
-        ("router.0", ["127.0.0.1", "localhost"]),
-        ("keeper.0", []),
-        ("agent.blue.a0", []),
-        ("agent.red.a1", []),
-        ("agent.blue.x", []),
-    ):
-        issue(certs, name, hosts, 2)
-    endpoint = f"tls/localhost:{free_ports(1)[0]}"
-
-    def network(name: str) -> NetworkConfig:
-        files = TlsConfig(
-            ca=str(certs / "ca.pem"), certificate=str(certs / f"{name}.pem"), key=str(certs / f"{name}.key")
-        )
-        admit = ("router.0", "keeper.0", "agent.blue.a0", "agent.red.a1")
-        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, admit=admit)
-
-    router = Zenohd(tmp_path, network("router.0"), plugins())
-    try:
-        with (
-            open_bus(network("keeper.0")) as trusted,
-            open_bus(network("agent.blue.a0")) as own,
-            open_bus(network("agent.blue.x")) as stranger,
-        ):
-            heard: list[str] = []
-            trusted.subscribe(DIGEST, lambda event: heard.append(event.message.author))  # type: ignore[union-attr]
-            listener = Participant(trusted)
-            author = Participant(own, "blue.a0.1")
-            listener.run(0.5)
-            author.write([1, 2, 3], MarkKind.LETHAL)
-            forged = mark_set("red.a1.1", "all", 0, 1, SEQ_STEP, statements(author.replica.held.of_tile(0)[0]))
-            for bus in (own, stranger):
-                bus.publish(MARKS, forged, region=0, tile=0, author="red.a1.1")
-                bus.publish(DIGEST, Digest(author="red.a1.1", role="agent", held={}), author="red.a1.1")
-                stats = Stats(role="agent", id="a1", incarnation=1, stamp_ns=1, counts={}, gauges={}, histograms={})
-                bus.publish(STATS, stats, role="agent", id="a1")
-            for _ in range(10):
-                author.run(0.1)
-                listener.run(0.1)
-            assert list(listener.replica.held.ledger.held()) == ["blue.a0.1"]
-            assert set(heard) == {"blue.a0.1"}
-            spy = Participant(stranger)
-            spy.run(1.5)
-            assert spy.replica.held.ledger.held() == {}
-        with open_bus(network("keeper.0")) as trusted:
-            late = Participant(trusted)
-            eventually(lambda: late.run(0.2) or late.replica.held.ledger.held(), 10, "the storage's answer")
-            assert list(late.replica.held.ledger.held()) == ["blue.a0.1"]
-    finally:
-        router.stop()
 
 
 def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> None:

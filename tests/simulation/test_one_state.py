@@ -17,7 +17,6 @@ from launch_scripts.commands.status_view import print_status, status_fields, sta
 from launch_scripts.launcher.terminal_tables import live_table
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.vehicles_view import _DOES
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.observe import fact_table as facts
@@ -64,9 +63,9 @@ def _crashes(*when: tuple[float, str, bool]) -> Callable[[OrderedSimulation], No
     return plan
 
 
-def _guest(simulation: OrderedSimulation) -> None:
-    guest = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
-    simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(guest) and None)
+def _external(simulation: OrderedSimulation) -> None:
+    external = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
+    simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(external) and None)
     _crashes((3.5, "agent-g", True))(simulation)
 
 
@@ -89,11 +88,11 @@ RUNS: list[Run] = [
         _scenario(seed=6, standbys=StandbyConfig(planner=1, targets=1)),
         _crashes((2.0, "planner-t0", True), (2.2, "targets-0", False)),
     ),
-    ("a guest that goes", _scenario(seed=7), _guest),
+    ("an external vehicle that goes", _scenario(seed=7), _external),
     ("orders", _scenario(seed=8), _orders),
     ("a zone, an agent gone for good", _scenario(seed=9), _zone),
     (
-        "bodies, keeper killed",
+        "obstacles, keeper killed",
         _scenario(seed=10, rovers=(RoverConfig(name="r", count=2, speed_m_per_s=1.0, radius_m=4.0),)),
         _crashes((2.0, "keeper-0", False)),
     ),
@@ -218,8 +217,8 @@ def rows_in(text: str) -> list[list[str]]:
     labels = [column.label for column in facts.TARGET_FACTS if column.always]
     heads = [n for n, row in enumerate(rows) if row[: len(labels)] == labels]
     (head,) = heads
-    body = [row[: len(labels)] for row in rows[head + 1 :] if len(row) >= len(labels)]
-    return [row for row in body if not set(row[0]) <= set("-─")]
+    obstacle = [row[: len(labels)] for row in rows[head + 1 :] if len(row) >= len(labels)]
+    return [row for row in obstacle if not set(row[0]) <= set("-─")]
 
 
 def alarms_in(text: str, state: RunState) -> set[str]:
@@ -282,8 +281,8 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     assert told == [(each["kind"], each["about"], each["over_s"]) for each in values["status as JSON"]["alarms"]]
 
     vehicles = watched.logged.details("world/vehicles")
-    does = {each.name.lower(): sum(f": {words}" in text for text in vehicles) for each, words in _DOES.items()}
-    assert len(vehicles) == state.vehicles
+    does = {name: sum(f": {name}" in text for text in vehicles) for name in state.states}
+    assert len(vehicles) == state.driven[0]
     assert does == state.states
 
     # The end: what the recording shows last is what the report says.

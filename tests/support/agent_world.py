@@ -25,15 +25,13 @@ from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
-    PlaceRouteReply,
-    PlaceRouteRequest,
     RouteReply,
     RouteRequest,
     TargetPose,
 )
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, PLACE_ROUTE, POSE, ROUTE
+from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
@@ -171,35 +169,6 @@ class FakePlanner:
             tree_age_ms=0.0,
             cost_to_go_s=pack_column(costs, "<f4"),
         )
-
-
-class FakePlaces(FakePlanner):
-    """Serves exact routes to any place, by the same trees."""
-
-    def __init__(self, world: AgentWorld) -> None:
-        super().__init__(world, "places")
-        self._trees: dict[int, NDArray[np.float64] | None] = {}
-        self.bus.serve(PLACE_ROUTE, self.handle)
-        self.bus.declare_alive(Peer("places", "all", 1))
-
-    def handle(self, event: Event) -> None:
-        match event:
-            case Asked(request=PlaceRouteRequest() as request):
-                self.cell = request.to
-                self._cost = self._trees.get(request.to)
-                routes = [self.route(cell, request.max_cells) for cell in request.cells]
-                self._trees[request.to] = self._cost
-                reply = PlaceRouteReply(
-                    to_cell=request.to, incarnation=1, map_version=0, routes=RouteBatch.of(routes).columns()
-                )
-                event.answer(reply, places="all")
-                event.end()
-            case _:
-                super().handle(event)
-
-    def _mark(self, marks: MarkSet) -> None:
-        super()._mark(marks)
-        self._trees.clear()
 
 
 class AgentWorld(SwarmModel):

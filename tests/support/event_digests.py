@@ -21,7 +21,7 @@ from launch_scripts.simulation.worlds import WORLDS, world
 SECONDS = 12.0
 RUNS = (
     *((name, seed) for name in WORLDS for seed in (1, 2)),
-    *((name, 3) for name in ("jacksboro", "walkers", "aloft", "bodies", "clustered", "demo", "synthetic")),
+    *((name, 3) for name in ("jacksboro", "walkers", "aloft", "obstacles", "clustered", "demo", "synthetic")),
 )
 
 

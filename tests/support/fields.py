@@ -98,9 +98,7 @@ def from_file(path: Path) -> Pace:
         case ".map":
             from shared_map.importers.array_grids import read_map
 
-            factor = read_map(path).factor
-            assert factor is not None, "a .map has no heights"
-            pace = factor
+            pace = read_map(path).factor
         case _:
             from shared_map.terrain.terrain import build_terrain
             from swarm.config.ground import TerrainConfig

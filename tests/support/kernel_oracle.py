@@ -8,7 +8,6 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import StrideNetwork, StrideSearch
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -26,13 +25,6 @@ def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
     """The cells of the grid of padded ones."""
     rows, cols = np.divmod(padded, cost_grid.stride)
     return (rows - 1) * cost_grid.grid.cols + cols - 1
-
-
-def find_strides(cost_grid: CostGrid) -> StrideNetwork:
-    """The networks of a map, at once."""
-    network = StrideSearch(cost_grid).run().network
-    assert network is not None
-    return network
 
 
 def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:

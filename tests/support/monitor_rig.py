@@ -20,26 +20,22 @@ from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
+from swarm.wire import topics
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet
-from swarm.wire.messages.orders import GoalStates
-from swarm.wire.messages.planning import Believed, PlannerStatus, Sighted, TargetPose
-from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.vehicles import Body, Fleet, Followed
-from swarm.wire.topics import (
-    BELIEVED,
-    BODY,
-    FLEET,
-    FOLLOWED,
-    GOAL_STATES,
-    MARKS,
-    NOTE,
-    POSE,
-    SIGHTED,
-    STATS,
-    STATUS,
-)
 
+_TOPICS = (
+    *(
+        topics.BELIEVED,
+        topics.OBSTACLE,
+        topics.FLEET,
+        topics.FOLLOWED,
+        topics.GOAL_STATES,
+        topics.MARKS,
+        topics.NOTE,
+    ),
+    *(topics.POSE, topics.SIGHTED, topics.STATS, topics.STATUS),
+)
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
 NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
@@ -109,27 +105,10 @@ class Rig(SwarmModel):
 
 
 def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
-    match message:
-        case Fleet():
-            bus.publish(FLEET, message, region=message.region, author=message.author)
-        case TargetPose():
-            bus.publish(POSE, message, target=message.target)
-        case PlannerStatus():
-            bus.publish(STATUS, message, target=message.target)
-        case Stats():
-            bus.publish(STATS, message, role=message.role, id=message.id)
-        case Note():
-            bus.publish(NOTE, message, role=message.role, id=message.id)
-        case Followed():
-            bus.publish(FOLLOWED, message, agent="a0", vehicle=message.vehicle)
-        case Sighted():
-            bus.publish(SIGHTED, message, target=message.target, author=message.author)
-        case Believed():
-            bus.publish(BELIEVED, message, target=message.target)
-        case GoalStates():
-            bus.publish(GOAL_STATES, message, agent=message.agent)
-        case Body():
-            bus.publish(BODY, message, id=message.id)
-        case MarkSet():
-            region = terrain.grid.region_of_tile(message.tile)
-            bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)
+    """Publishes a message on its topic, under the key that its fields make; one that no view hears is left out."""
+    told = {"agent": "a0", **{name: getattr(message, name) for name in message.__struct_fields__}}
+    if isinstance(message, MarkSet):
+        told["region"] = terrain.grid.region_of_tile(message.tile)
+    for topic in _TOPICS:
+        if topic.message is type(message):
+            bus.publish(topic, message, **{field: told[field] for field in topic.fields})

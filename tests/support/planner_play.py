@@ -16,7 +16,7 @@ from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
-from planner_service.tree.strides import StrideSearch
+from planner_service.tree.strides import StrideNetwork
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -47,7 +47,7 @@ class Play:
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None
-        self.search: StrideSearch | None = None
+        self.search: Callable[[], StrideNetwork] | None = None
         self.since: list[Window] = []
         self.rules: dict[str, Any] = {
             "climb": climb,
@@ -81,7 +81,7 @@ class Play:
             )
             self.grown = None
             if self.search is not None:
-                self.tree.take_strides(self.search.run())
+                self.tree.take_strides(self.search())
                 self.search = None
         elif event.what == "force":
             self.tree.force([0, self.grid.cells - 1])

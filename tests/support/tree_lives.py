@@ -163,7 +163,7 @@ class Life:
         self._tree.adopt(self._grown, self._pace, self._target, self._dirty, self._version, followed)
         self._grown = None
         if self._tree.wants_strides:
-            self._tree.take_strides(self._tree.stride_job().run())
+            self._tree.take_strides(self._tree.stride_job()())
 
     def _check(self) -> None:
         if not self._tree.ready:

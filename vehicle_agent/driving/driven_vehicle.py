@@ -18,25 +18,24 @@ from vehicle_agent.driving.route_follower import Follower
 
 _RETRY_NS = NS_PER_S // 5
 _LONGEST_RETRY_NS = 3 * NS_PER_S
-_FRESH_NS = 5 * NS_PER_S
-"""A route to a place is asked for again after this time."""
 _STRANDED_RETRY_NS = 3 * NS_PER_S
 PREFETCH_CELLS = 8
 """The next part of a partial route is requested when so few cells are left."""
 
 
-_GOAL = "place:"
-"""Before a cell, in the name of a place as a target; no id of a target has a colon."""
+PLACES = "place:"
+"""Before a cell, in the name of a place as a target; no id of a target has a colon. Alone: the planner of all
+places."""
 
 
 def goal_name(cell: int) -> str:
     """The name of a place that a vehicle goes for like a target, which has no tracker and stays."""
-    return f"{_GOAL}{cell}"
+    return f"{PLACES}{cell}"
 
 
 def goal_of(target: str | None) -> int | None:
     """The cell of a place that a vehicle goes for like a target; None of a target."""
-    return int(target.removeprefix(_GOAL)) if target is not None and target.startswith(_GOAL) else None
+    return int(target.removeprefix(PLACES)) if target is not None and target.startswith(PLACES) else None
 
 
 class Reason(enum.Enum):
@@ -131,8 +130,6 @@ class Vehicle:
         self._retry_ns = _RETRY_NS
         """Doubles with each unanswered request, until a route comes."""
         self._ask_due_ns = 0
-        self._routed_ns = 0
-        """Time when it asked for a route last."""
 
     @property
     def cell(self) -> int:
@@ -216,12 +213,9 @@ class Vehicle:
                 self._settle()  # of all that the state follows from, only this changes by driving
             elif left <= PREFETCH_CELLS and self.route.partial:
                 self._need = Reason.CONTINUED
-            elif self.goal is not None and now_ns - self._routed_ns >= _FRESH_NS:
-                self._need = Reason.CONTINUED  # the map may have changed, and no planner of a place pushes
         if self._need is None or self.asked is not None or now_ns < self._ask_due_ns:
             return None
         self.asked = self.target
-        self._routed_ns = now_ns
         self._ask_due_ns = now_ns + self._retry_ns
         return self._need
 
@@ -239,9 +233,7 @@ class Vehicle:
             self.asked = None
         begun = None
         if given.target == self.target:
-            if self._continues(given):
-                self._need = None
-            elif self.route.begin(given.cells, path, given.partial, given.turns):
+            if self.route.begin(given.cells, path, given.partial, given.turns):
                 begun = self._begin(given, path)
             else:
                 # It has driven on to where the new route does not pass: stop, so that the next answer fits.
@@ -256,8 +248,6 @@ class Vehicle:
         if target == self.target:
             if status is RouteStatus.NO_TARGET:
                 self._ask_later(now_ns)
-            elif self.goal is not None and self.route.left:
-                self._need = None  # it drives on as far as it can, and asks again then
             elif not self.route.left:
                 self.state = VehicleState.STRANDED
                 self.searching = False
@@ -281,14 +271,6 @@ class Vehicle:
             self._need_route(Reason.BLOCKED, now_ns)
 
     # --- inside ---------------------------------------------------------------------------------------------
-
-    def _continues(self, given: GivenRoute) -> bool:
-        """Returns True if a route to a place is what is left of the one that the vehicle drives."""
-        if self.goal is None or self.route.partial or given.partial:
-            return False
-        ahead = tuple(self.route.ahead())
-        count = min(len(ahead), len(given.cells) - 1)
-        return count > 0 and ahead[-count:] == given.cells[-count:]
 
     def _begin(self, given: GivenRoute, path: Sequence[int]) -> Follow:
         self._need = None

@@ -31,7 +31,7 @@ _MOST_SAID = 64
 _WARN_NS = 4 * NS_PER_S
 """Texts of the vehicle are passed on this often at most: 15 a minute, a quarter of `_MOST_SAID`."""
 _MOST_M_PER_S = 340.0
-"""The speed of sound, as `MOST_M_PER_S` of bodies: hosts refuse the report of a faster one."""
+"""The speed of sound, as `MOST_M_PER_S` of obstacles: hosts refuse the report of a faster one."""
 
 
 class Report(Struct, frozen=True):
@@ -71,8 +71,8 @@ class Adapter:
 
     The vehicle exists once its heartbeat and a position on the terrain were received. It is lost when either is
     missing for `lost_s` or it leaves the terrain. Gone means: its target is given up, nothing is said to it but
-    heartbeats, and its body is withdrawn if it flies. One that drives stands where it was heard last, as far as
-    anybody knows: its body stays.
+    heartbeats, and its report as an obstacle is withdrawn if it flies. One that drives stays an obstacle where it
+    was heard last.
 
     kind  its type and make, from its first heartbeat; None before
     """

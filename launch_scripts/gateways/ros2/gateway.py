@@ -52,26 +52,11 @@ class Channel(Struct, frozen=True):
     topic: str
 
 
-class Declare(Struct, frozen=True):
-    """Put topics up: a publisher with its token each."""
-
-    channels: tuple[Channel, ...]
-
-
-class Remove(Struct, frozen=True):
-    """Take topics down."""
-
-    channels: tuple[Channel, ...]
-
-
 class Put(Struct, frozen=True):
     """Put a message; bytes are CDR already."""
 
     channel: Channel
     message: Any
-
-
-Action = Declare | Remove | Put
 
 
 @dataclass(frozen=True)
@@ -110,8 +95,7 @@ class Moving:
     id              in the swarm
     frames          the one that does not move, and its own
     place           a heading of None is published as the last known one
-    speed_m_per_s   forward; negative backwards
-    turn_rad_per_s  clockwise
+    twist           m/s forward, negative backwards; rad/s clockwise
     route           float64 (n, 2): x, y; what it follows
     route_is_new    it was not published yet
     """
@@ -119,7 +103,7 @@ class Moving:
     def __init__(self, id: str, frames: tuple[str, str], seen: SeenVehicle, now_ns: int, made: RosMessages) -> None:
         self.id, self.frames = id, frames
         self.place: Place = (seen.x_m, seen.y_m, seen.heading_rad)
-        self.speed_m_per_s = self.turn_rad_per_s = 0.0
+        self.twist = (0.0, 0.0)
         self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
         self.route_is_new = False
         self.odometry = ros_messages.packed_odometry(made, frames)
@@ -131,7 +115,7 @@ class Moving:
         heading_rad = before_rad if seen.heading_rad is None else seen.heading_rad
         if self.place == (seen.x_m, seen.y_m, heading_rad):
             if now_ns - self._moved_ns > _STANDS_NS:
-                self.speed_m_per_s = self.turn_rad_per_s = 0.0
+                self.twist = (0.0, 0.0)
             return
         # Of two positions far apart in time, the first was left at an unknown time: no less than a report ago.
         since_s = (now_ns - self._moved_ns) / NS_PER_S
@@ -143,7 +127,7 @@ class Moving:
                 forward_m = east_m * math.sin(heading_rad) + north_m * math.cos(heading_rad)
                 if before_rad is not None:
                     turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
-            self.speed_m_per_s, self.turn_rad_per_s = forward_m / since_s, turned_rad / since_s
+            self.twist = (forward_m / since_s, turned_rad / since_s)
         self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
 
 
@@ -161,7 +145,7 @@ class Gateway:
     ) -> None:
         self._rows = {row.name: row for row in settings.rows() if to_wgs84 is not None or row.name != "fix"}
         self._bare, self._patterns = settings.frames.bare, settings.vehicles
-        self._feed, self._to_wgs84 = feed, to_wgs84
+        self._feed = feed
         self._messages = RosMessages(types, map)
         self._vehicles: dict[str, Moving] = {}
         """By name in ROS."""
@@ -172,7 +156,6 @@ class Gateway:
         self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
-        self._pose = ros_messages.packed_pose(self._messages)
         self._transforms: dict[str | None, PackedPlaces] = {}
         """Transforms of each group, since its vehicles changed last."""
         self._fresh: list[Window] = []
@@ -181,13 +164,20 @@ class Gateway:
         """Windows that have changed since the map or its updates were put last."""
         self._due_ns = dict.fromkeys(self._rows, 0)
         """Due time of each row, by the clock that never leaps."""
-        always = tuple(self._channel(row.name) for row in self._rows.values() if row.per is None)
-        self._first: list[Action] = [Declare(always)]
+        self._always = frozenset(self._channels_per(None))
+        self.channels = self._always
+        """The topics that are to be up, each a publisher with its token."""
+        made, pose = self._messages, ros_messages.packed_pose(self._messages)
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
-            "tf": self._tell_transforms, "odom": self._tell_odometry, "pose": self._tell_poses,
-            "plan": self._tell_plans, "fix": self._tell_fixes, "poses": self._tell_all_poses,
-            "targets": self._tell_targets, "target_pose": self._tell_target_poses,
+            "tf": self._tell_transforms,
+            "odom": self._tell_each(lambda each, at_ns: each.odometry.at(at_ns, [each.place], each.twist)),
+            "pose": self._tell_each(lambda each, at_ns: pose.at(at_ns, [each.place])),
+            "plan": self._tell_plans,
+            "fix": self._tell_each(
+                lambda each, at_ns: to_wgs84 and made.fix(at_ns, each.frames[1], *to_wgs84(*each.place[:2]))
+            ),
+            "poses": self._tell_all_poses, "targets": self._tell_targets, "target_pose": self._tell_target_poses,
             "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
         }  # fmt: skip
 
@@ -208,8 +198,8 @@ class Gateway:
         view: Observer,
         health: Health,
         robots: Collection[str] = (),
-    ) -> list[Action]:
-        """Returns due actions, in order.
+    ) -> list[Put]:
+        """Returns due messages, in order; each is for one of `channels`.
 
         now_ns        by a clock that never leaps, by which all rates are kept
         stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
@@ -221,49 +211,46 @@ class Gateway:
             return []
         vehicles = {id: each for id, each in view.vehicles.items() if id not in robots}
         now = _Now(now_ns, stamp_ns, vehicles, view.targets, health)
-        actions, self._first = [*self._first, *self._follow(now)], []
+        self._follow(now)
         for id, points_m in view.take_routes().items():
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
-            self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
+            self._feed.merge(view.take_mark_sets(), swarm_now_ns)
             changed = self._feed.take_changes()
             if "markers" in self._rows:
                 self._fresh += changed
             if "map_updates" in self._rows:
                 self._changed = merged(changed, self._changed)
+        puts: list[Put] = []
         for name, tell in self._tellers.items():
             if name in due:
                 self._due_ns[name] = _next_ns(self._rows[name], now_ns)
-                actions += [Put(self._channel(name, of), message) for of, message in tell(now)]
-        return actions
+                puts += [Put(self._channel(name, of), message) for of, message in tell(now)]
+        return puts
 
     # --- who is there ---------------------------------------------------------------------------------------------
 
-    def _follow(self, now: _Now) -> list[Action]:
-        """Updates positions. Topics of vehicles that are new are declared, of those that have left taken down. A
-        target of a scenario stays."""
+    def _follow(self, now: _Now) -> None:
+        """Updates positions. Topics of new vehicles come up, those of vehicles that have left go. A target of a
+        scenario stays."""
         gone = [name for name, moving in self._vehicles.items() if moving.id not in now.vehicles]
-        actions: list[Action] = [Remove(self._channels(VEHICLE, name)) for name in gone]
         for name in gone:
             del self._vehicles[name]
-        taken = [self._take(id, seen, now.now_ns) for id, seen in now.vehicles.items()]
-        came = [name for name in taken if name is not None]
+        came = [id for id, seen in now.vehicles.items() if self._take(id, seen, now.now_ns)]
         if came or gone:
             self._transforms, self._crew_changed = {}, True
-        actions += [Declare(self._channels(VEHICLE, name)) for name in came]
+        targets = len(self._targets)
         for id in now.targets:
-            name = ros_name(id)
-            if name not in self._targets:
-                self._targets[name] = id
-                actions.append(Declare(self._channels(TARGET, name)))
-            elif self._targets[name] != id:
-                self._refuse(f"target {id}", f"{self._targets[name]} is called {name}, too")
-        return actions
+            if self._targets.setdefault(ros_name(id), id) != id:
+                self._refuse(f"target {id}", f"{self._targets[ros_name(id)]} is called {ros_name(id)}, too")
+        if came or gone or len(self._targets) > targets:
+            of_each = ((VEHICLE, self._vehicles), (TARGET, self._targets))
+            own = (self._channels_per(per, name) for per, names in of_each for name in names)
+            self.channels = self._always.union(*own)
 
-    def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
-        """Returns the name of a vehicle that is published from now on; None for a known one, or one that is not
-        published."""
+    def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> bool:
+        """Returns True for a vehicle that is published from now on."""
         name = ros_name(id)
         moving = self._vehicles.get(name)
         if moving is not None and moving.id == id:
@@ -277,42 +264,31 @@ class Gateway:
         else:
             frames = ("odom", "base_link") if self._bare else ros_messages.frames_of(name)
             self._vehicles[name] = Moving(id, frames, seen, now_ns, self._messages)
-            return name
-        return None
+            return True
+        return False
 
     def _refuse(self, who: str, why: str) -> None:
         if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
             self._problems.append(f"{who} is not published to ROS: {why}")
 
-    def _channels(self, per: str, name: str) -> tuple[Channel, ...]:
-        return tuple(self._channel(row.name, name) for row in self._rows.values() if row.per == per)
+    def _channels_per(self, per: str | None, name: str | None = None) -> list[Channel]:
+        return [self._channel(row.name, name) for row in self._rows.values() if row.per == per]
 
     def _channel(self, row: str, name: str | None = None) -> Channel:
         return Channel(row, self._rows[row].topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))
 
     # --- vehicles -------------------------------------------------------------------------------------------------
 
-    def _tell_odometry(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            twist = each.speed_m_per_s, each.turn_rad_per_s
-            yield name, each.odometry.at(now.stamp_ns, [each.place], twist)
-
-    def _tell_poses(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            yield name, self._pose.at(now.stamp_ns, [each.place])
+    def _tell_each(self, message: Callable[[Moving, int], Any]) -> Callable[[_Now], _Told]:
+        """Makes the teller of a topic that every vehicle has, from its message at a stamp."""
+        return lambda now: ((name, message(each, now.stamp_ns)) for name, each in self._vehicles.items())
 
     def _tell_plans(self, now: _Now) -> _Told:
         for name, each in self._vehicles.items():
             if each.route_is_new:
                 each.route_is_new = False
                 yield name, self._messages.path(now.stamp_ns, each.route)
-
-    def _tell_fixes(self, now: _Now) -> _Told:
-        for name, each in self._vehicles.items():
-            if self._to_wgs84 is not None:
-                place = self._to_wgs84(*each.place[:2])
-                yield name, self._messages.fix(now.stamp_ns, each.frames[1], *place)
 
     def _groups(self) -> _Told:
         """Vehicles whose transforms go into one message, with the name of the one that has a topic of its own."""

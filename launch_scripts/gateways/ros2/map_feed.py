@@ -15,29 +15,24 @@ from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2.map_messages import Occupancy, occupancy_of
 from shared_map.cost_map import CostMap
-from shared_map.replication.marks import is_zone
-from shared_map.replication.merge import winners
+from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.store import load_prepared, read_meta
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.errors import SwarmError, TerrainError
 from swarm.grid import GridSpec, Window
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 QUICK_S_PER_M = 0.1
 """The pace of the quickest ground where the terrain is not known: 10 m/s."""
 _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
 """The whole map is due so long after it was put last if anything has changed, and as many times longer as it has
 more cells than a million."""
-_REDRAW_NS = 10 * NS_PER_S
-"""All marks are looked at again so often, as those that expire are in no set that comes."""
 _META = "terrain.json"
 _NEWEST = 50
 """The folders of runs that are looked at."""
-_Cells = NDArray[np.uint32]
-_NO_CELLS: _Cells = np.empty(0, np.uint32)
+_Cells = NDArray[np.int64]
 
 
 class MapFeed:
@@ -58,43 +53,22 @@ class MapFeed:
         self._told_ns: int | None = None
         self._changed = False
         """Changes since the whole map was published last, at `_told_ns`."""
-        self._marked: dict[int, tuple[_Cells, _Cells, _Cells]] = {}
-        """Tile -> cells of it that are marked as lethal, and with a pace, and those of zones."""
-        self._redraw_due_ns = 0
+        self._marks: tuple[_Cells, _Cells] | None = None
+        """Cells that are lethal by marks, and those with a pace by marks; None since the map has changed."""
+        self._now_ns = 0
+        """Time of the last merge, by the swarm's clocks."""
 
-    def merge(self, sets: Sequence[MarkSet], now_ns: int, swarm_now_ns: int) -> None:
-        """Merges mark sets, and drops expired marks.
-
-        now_ns        by a clock that never leaps
-        swarm_now_ns  by the swarm's clocks
-        """
+    def merge(self, sets: Sequence[MarkSet], swarm_now_ns: int) -> None:
+        """Merges mark sets, and drops expired marks."""
+        self._now_ns = swarm_now_ns
         self._replica.tick(swarm_now_ns)
-        taken = self._replica.merge(sets, measured=False).sets if sets else []
-        tiles = {each.tile for each in taken}
-        if now_ns >= self._redraw_due_ns:
-            self._redraw_due_ns = now_ns + _REDRAW_NS
-            tiles |= self._marked.keys()
-        for tile in tiles:
-            if tile < self.grid.tiles:
-                zones = [each for each in self._replica.held.of_tile(tile) if is_zone(each.author)]
-                stated = winners(zones, swarm_now_ns)
-                drawn = stated.cells[stated.kinds != MarkKind.CLEAR]
-                won = self._replica.winners(tile)
-                marks = np.isin(won.cells, drawn, invert=True)
-                lethal, paced = (
-                    won.cells[marks & (won.kinds == kind)] for kind in (MarkKind.LETHAL, MarkKind.PACE)
-                )
-                corner = tile_corners(self.grid, [tile])[0]
-                self._marked[tile] = (
-                    grid_cells(self.grid, corner, lethal),
-                    grid_cells(self.grid, corner, paced),
-                    grid_cells(self.grid, corner, drawn),
-                )
+        self._replica.merge(sets, measured=False)
 
     def take_changes(self) -> list[Window]:
         """Returns the windows that have changed since the last call."""
         windows = self._map.take_dirty()
-        self._changed |= bool(windows)
+        if windows:
+            self._changed, self._marks = True, None
         return windows
 
     def whole_is_due(self, now_ns: int) -> bool:
@@ -115,8 +89,14 @@ class MapFeed:
     @property
     def marked(self) -> tuple[_Cells, _Cells, _Cells]:
         """Cells that are marked as lethal, those that are marked with a pace, and those of zones."""
-        lethal, paced, zones = zip((_NO_CELLS,) * 3, *self._marked.values(), strict=True)
-        return np.concatenate(lethal), np.concatenate(paced), np.concatenate(zones)
+        if self._marks is None:
+            now, prior = self._map.ground_s_per_m.reshape(-1), self._map.prior_s_per_m.reshape(-1)
+            closed, paced = np.isinf(now) & ~np.isinf(prior), np.isfinite(now) & (now != prior)
+            self._marks = np.flatnonzero(closed), np.flatnonzero(paced)
+        zones = cells_of_zones(self._replica, self._now_ns).values()
+        drawn = np.concatenate([np.empty(0, np.int64), *(each.cells for each in zones if not each.class_number)])
+        of_lethal, of_paces = (cells[~np.isin(cells, drawn)] for cells in self._marks)
+        return of_lethal, of_paces, drawn
 
 
 def _unknown(grid: GridSpec) -> Terrain:

@@ -41,10 +41,6 @@ _ADDED = {
     "uint32 width\nuint32 height\nint8[] data",
     "std_srvs/srv/Trigger_Request": "",
     "std_srvs/srv/Trigger_Response": "bool success\nstring message",
-    "std_srvs/srv/SetBool_Request": "bool data",
-    "std_srvs/srv/SetBool_Response": "bool success\nstring message",
-    "std_srvs/srv/Empty_Request": "",
-    "std_srvs/srv/Empty_Response": "",
     "nav_msgs/srv/GetMap_Request": "",
     "nav_msgs/srv/GetMap_Response": "nav_msgs/OccupancyGrid map",
     "nav_msgs/srv/GetPlan_Request": "geometry_msgs/PoseStamped start\ngeometry_msgs/PoseStamped goal\n"

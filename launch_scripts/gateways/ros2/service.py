@@ -12,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 
-from launch_scripts.gateways.ros2.gateway import Action, Channel, Declare, Gateway, Health, Put, Remove, ToWgs84
+from launch_scripts.gateways.ros2.gateway import Channel, Gateway, Health, Put, ToWgs84
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
@@ -98,6 +98,7 @@ class _Run:
         self._node = node
         self._incoming: Incoming | None = None
         self._publishers: dict[Channel, Publisher] = {}
+        self._declared: frozenset[Channel] = frozenset()
         self._counts: Counter[str] = Counter()
         self._up = {"swarm": True, "ROS": True}
         self._watch = PeerWatch()
@@ -119,8 +120,10 @@ class _Run:
                 self._say(f"the {side} router {'is back' if up else 'is disconnected: waiting for it'}")
         robots = () if self._incoming is None else self._incoming.robots
         now_ns, stamp_ns, swarm_now_ns = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
-        for action in self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots):
-            self._perform(action)
+        puts = self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots)
+        self._declare(self._gateway.channels)
+        for put in puts:
+            self._put(put)
         if self._incoming is not None:
             self._incoming.tick(time.monotonic_ns())
         problems = self._gateway.take_problems()
@@ -135,22 +138,24 @@ class _Run:
             self._incoming.close()
         self._node.close()
 
-    def _perform(self, action: Action) -> None:
-        match action:
-            case Put(channel=channel, message=message):
-                try:
-                    self._publishers[channel].put(message)
-                    self._counts["put"] += 1
-                except BusError as error:
-                    self._counts["put_failed"] += 1
-                    log.debug("%s: %s", channel.topic, error)
-            case Declare(channels=channels):
-                for channel in channels:
-                    row = ROWS[channel.row]
-                    self._publishers[channel] = self._node.publisher(channel.topic, row.type_name, row.qos)
-            case Remove(channels=channels):
-                for channel in channels:
-                    self._node.remove(self._publishers.pop(channel).endpoint)
+    def _declare(self, channels: frozenset[Channel]) -> None:
+        """Takes topics down that are no more, and puts new ones up."""
+        if channels is self._declared:
+            return
+        self._declared = channels
+        for channel in self._publishers.keys() - channels:
+            self._node.remove(self._publishers.pop(channel).endpoint)
+        for channel in channels - self._publishers.keys():
+            row = ROWS[channel.row]
+            self._publishers[channel] = self._node.publisher(channel.topic, row.type_name, row.qos)
+
+    def _put(self, put: Put) -> None:
+        try:
+            self._publishers[put.channel].put(put.message)
+            self._counts["put"] += 1
+        except BusError as error:
+            self._counts["put_failed"] += 1
+            log.debug("%s: %s", put.channel.topic, error)
 
     def _health(self) -> Health:
         counts = {**self._counts, **self._node.counts}

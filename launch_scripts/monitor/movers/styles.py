@@ -31,7 +31,7 @@ NOBODY: Colour = (170, 176, 182)
 TARGET_COLOUR: Colour = (255, 255, 255)
 """Colour of all targets, where hues are groups."""
 LOST_COLOUR: Colour = (120, 124, 130)
-BODY_COLOUR: Colour = (118, 84, 60)
+OBSTACLE_COLOUR: Colour = (118, 84, 60)
 SIGHTED_COLOUR: Colour = (255, 255, 255)
 SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
@@ -44,17 +44,17 @@ _GROUPS = 4
 """Groups in the legend: more have no place there."""
 
 
-SHADES: dict[VehicleState, tuple[Colour, float, str | None]] = {
-    VehicleState.FOLLOWING: ((0, 0, 0), 0.0, "on its way"),
-    VehicleState.ARRIVED: ((255, 255, 255), 0.65, "arrived"),
-    VehicleState.WAITING: ((0, 0, 0), 0.55, "waits"),
-    VehicleState.IDLE: ((0, 0, 0), 0.55, None),
-    VehicleState.STRANDED: ((0, 0, 0), 0.9, "stranded"),
-    VehicleState.LOST: ((128, 132, 138), 0.85, "planner or target lost"),
-    VehicleState.OUTDATED: ((128, 132, 138), 0.85, None),
-    VehicleState.SEARCHING: ((255, 255, 255), 0.35, "searches"),
+SHADES: dict[VehicleState, tuple[Colour, float]] = {
+    VehicleState.FOLLOWING: ((0, 0, 0), 0.0),
+    VehicleState.ARRIVED: ((255, 255, 255), 0.65),
+    VehicleState.WAITING: ((0, 0, 0), 0.55),
+    VehicleState.IDLE: ((0, 0, 0), 0.55),
+    VehicleState.STRANDED: ((0, 0, 0), 0.9),
+    VehicleState.LOST: ((128, 132, 138), 0.85),
+    VehicleState.OUTDATED: ((128, 132, 138), 0.85),
+    VehicleState.SEARCHING: ((255, 255, 255), 0.35),
 }
-"""Colour mixed into a hue, its share, and the legend's words; None if another state's entry has them."""
+"""Colour mixed into a hue, and its share."""
 
 
 class Look(NamedTuple):
@@ -73,7 +73,7 @@ def mixed(colour: Colour, other: Colour, share: float) -> Colour:
 
 def shaded(hue: Colour, state: VehicleState) -> Colour:
     """The colour of a vehicle whose group or target has this hue."""
-    return mixed(hue, *SHADES[state][:2])
+    return mixed(hue, *SHADES[state])
 
 
 def dimmed(colours: Bytes) -> Bytes:
@@ -122,17 +122,16 @@ class Looks:
             who = [Look("ball", first, "vehicle, hue by target")]
         else:
             who = [Look("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
-        states = [
-            Look("ball", shaded(first, state), meaning)
-            for state, (_, _, meaning) in SHADES.items()
-            if meaning is not None and state != VehicleState.FOLLOWING
-        ]
+        alike: dict[Colour, list[str]] = {}
+        for state in [*SHADES][1:]:  # who is following has the hue itself
+            alike.setdefault(shaded(first, state), []).append(state.name.lower())
+        states = [Look("ball", colour, ", ".join(names)) for colour, names in alike.items()]
         return [
             *who,
             *states,
             Look("ball", self.target(target), "target on a pole"),
             Look("ring", SIGHTED_COLOUR, "hidden target seen"),
-            Look("ball", BODY_COLOUR, "body to keep off"),
+            Look("ball", OBSTACLE_COLOUR, "obstacle to keep off"),
             Look("line", self.route(target), "route, trail"),
             Look("ball", ALARM_COLOUR, "alarm on a pole"),
             Look("ball", FLAG_COLOUR, "place of an order"),

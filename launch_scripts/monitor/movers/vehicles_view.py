@@ -25,16 +25,6 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 Cells = NDArray[np.int64]
 _ROUTES_KEPT = 1 << 15
 """Vehicles whose routes are remembered. Beyond this number all are forgotten: their agents never had as many."""
-_DOES = {
-    VehicleState.IDLE: "idle",
-    VehicleState.WAITING: "waits for a route",
-    VehicleState.FOLLOWING: "on its way",
-    VehicleState.ARRIVED: "arrived",
-    VehicleState.STRANDED: "stranded",
-    VehicleState.LOST: "goes on without its planner",
-    VehicleState.OUTDATED: "goes by an old pose",
-    VehicleState.SEARCHING: "looks for its target",
-}
 
 
 class Trails:
@@ -239,7 +229,7 @@ class VehiclesView:
 def vehicle_details(
     vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """Text such as `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. The most
+    """Text such as `a0-04 to t3: following, route 2 s old, certified gap 1.20%; scouts, walker`. The most
     important comes first: a viewer may cut off the end.
 
     who  vehicle -> what is said of whose it is
@@ -248,7 +238,7 @@ def vehicle_details(
     lines = []
     for id, state, target in zip(vehicles.ids, vehicles.states.tolist(), vehicles.targets.tolist(), strict=True):
         chased = target_ids[target] if target >= 0 else None
-        line = f"{id}: {_DOES[state]}" if chased is None else f"{id} to {chased}: {_DOES[state]}"
+        line = f"{id if chased is None else f'{id} to {chased}'}: {VehicleState(state).name.lower()}"
         route = routes.get(id)
         if route is not None and route.target == chased and state != VehicleState.ARRIVED:
             proven = "gap not proven" if route.gap is None else f"certified gap {percent(route.gap)}"

@@ -1,7 +1,6 @@
 """Land cover: classes from a photo, and from land-cover maps.
 
 A photo is read by `photos` and classified by `classify`, by rules that need no labels (`photo_rules`) or learnt
-from a few. A map of land cover is read by `land_cover`; `cover_codes` has what its codes mean, from
-`land_cover.toml` or from a table of the user's own, and `cover_meaning` finds out which of these tables a file goes
-by.
+from a few. A map of land cover is read by `land_cover`, which finds out what its codes mean; `cover_codes` has the
+tables, from `land_cover.toml` or from a file of the user's own.
 """

@@ -16,22 +16,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.cover.photo_rules import (
-    CERTAIN,
-    CLASS_OF_READINGS,
-    COARSEST_M,
-    LIKELY,
-    REACH,
-    SHORE_GRADE,
-    STILL,
-    ground_readings,
-    line_strength,
-    long_lines,
-    tiles,
-    water_signs,
-)
+from shared_map.importers.cover import photo_rules as rules
 from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
 from swarm.config.explain import explain
@@ -64,7 +53,7 @@ class ByRules(NamedTuple):
 
 def class_readings(
     rgb: Bytes,
-    elevation_m: Floats | None,
+    elevation_m: Floats,
     resolution_m: float,
     seen: Bools | None = None,
     progress: Progress = no_progress,
@@ -75,8 +64,8 @@ def class_readings(
     Parameters
     ----------
     rgb : uint8 (rows, cols, 3), red, green, blue
-    elevation_m : float32 (rows, cols), m, or None
-        Cells without a height (NaN) count as level. None: all cells count as level.
+    elevation_m : float32 (rows, cols), m
+        Cells without a height (NaN) count as level.
     resolution_m : float
         Side of a cell, in metres. Roads are searched for only if it is at most `COARSEST_M` (30 m).
     seen : bool (rows, cols), optional
@@ -92,20 +81,20 @@ def class_readings(
     lines = np.zeros((rows, cols), np.uint8)
 
     def work(row0: int, row1: int) -> None:
-        for part, features in tiles(rgb, elevation_m, resolution_m, row0, row1):
-            readings[row0:row1, part] = ground_readings(features)
-            wetness[row0:row1, part] = water_signs(features)
-            if resolution_m <= COARSEST_M:
+        for part, features in rules.tiles(rgb, elevation_m, resolution_m, row0, row1):
+            readings[row0:row1, part] = rules.ground_readings(features)
+            wetness[row0:row1, part] = rules.water_signs(features)
+            if resolution_m <= rules.COARSEST_M:
                 strength = _line_strength(rgb, row0, row1, part)
                 strength *= features.grade <= ROAD_GRADE
                 lines[row0:row1, part] = strength
-        np.take(CLASS_OF_READINGS, readings[row0:row1], out=classes[row0:row1])
+        np.take(rules.CLASS_OF_READINGS, readings[row0:row1], out=classes[row0:row1])
 
     in_bands(rows, work, "classifying the photo", progress)
     lakes = _lakes(wetness, elevation_m, resolution_m)
     if lines.any():
         lines[spread(lakes, SHORE)] = 0
-        classes[long_lines(lines)] = TerrainClass.ROAD
+        classes[rules.long_lines(lines)] = TerrainClass.ROAD
     classes[lakes] = TerrainClass.WATER
     if seen is not None:
         classes[~seen] = TerrainClass.UNKNOWN
@@ -116,35 +105,31 @@ def class_readings(
 
 def _line_strength(rgb: Bytes, row0: int, row1: int, part: slice) -> Bytes:
     """`line_strength` of a tile, which looks at the cells around it."""
-    above, left = max(row0 - REACH, 0), max(part.start - REACH, 0)
-    strength = line_strength(rgb[above : row1 + REACH, left : part.stop + REACH])
+    above, left = max(row0 - rules.REACH, 0), max(part.start - rules.REACH, 0)
+    strength = rules.line_strength(rgb[above : row1 + rules.REACH, left : part.stop + rules.REACH])
     return strength[row0 - above :, part.start - left :][: row1 - row0, : part.stop - part.start]
 
 
-def _lakes(wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> Bools:
+def _lakes(wetness: Bytes, elevation_m: Floats, resolution_m: float) -> Bools:
     """Patches of likely water of which a fifth is certain, and that are level. If a shadow covers a shore the patch
     is no lake; then its still part, and the shore of that."""
-    from scipy import ndimage
-
-    likely = (wetness & LIKELY) > 0
+    likely = (wetness & rules.LIKELY) > 0
     lakes, tilted = _patches(likely, wetness, elevation_m, resolution_m)
     if tilted.any():
-        still, _ = _patches(tilted & ((wetness & STILL) > 0), wetness, elevation_m, resolution_m)
+        still, _ = _patches(tilted & ((wetness & rules.STILL) > 0), wetness, elevation_m, resolution_m)
         lakes |= tilted & spread(still, SHORE)
     return np.asarray(ndimage.binary_fill_holes(lakes), np.bool_) if lakes.any() else lakes
 
 
-def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> tuple[Bools, Bools]:
+def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats, resolution_m: float) -> tuple[Bools, Bools]:
     """(level, tilted) patches; small ones are puddles or shadows of houses and are neither."""
-    from scipy import ndimage
-
     labels, count = ndimage.label(likely)
     sizes = counted(labels, count + 1)
-    certain = counted(labels, count + 1, (wetness & CERTAIN) > 0)
+    certain = counted(labels, count + 1, (wetness & rules.CERTAIN) > 0)
     wet = (sizes >= SMALLEST_LAKE) & (5 * certain >= sizes)
     wet[0] = False
     tilted = np.zeros(count + 1, np.bool_)
-    if elevation_m is not None and wet.any():
+    if wet.any():
         of_cell = labels[likely]
         heights = np.nan_to_num(elevation_m[likely].astype(np.float64))
         mean = np.bincount(of_cell, heights, count + 1) / np.maximum(sizes, 1)
@@ -170,7 +155,6 @@ class Learner:
         columns : float32 (cells, 11), `Features.columns`
         kinds : uint8 (cells,), TerrainClass
         """
-        from scipy.spatial import cKDTree
 
         of_class = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
         some = [at[np.linspace(0, len(at) - 1, min(len(at), MOST_OF_A_CLASS)).astype(np.intp)] for at in of_class]
@@ -189,7 +173,7 @@ class Learner:
         for number, weight in enumerate(self._weights):
             votes[:, number] = weight * (self._number[nearest] == number).sum(axis=1)
         if len(self.kinds) > 1:
-            votes[np.ix_(columns[:, -1] >= SHORE_GRADE, self.kinds == TerrainClass.WATER)] = -1.0
+            votes[np.ix_(columns[:, -1] >= rules.SHORE_GRADE, self.kinds == TerrainClass.WATER)] = -1.0
         return np.asarray(self.kinds[np.argmax(votes, axis=1)], np.uint8)
 
 
@@ -202,7 +186,7 @@ def _stretched(columns: Floats) -> Floats:
 
 def learnt(
     rgb: Bytes,
-    elevation_m: Floats | None,
+    elevation_m: Floats,
     resolution_m: float,
     labels: Bytes,
     seen: Bools | None = None,
@@ -226,7 +210,7 @@ def learnt(
     classes = np.empty(rgb.shape[:2], np.uint8)
 
     def work(row0: int, row1: int) -> None:
-        for part, features in tiles(rgb, elevation_m, resolution_m, row0, row1):
+        for part, features in rules.tiles(rgb, elevation_m, resolution_m, row0, row1):
             classes[row0:row1, part] = learner.predict(features.columns()).reshape(features.red.shape)
 
     in_bands(len(classes), work, "classifying the photo", progress)
@@ -235,11 +219,11 @@ def learnt(
     return classes
 
 
-def _samples(rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels: Bytes) -> tuple[Floats, Bytes]:
+def _samples(rgb: Bytes, elevation_m: Floats, resolution_m: float, labels: Bytes) -> tuple[Floats, Bytes]:
     """Features and class of each labelled cell."""
     columns, kinds = [], []
     for row in np.flatnonzero((labels != TerrainClass.UNKNOWN).any(axis=1)).tolist():
-        for part, features in tiles(rgb, elevation_m, resolution_m, row, row + 1):
+        for part, features in rules.tiles(rgb, elevation_m, resolution_m, row, row + 1):
             labelled = labels[row, part]
             here = labelled != TerrainClass.UNKNOWN
             columns.append(features.columns()[here])
@@ -248,7 +232,7 @@ def _samples(rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels
 
 
 def held_out(
-    rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels: Bytes, groups: NDArray[np.int32]
+    rgb: Bytes, elevation_m: Floats, resolution_m: float, labels: Bytes, groups: NDArray[np.int32]
 ) -> tuple[Bytes, Bytes]:
     """Returns the prediction for each labelled cell of a learner that was trained without its polygon.
 

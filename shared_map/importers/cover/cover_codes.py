@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,8 +37,6 @@ LEAST_DISTINCT = 3
 _LEAST_DRAWN = 0.9
 """Share of a drawing that must have one legend's colours, margins left out (docs/design/terrain-import.md): labels,
 borders and scale bars have others."""
-_HIGHEST_FACTOR = 1e12
-"""The highest pace of `terrain.cover_classes`, too (`Positive`)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,6 @@ class CoverTable:
     grounds  what each code stands for
     nothing  codes that stand for no data
     words    what its files call it in their metadata or names, in lower case
-    where    west, south, east, north in degrees, beyond which it was not published
     gappy    whether whole numbers between its codes are none, so that heights are hardly all among them
     """
 
@@ -80,7 +78,6 @@ class CoverTable:
     grounds: Mapping[int, Ground]
     nothing: frozenset[int] = frozenset((0,))
     words: tuple[str, ...] = ()
-    where: tuple[float, float, float, float] = (-180.0, -90.0, 180.0, 90.0)
     gappy: bool = True
 
     def replaced(self, own: Mapping[int, Ground]) -> CoverTable:
@@ -169,16 +166,12 @@ def read_cover_table(path: Path) -> CoverTable:
 
 
 def _value(cell: str, what: str) -> CoverGround:
-    word = cell.lower().replace(",", ".")
-    if word == "lethal" or word.upper() in TerrainClass.__members__:
-        return word  # type: ignore[return-value]
     try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not 0 < value <= _HIGHEST_FACTOR:
+        value: CoverGround = msgspec.convert(cell.lower().replace(",", "."), CoverGround, strict=False)
+    except msgspec.ValidationError as error:
         kinds = ", ".join(kind.name.lower() for kind in TerrainClass)
-        raise TerrainError(f"{what}: {cell[:40]!r} is no ground; expected {kinds}, lethal, or a pace such as 1.5")
+        expected = f"expected {kinds}, lethal, or a pace such as 1.5"
+        raise TerrainError(f"{what}: {cell[:40]!r} is no ground; {expected}") from error
     return value
 
 
@@ -191,9 +184,7 @@ def table_named(name: str) -> CoverTable:
         return TABLES[name]
     path = Path(name)
     if not path.is_file():
-        raise TerrainError(
-            f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file of code and class"
-        )
+        raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
     return read_cover_table(path)
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.layers import READABLE, TerrainClass, grade_of_padded, spread
@@ -110,22 +111,20 @@ def box_sum(padded: NDArray[Any], reach: int) -> NDArray[Any]:
 
 
 def tiles(
-    rgb: Bytes, elevation_m: Floats | None, resolution_m: float, row0: int, row1: int
+    rgb: Bytes, elevation_m: Floats, resolution_m: float, row0: int, row1: int
 ) -> Iterator[tuple[slice, Features]]:
     """The tiles of the band from row0 to row1: which columns, and the features. Beyond the photo it is mirrored.
 
     Other arguments are as of `classify.class_readings`.
     """
     rows, cols = rgb.shape[:2]
-    padded_m = None if elevation_m is None else padded_rows(elevation_m, row0, row1)
+    padded_m = padded_rows(elevation_m, row0, row1)
     above, below = max(row0 - HALO, 0), min(row1 + HALO, rows)
     pads = ((HALO - (row0 - above), HALO - (below - row1)), (HALO, HALO), (0, 0))
     padded = np.pad(rgb[above:below], pads, mode="symmetric")
     for col0 in range(0, cols, TILE_COLS):
         col1 = min(col0 + TILE_COLS, cols)
-        grade = np.zeros((row1 - row0, col1 - col0), np.float32)
-        if padded_m is not None:
-            grade = np.nan_to_num(grade_of_padded(padded_m[:, col0 : col1 + 2], resolution_m))
+        grade = np.nan_to_num(grade_of_padded(padded_m[:, col0 : col1 + 2], resolution_m))
         yield slice(col0, col1), features_of(padded[:, col0 : col1 + 2 * HALO], grade)
 
 
@@ -222,8 +221,6 @@ def line_strength(rgb: Bytes) -> Bytes:
     uint8 (rows, cols), tenths of a grey level
         0 where there is no crest. The outer `REACH` rows and columns are found from less of the photo.
     """
-    from scipy import ndimage
-
     # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.
     grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
     smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * _FIXED).astype(np.int16)
@@ -272,8 +269,6 @@ def long_lines(strength: Bytes) -> Bools:
     -------
     bool (rows, cols)
     """
-    from scipy import ndimage
-
     strong = strength >= _STRONG
     labels, count = ndimage.label(spread(strong, (1, 1)), np.ones((3, 3), np.int8))
     sizes = counted(labels, count + 1, strong)

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
 
-from shared_map.array_files import Bools, Bytes
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
-from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
+from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, sampled
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
-MOST_SIDE = 1024
+_MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
+_STRETCHED_CELLS = 1 << 18
+"""Sample of 512 x 512 pixels, from which a percentile is known to a thousandth."""
 _DARK = 30
 """Out of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
 channels have no meaning."""
@@ -39,13 +42,13 @@ class Photo:
     rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
     seen   bool (rows, cols): where it shows anything
     notes  processing steps, for people
-    drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
+    other  the kind of an image that is no true-colour photo, for people; None if it may be one
     """
 
     rgb: Bytes
     seen: Bools
     notes: tuple[str, ...]
-    drawn: str | None = None
+    other: str | None = None
 
 
 def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
@@ -70,8 +73,8 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     """
     what = f"photo {path}"
     with opened(path, "photo") as dataset:
-        placed = place_on(dataset, grid, given_crs, what)
-        notes = []
+        placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
+        notes = [str(path)]
         if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
             notes.append(
                 f"photo: {dataset.height} x {dataset.width} pixels, covers {placed.share:.1%} of the terrain"
@@ -79,83 +82,43 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
         return _read(placed, notes, progress)
 
 
-def _band(placed: Placed, index: int, row0: int, row1: int) -> NDArray[Any]:
-    """Rows of a band on the grid, 0 beyond the photo. Palettes and transparency are not interpolated."""
-    from rasterio.enums import ColorInterp
-
-    dataset = placed.dataset
-    if placed.target is None:
-        return np.asarray(dataset.read(index, window=((row0, row1), (0, dataset.width))))
-    how = "average" if placed.grows else "bilinear"
-    if dataset.colorinterp[index - 1] in (ColorInterp.palette, ColorInterp.alpha):
-        how = "nearest"
-    return placed.warp(index, np.zeros((row1 - row0, placed.grid.cols), dataset.dtypes[index - 1]), how, row0)
-
-
-def _frame(placed: Placed, row0: int, row1: int) -> Bools:
-    """Returns which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
-    inside = np.zeros((row1 - row0, placed.grid.cols), np.uint8)
-    if placed.target is None:
-        return np.ones(inside.shape, np.bool_)
-    ones = np.ones((min(placed.dataset.height, 64), min(placed.dataset.width, 64)), np.uint8)
-    seen: Bools = placed.warp(ones, inside, "nearest", row0) > 0
-    return seen
-
-
 def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
-    from rasterio.enums import ColorInterp
-
     dataset, grid = placed.dataset, placed.grid
     indexes, palette = _colour_bands(dataset)
-    meanings = list(dataset.colorinterp)
-    alpha = meanings.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in meanings else None
     low, high = _stretch(dataset, indexes, notes)
     if len(indexes) == 1 and palette is None:
         notes.append("the photo is grey: without colour, what covers the ground is a guess")
+
+    def colours(raw: Floats) -> Bytes:
+        if high > low:
+            raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
+        stored = raw.astype(np.uint8)
+        rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
+        return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
+
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
-    for row0, row1 in bands(grid.rows, READ_ROWS):
-        raw = [_band(placed, index, row0, row1) for index in indexes]
-        inside = _frame(placed, row0, row1)
-        if raw[0].dtype.kind == "f":
-            inside &= ~np.any([np.isnan(values) for values in raw], axis=0)
-        if dataset.nodata is not None:
-            inside &= ~np.all([values == dataset.nodata for values in raw], axis=0)
-        if alpha is not None:
-            inside &= _band(placed, alpha, row0, row1) > 0
-        seen[row0:row1] = inside
-        for channel in range(3):
-            values = raw[channel % len(raw)]
-            if palette is not None:
-                values = palette[np.minimum(values.astype(np.intp), 255), channel]
-            elif high > low:
-                scaled = (values.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
-                values = np.clip(np.nan_to_num(scaled), 0, 255)
-            rgb[row0:row1, :, channel] = np.where(inside, values, 0)
-        progress("reading photo", row1 / grid.rows)
+    how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
+    with placed.on_grid(how) as cells:
+        for row0, row1 in bands(grid.rows, READ_ROWS):
+            raw = cells.read(indexes, window=((row0, row1), (0, grid.cols)))
+            inside = ~np.isnan(raw).any(axis=0)
+            seen[row0:row1] = inside
+            rgb[row0:row1] = colours(np.where(inside, raw, 0)) * inside[..., None]
+            progress("reading photo", row1 / grid.rows)
     if not seen.any():
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    return Photo(rgb, seen, tuple(notes), _why_drawn(dataset, indexes, palette))
-
-
-def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:
-    """Looked for in the file's own pixels, in its middle."""
-    if len(indexes) == 1 and palette is None:
-        return None
-    if any(dataset.dtypes[index - 1] != "uint8" for index in indexes):
-        return None
-    window = middle_of(dataset, MOST_SIDE)
-    stored = dataset.read(indexes, window=window)
-    rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
-    return why_drawn(rgb, dataset.dataset_mask(window=window) > 0)
+    # Looked for in the file's own pixels: between two colours of a legend an interpolation makes others.
+    middle = middle_of(dataset, _MOST_SIDE)
+    own = np.nan_to_num(dataset.read(indexes, window=middle).astype(np.float32))
+    other = why_not_true_colour(colours(own), dataset.dataset_mask(window=middle) > 0)
+    return Photo(rgb, seen, tuple(notes), other)
 
 
 def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
     """Returns which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
-    from rasterio.enums import ColorInterp
-
     meanings = list(dataset.colorinterp)
     wanted = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
     if all(colour in meanings for colour in wanted):
@@ -172,17 +135,13 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
-    every = -(-max(dataset.height, dataset.width) // 512)
-    sample = thinned(dataset.read, dataset, indexes, every).astype(np.float64)
-    sample = sample[np.isfinite(sample) & (sample != (0 if dataset.nodata is None else dataset.nodata))]
+    sample = sampled(dataset, tuple(indexes), _STRETCHED_CELLS).compressed().astype(np.float64)
+    sample = sample[np.isfinite(sample) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(sample, (2, 98)))
     notes.append(f"photo stretched from {low:.4g}..{high:.4g} to bytes")
     return low, max(high, low + 1e-9)
-
-
-# --- true colour or not -------------------------------------------------------------------------------------
 
 
 def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
@@ -200,33 +159,14 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
         A map with a legend has few colours, in areas. In images that show near infrared as red, plants are red,
         with as much green as blue; the reds of true ground have more green than blue.
     """
-    drawn = why_drawn(rgb, seen)
-    if drawn is not None:
-        return drawn
-    red, green, blue = np.moveaxis(_middle(rgb).astype(np.int32), -1, 0)
-    lit = _middle(seen) & (red + green + blue > _DARK)
+    same = (rgb[1:, 1:] == rgb[:-1, 1:]).all(axis=2) & (rgb[1:, 1:] == rgb[1:, :-1]).all(axis=2)
+    count = np.unique(joined(np.moveaxis(rgb, -1, 0))[seen]).size
+    if 1 < count <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
+        return f"a drawn map: it has {count} colours, in areas"
+    red, green, blue = np.moveaxis(rgb.astype(np.int32), -1, 0)
+    lit = seen & (red + green + blue > _DARK)
     false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit
     share = false.sum() / max(int(lit.sum()), 1)
     if share > _FALSE_SHARE:
         return f"in false colour: {share:.0%} of it is as red as plants are where near infrared is shown as red"
     return None
-
-
-def why_drawn(rgb: Bytes, seen: Bools) -> str | None:
-    """Returns a sentence that an image is a drawn map; None if it may be a photo. Arguments as of
-    `why_not_true_colour`.
-
-    Pixels must be the file's own, or copies of them: between two colours of a legend an interpolation makes others.
-    """
-    some = _middle(rgb)
-    same = (some[1:, 1:] == some[:-1, 1:]).all(axis=2) & (some[1:, 1:] == some[1:, :-1]).all(axis=2)
-    colours = np.unique(joined(np.moveaxis(some, -1, 0))[_middle(seen)]).size
-    if 1 < colours <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
-        return f"a drawn map: it has {colours} colours, in areas"
-    return None
-
-
-def _middle(array: NDArray[Any]) -> NDArray[Any]:
-    """At most `MOST_SIDE` rows and columns in the middle of an array."""
-    row0, col0 = (max(side - MOST_SIDE, 0) // 2 for side in array.shape[:2])
-    return array[row0 : row0 + MOST_SIDE, col0 : col0 + MOST_SIDE]

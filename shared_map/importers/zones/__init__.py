@@ -1,6 +1,7 @@
 """Zones that files draw: vector files, whose features are burnt into cells, and rasters of pace.
 
-`vector_files` opens a file and reads its features as they are stored; `vector_shapes` repairs them and brings them
-into cells; `burn` rasterises them. `zone_files` decides which features count and what they are worth, by the
-classes of ways of `way_classes`, whose built-in table is `ways.toml`.
+`zone_files` is the door. `vector_files` opens a file and reads its features as they are stored; `vector_shapes`
+repairs them and brings them into cells; `drawings` decides which features count and what they are worth, by the
+classes of ways of `way_classes`, whose built-in table is `ways.toml`; `burn` rasterises them. Only these need the
+extra `vectors`.
 """

@@ -7,7 +7,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
+from rasterio.features import rasterize
+from rasterio.transform import Affine
 
 from shared_map.array_files import Floats
 from swarm.errors import TerrainError
@@ -20,7 +24,7 @@ _CHUNK = 4096
 """Shapes that are handed to GDAL at once: it takes Python's lists of numbers, which are large."""
 _PIECE = 50
 """Corners of a line that is widened at once: one of many that crosses itself often would take for ever."""
-_POLYGON = 3
+POLYGON = 3
 _NUDGE = (1.3e-4, 0.7e-4)
 """In cells. A line through the very corner of cells passes two of them that have no side in common, and no vehicle
 drives from one to the other between closed cells. Only rounded coordinates touch cells exactly."""
@@ -45,14 +49,12 @@ def burn(
 
     Raises TerrainError, which `what` begins, if shapes lie upon each other too often.
     """
-    import shapely
-
     if not drawing:
         return Window(0, 0, 0, 0), np.zeros((0, 0), np.float32)
     shapes = np.array([each.shape for each in drawing], object)
     values = np.array([each.value for each in drawing])
     halves = np.array([each.width_cells for each in drawing]) / 2
-    areas = shapely.get_type_id(shapes) == _POLYGON
+    areas = shapely.get_type_id(shapes) == POLYGON
     halves[areas] = 0.0
     window = _window(shapes, halves, grid, what)
     size = (max(window.row1 - window.row0, 0), max(window.col1 - window.col0, 0))
@@ -74,7 +76,6 @@ def burn(
 
 
 def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, what: str) -> Window:
-    import shapely
 
     box = shapely.bounds(shapes)
     west, north, east, south = box[:, 0] - halves, box[:, 1] - halves, box[:, 2] + halves, box[:, 3] + halves
@@ -90,8 +91,6 @@ def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, w
 
 def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
     """Polygons as they are, lines and points as areas, long ones in pieces; and of which shape each is a part."""
-    import shapely
-
     of = np.arange(len(shapes))
     long = np.flatnonzero((halves > 0) & (shapely.get_num_coordinates(shapes) > _PIECE)) if len(shapes) else of
     if len(long):
@@ -115,9 +114,6 @@ def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray
 def _rasterize(
     shapes: NDArray[Any], values: NDArray[np.float64], out: Floats, window: Window, *, everywhere: bool
 ) -> None:
-    from rasterio.errors import NotGeoreferencedWarning
-    from rasterio.features import rasterize
-    from rasterio.transform import Affine
 
     pairs = [(part, value) for shape, value in zip(shapes, values.tolist(), strict=True) for part in _parts(shape)]
     if not pairs:
@@ -131,8 +127,6 @@ def _rasterize(
 def _parts(shape: Any) -> list[Any]:
     """A shape in pieces that GDAL burns in a bounded time: a polygon of very many corners is cut along rows of
     cells."""
-    import shapely
-
     west, north, east, south = shape.bounds
     heavy = shapely.get_num_coordinates(shape) * (south - north) > _HEAVY
     if shape.geom_type != "Polygon" or not heavy or south - north < 2:

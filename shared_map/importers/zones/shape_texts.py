@@ -6,16 +6,21 @@ therefore checked before: a GeoJSON against the types below, an XML in its coord
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
 import msgspec
 from msgspec import Meta, Struct
 
+from shared_map.importers.raster_files import beginning
+from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 
 
@@ -27,10 +32,10 @@ class Kind(NamedTuple):
 
 
 _MAGIC = {
-    b"SQLite format 3\0": Kind("GPKG"),
     b"\0\0\x27\x0a": Kind("ESRI Shapefile"),
     b"fgb\x03fgb": Kind("FlatGeobuf"),
     b"{": Kind("GeoJSON", "json"),
+    b"\x1e": Kind("GeoJSON", "json"),
     b"QGC WPL": Kind("GeoJSON", "fence"),
 }
 """First bytes -> format. GDAL knows 80 formats, some of which name other files."""
@@ -42,18 +47,34 @@ _CONVERTED = {
     b"\0\0\0\x0e\x0a\x09OSMHeader": "OSM PBF",
 }
 """First bytes of formats that are not read here."""
+_SQLITE, _APPLICATION = b"SQLite format 3\0", slice(68, 70)
+"""Beginning of a database, and where it says to which application it belongs: GP10, GP11 or GPKG."""
 _CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
 
 
 def kind_of(head: bytes, what: str) -> Kind | None:
     """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
     for magic, name in _CONVERTED.items():
-        if head.startswith(magic) and what:
+        if head.startswith(magic):
             raise TerrainError(f"{what} is {name}, which {_CONVERT}")
+    if head.startswith(_SQLITE):
+        if head[_APPLICATION] != b"GP":
+            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; it {_CONVERT}")
+        return Kind("GPKG")
     head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
     root = _ROOT.match(head) if found is None else None
     return Kind(_ROOTS[root[1]], "xml") if root is not None and root[1] in _ROOTS else found
+
+
+IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
+
+
+def is_vector(path: Path) -> bool:
+    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
+    with contextlib.suppress(OSError, TerrainError):
+        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0], "") is not None
+    return False
 
 
 # --- GeoJSON ------------------------------------------------------------------------------------------------
@@ -110,6 +131,9 @@ class _Document(Struct, frozen=True):
 
 _document = msgspec.json.Decoder(_Document)
 _feature = msgspec.json.Decoder(Feature | Geometry)
+_lines = msgspec.json.Decoder(msgspec.Raw)
+_RECORD = b"\x1e"
+"""The sign before each feature of a GeoJSON text sequence."""
 
 
 INCLUSION = "inclusion"
@@ -117,28 +141,36 @@ INCLUSION = "inclusion"
 
 
 def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
-    """Checks every coordinate of a GeoJSON; returns the GeoJSON of a fence, None if it is one itself.
+    """Checks every coordinate of a GeoJSON, also of one with a feature a line.
+
+    Returns its content as a GeoJSON where GDAL cannot read the file itself, as that of a fence; else None.
 
     Raises TerrainError with one sentence, which names the first feature that cannot be read.
     """
-    number, data = 0, data.removeprefix(b"\xef\xbb\xbf")
+    number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(_RECORD, b"")
     try:
         if kind.text == "fence":
-            return fence_of_waypoints(data.decode("ascii"))
-        document = _document.decode(data)
+            return fence_of_waypoints(text.decode("ascii"))
+        try:
+            document = _document.decode(text)
+        except msgspec.DecodeError as error:
+            if "trailing characters" not in str(error):
+                raise
+            document = _Document(features=_lines.decode_lines(text))
         if document.fileType:
-            return fence_of_plan(data)
+            return fence_of_plan(text)
         foreign = "TopoJSON" if document.type == "Topology" else "ArcGIS JSON" if document.geometryType else ""
         if foreign:
             raise TerrainError(f"{what} is {foreign}, which {_CONVERT}")
         if document.type == "FeatureCollection" and document.features is None:
             raise TerrainError(f"{what} is damaged: a FeatureCollection without features")
-        for number, each in enumerate(document.features if document.features is not None else [data], 1):  # noqa: B007
+        features = document.features if document.features is not None else [msgspec.Raw(text)]
+        for number, each in enumerate(features, 1):  # noqa: B007
             _feature.decode(each)
+        return None if document.type and _RECORD not in data else _collection(features)
     except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
         at = f"feature number {number} cannot be used: " if number else ""
         raise TerrainError(f"{what} is damaged: {at}{error}; repair or remove it") from error
-    return None
 
 
 # --- XML ----------------------------------------------------------------------------------------------------
@@ -169,7 +201,7 @@ def checked_xml(data: bytes, what: str) -> None:
             for place in places:
                 if len(place) not in (2, 3) or not all(_is_number(each) for each in place):
                     raise TerrainError(
-                        f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers; repair it"
+                        f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers"
                     )
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
@@ -198,9 +230,7 @@ def checked_xml(data: bytes, what: str) -> None:
             raise TerrainError(f"{what}: relation {area} cannot be used: its ways form no closed ring; repair it")
     for absent in needed.keys() - known:
         user = needed[absent]
-        raise TerrainError(
-            f"{what} is not complete: {user} needs {absent[0]} {absent[1]}; load it with all it needs"
-        )
+        raise TerrainError(f"{what} is not complete: {user} needs {absent[0]} {absent[1]}")
 
 
 def _is_area(relation: ElementTree.Element) -> bool:
@@ -299,5 +329,5 @@ def _fence(shape: Geometry, inside: bool, **extent: float) -> dict[str, Any]:
     return {"type": "Feature", "properties": {INCLUSION: "yes" if inside else "no", **extent}, "geometry": shape}
 
 
-def _collection(features: list[dict[str, Any]]) -> bytes:
+def _collection(features: Sequence[object]) -> bytes:
     return msgspec.json.encode({"type": "FeatureCollection", "features": features})

@@ -15,17 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
+import shapely
 from numpy.typing import NDArray
+from pyogrio.raw import read
 
-from shared_map.importers.raster_files import BAD_ARCHIVE, LONGEST_REASON
-from shared_map.importers.zones.shape_texts import Kind, checked_json, checked_xml, kind_of
+from shared_map.importers.raster_files import LONGEST_REASON, beginning
+from shared_map.importers.zones.shape_texts import IN_ARCHIVES, Kind, checked_json, checked_xml, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import SwarmError, TerrainError
 
 _CHUNK = 100_000
 """Features which are read at once."""
-_IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
 _TOGETHER = {"LIBKML": None, "GPX": {"waypoints", "routes", "tracks"}, "OSM": {"points", "lines", "multipolygons"}}
 """Formats whose layers are one drawing, and the layers which hold it; None: all."""
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
@@ -82,21 +84,12 @@ class Features:
         return next((tags[name] for name in _IDS if name in tags), str(self.numbers[feature]))[:60]
 
 
-def is_vector(path: Path) -> bool:
-    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
-    with contextlib.suppress(OSError, TerrainError, *BAD_ARCHIVE):
-        return _found(path, "") is not None
-    return False
-
-
 def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
     """The layer that is named, or the one of a file, or those which are one drawing.
 
     Raises TerrainError with one sentence, which `what` begins, if the file is missing, too large, damaged, of
     another kind, or holds several layers and none is named.
     """
-    import pyogrio
-
     source, kind = _source(path, what)
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # which takes new, negative ids for damage
     with _refused(what):
@@ -124,7 +117,7 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             if kind.driver == "ESRI Shapefile" and index_file.is_file():
                 count = max(count, (index_file.stat().st_size - 100) // 8)  # GDAL believes its header
             columns = tuple(str(field) for field in info["fields"])
-            shown = name if isinstance(source, str) else "fence"
+            shown = name if isinstance(source, str) else path.stem
             found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns, count))
         return found
 
@@ -135,9 +128,6 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
     Raises TerrainError, which names the feature, if one has no shape, or a part of it none, or a coordinate is no
     number: GDAL leaves out of a shape what it cannot read. Raises it if the file is damaged.
     """
-    import shapely
-    from pyogrio.raw import read
-
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
     for first in range(0, 1 << 31, _CHUNK):
         with _refused(layer.what), np.errstate(all="ignore"):
@@ -166,8 +156,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
         if len(numbers) < _CHUNK:
             if first + len(numbers) != layer.count:
                 raise TerrainError(
-                    f"{layer.what} is damaged: it holds {layer.count} features, of which {first + len(numbers)} are"
-                    " read; ogr2ogr makes a copy of these"
+                    f"{layer.what} is damaged: of its {layer.count} features {first + len(numbers)} are read"
                 )
             return
 
@@ -178,8 +167,6 @@ def unusable(what: str, id: str, why: str) -> TerrainError:
 
 def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, empty ones too, and of which each is a part."""
-    import shapely
-
     of = np.arange(len(geometries))
     parts = np.asarray(geometries, object)
     while (several := (shapely.get_type_id(parts) > _POLYGONS) & ~shapely.is_empty(parts)).any():
@@ -209,77 +196,49 @@ def _refused(what: str) -> Iterator[None]:
 
 
 def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
-    """Returns GDAL's name for a file, whose text is checked. Raises TerrainError on a file of another kind."""
+    """Returns GDAL's name for a file, whose text is checked, or its content as GeoJSON. Raises TerrainError on a
+    file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
-        found = _found(path, what)
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"{what} is damaged or no .zip: {error}") from error
+        head, member, unpacked = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
-    if found is None:
+    kind = kind_of(head, what)
+    if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
         raise TerrainError(
             f"{what} is neither GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor"
             " .waypoints, nor a .zip of one; `ogr2ogr -f GPKG out.gpkg FILE` converts most others"
         )
-    kind, member = found
     absolute = path.resolve()
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if kind.text is None:
         return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
-    if member is None:
-        data = read_bytes(path, FileKind.VECTOR_TEXT)
-    else:
-        with zipfile.ZipFile(path) as archive:
-            data = archive.read(member)
+    if unpacked > FileKind.VECTOR_TEXT.most_bytes:
+        raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(unpacked)}")
+    data = _read(path, member)
     if kind.text == "xml":
         checked_xml(data, what)
         return source, kind
     return checked_json(data, kind, what) or f"GeoJSON:{source}", kind
 
 
-def _found(path: Path, what: str) -> tuple[Kind, str | None] | None:
-    """The kind of a file, and the member of a .zip which holds it."""
-    with path.open("rb") as file:
-        head = file.read(4096)
-    if not head.startswith(b"PK"):
-        kind = kind_of(head, what)
-        if kind is not None and kind.text is not None:
-            check_bytes(path, FileKind.VECTOR_TEXT)
-        return None if kind is None else (kind, None)
+def _read(path: Path, member: str | None) -> bytes:
+    if member is None:
+        return read_bytes(path, FileKind.VECTOR_TEXT)
     with zipfile.ZipFile(path) as archive:
-        members = [each for each in archive.infolist() if not each.is_dir()]
-        named = [each for each in members if Path(each.filename).suffix.lower() in _IN_ARCHIVES]
-        if len(named) != 1:
-            if not what:
-                return None
-            raise TerrainError(
-                f"{what} holds {len(named)} files of shapes ({', '.join(_IN_ARCHIVES)}), expected one: unpack it"
-            )
-        name = named[0].filename
-        with archive.open(name) as member:
-            kind = kind_of(member.read(4096), what)
-        if kind is None:
-            return None
-        stem = str(Path(name).with_suffix(""))
-        unpacked = sum(each.file_size for each in members if str(Path(each.filename).with_suffix("")) == stem)
-        most = (FileKind.VECTORS if kind.text is None else FileKind.VECTOR_TEXT).most_bytes
-        if unpacked > most:
-            raise TerrainError(f"{what}: {name} has {size(unpacked)}, at most {size(most)} are read")
-    return kind, name
+        return archive.read(member)
 
 
 def _check_table(path: Path, source: str | bytes, layer: str, what: str) -> None:
     """A layer of a GeoPackage must be a table: a view is a program, which may not end."""
-    zipped = str(source).startswith("/vsizip/")
+    _, zipped, member = str(source).partition("}/")
     where = ":memory:" if zipped else path.resolve().as_uri() + "?mode=ro"
     try:
         with contextlib.closing(sqlite3.connect(where, uri=True)) as database:
             if zipped:
-                with zipfile.ZipFile(path) as archive:
-                    database.deserialize(archive.read(str(source).partition("}/")[2]))
+                database.deserialize(_read(path, member))
             found = database.execute("SELECT type FROM sqlite_master WHERE name = ?", (layer,)).fetchone()
     except sqlite3.Error as error:
         raise TerrainError(f"{what} is damaged: {error}") from error

@@ -12,9 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import RasterioError
+from rasterio.transform import from_origin
+from rasterio.warp import transform as to_crs
 
-from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
+from shared_map.importers.georeference import bounds_in, crs_name, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -65,7 +70,10 @@ class Placing:
 
     def __init__(self, grid: GridSpec, layer: Layer, crs: str | None, margin_m: float) -> None:
         self.grid, self.layer = grid, layer
-        self._target, self._crs = systems_of(grid, layer.crs, crs, layer.what)
+        own = None
+        with suppress(TerrainError):
+            own = system_named(layer.crs, layer.what)
+        self._target, self._crs = systems_of(grid, own, crs, layer.what, "crs")
         self._margin_cells = margin_m / grid.resolution_m + 2.0
         with self._reprojecting():
             self._box = self._extent()
@@ -81,8 +89,6 @@ class Placing:
 
     def _extent(self) -> Box:
         """The terrain with its margin, in the layer's coordinates; degrees go on beyond 180."""
-        from rasterio.transform import from_origin
-        from rasterio.warp import transform as to_crs
 
         grid, out = self.grid, self._margin_cells * self.grid.resolution_m
         rows, cols = grid.rows + 2 * self._margin_cells, grid.cols + 2 * self._margin_cells
@@ -90,12 +96,7 @@ class Placing:
         if self._crs is None or self._crs == self._target:
             return west, north - rows * grid.resolution_m, west + cols * grid.resolution_m, north
         around = from_origin(west, north, grid.resolution_m, grid.resolution_m)
-        what = f"{self.layer.what}: the terrain"
-        box = bounds_in(around, rows, cols, self._target, self._crs, what)  # type: ignore[arg-type]
-        if self._crs.is_geographic and box[2] - box[0] > 180:
-            middle, _ = to_crs(self._target, self._crs, [west + cols / 2 * grid.resolution_m], [north])
-            turned = bounds_in(around, rows, cols, self._target, _degrees_around(self._crs, middle[0]), what)  # type: ignore[arg-type]
-            box = (turned[0] + middle[0], turned[1], turned[2] + middle[0], turned[3])
+        box = bounds_in(around, rows, cols, self._target, self._crs)  # type: ignore[arg-type]
         # The border was looked at in some of its points only, and may bulge between them.
         wide, high = 0.01 * (box[2] - box[0]), 0.01 * (box[3] - box[1])
         return box[0] - wide, box[1] - high, box[2] + wide, box[3] + high
@@ -144,7 +145,6 @@ class Placing:
 
     def place(self, features: Features) -> Shapes:
         """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
-        import shapely
 
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
@@ -159,8 +159,7 @@ class Placing:
             self._corners += int(shapely.get_num_coordinates(features.shapes[near]).sum())
             if self._features > MOST_FEATURES or self._corners > MOST_CORNERS:
                 raise TerrainError(
-                    f"{self.layer.what} has more than {MOST_FEATURES} features or {MOST_CORNERS} corners on the"
-                    " terrain; crop, dissolve or simplify it"
+                    f"{self.layer.what} has over {MOST_FEATURES} features or {MOST_CORNERS} corners; simplify it"
                 )
             of = features.of[near]
             shapes, of, mended = _mended(features, near, self.layer.what)
@@ -177,7 +176,6 @@ class Placing:
         self, shapes: NDArray[Any], of: NDArray[np.int64], shift: float, features: Features
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """The parts of shapes within the terrain's box that is turned by some degrees."""
-        import shapely
 
         box = (self._box[0] + shift, self._box[1], self._box[2] + shift, self._box[3])
         shapes, within = _simple(np.asarray(shapely.clip_by_rect(shapes, *box), object))
@@ -194,18 +192,15 @@ class Placing:
     @contextmanager
     def _reprojecting(self) -> Iterator[None]:
         """Makes what PROJ says of systems that do not go together a TerrainError."""
-        from rasterio._err import CPLE_BaseError
-        from rasterio.errors import RasterioError
 
         try:
             yield
         except (RasterioError, CPLE_BaseError) as error:
             raise TerrainError(
-                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system; is crs right?"
+                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system"
             ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
-        from rasterio.warp import transform as to_crs
 
         xs, ys = points[:, 0] + shift, points[:, 1]
         if self._crs is not None and self._crs != self._target and len(points):
@@ -213,46 +208,6 @@ class Placing:
             xs, ys = np.asarray(moved[0]), np.asarray(moved[1])
         grid = self.grid
         return np.stack([(xs - grid.west_m) / grid.resolution_m, (grid.north_m - ys) / grid.resolution_m], axis=1)
-
-
-def systems_of(grid: GridSpec, own: str, given: str | None, what: str) -> tuple[Any, Any]:
-    """(the terrain's system, a file's); (None, None) if the file is in the terrain's own metres.
-
-    own    the file's system as it says; empty if it does not
-    given  what the scenario says that it is
-    """
-    import rasterio
-
-    if given == "local":
-        return None, None
-    found = None
-    if given is not None:
-        found = system_named(given, f"{what}: crs")
-    elif own:
-        with suppress(TerrainError):
-            found = system_named(own, what)
-    if found is None:
-        raise TerrainError(
-            f"{what} does not say in which coordinate system it is; set crs, for example 'EPSG:4326', or 'local'"
-            " for metres of the terrain's own map"
-        )
-    if grid.crs == "local":
-        if is_local(found):
-            return None, None
-        raise TerrainError(
-            f"{what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local' if"
-            " its coordinates are metres of the terrain's own map"
-        )
-    if not found.is_geographic and not found.is_projected:
-        raise TerrainError(f"{what} is in {crs_name(found)}, which has no place on the Earth; set crs")
-    return rasterio.CRS.from_user_input(grid.crs), found
-
-
-def _degrees_around(crs: Any, lon_deg: float) -> Any:
-    """The same degrees, with longitudes counted from one in the middle of the terrain."""
-    import rasterio
-
-    return rasterio.CRS.from_proj4(f"+proj=longlat +pm={lon_deg!r} +datum=WGS84 +no_defs")
 
 
 def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
@@ -265,8 +220,6 @@ def _shown(box: Box) -> str:
 
 def _jumps(geometry: Any) -> bool:
     """Returns True if an edge spans more than half of the globe, and not all of it."""
-    import shapely
-
     parts, _ = _simple(np.array([geometry], object))
     for part in parts:
         for ring in shapely.get_rings(part) if part.geom_type == "Polygon" else [part]:
@@ -278,8 +231,6 @@ def _jumps(geometry: Any) -> bool:
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Points, lines and polygons that geometries consist of, without empty ones, and of which each is a part."""
-    import shapely
-
     parts, of = parts_of(geometries)
     kept = ~shapely.is_empty(parts)
     return parts[kept], of[kept]
@@ -292,8 +243,6 @@ def _mended(
 
     Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
     """
-    import shapely
-
     shapes = features.shapes.copy()
     polygons = near & (shapely.get_type_id(shapes) == _POLYGONS)
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
@@ -309,8 +258,6 @@ def _mended(
 
 def _crossings(polygon: Any) -> float:
     """Estimates the crossings of a polygon's edges from a sample: counting all takes as long as the repair."""
-    import shapely
-
     points = shapely.get_coordinates(polygon)
     edges = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
     some = edges[np.unique(np.linspace(0, len(edges) - 1, 200).astype(np.intp))]

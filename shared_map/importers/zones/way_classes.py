@@ -71,11 +71,13 @@ def unpacked(row: Mapping[str, str]) -> dict[str, str]:
     return tags | {key: value for key, value in row.items() if key not in PACKED}
 
 
-def class_of(kind: Kind, tags: Mapping[str, str], attribute: str | None) -> str | None:
+def class_of(kind: Kind | None, tags: Mapping[str, str], attribute: str | None) -> str | None:
     """The class of a feature; None if it says none."""
-    for column in (attribute,) if attribute is not None else COLUMNS[kind]:
+    if attribute is not None or kind is None:
+        return tags.get(attribute or "")
+    for column in COLUMNS[kind]:
         found = tags.get(column)
-        if found is not None and not (column in ("natural", "landuse") and found not in BUILT_IN["water"]):
+        if found is not None and (column not in ("natural", "landuse") or found in BUILT_IN["water"]):
             return found
     return None
 

@@ -1,37 +1,25 @@
-"""Zones that a file draws: which of its features count, what they are worth, and the cells that they cover."""
+"""Zones that a file draws: the cells that they cover, of shapes or of a raster of paces or factors."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name
-from shared_map.importers.onto_grid import Placed, overlap
+from shared_map.importers.onto_grid import place_on
 from shared_map.importers.raster_files import is_raster, opened
-from shared_map.importers.zones import way_classes
-from shared_map.importers.zones.burn import Drawn, burn
-from shared_map.importers.zones.shape_texts import INCLUSION
-from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layers, read_features, unusable
-from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
-from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
+from shared_map.importers.zones.shape_texts import is_vector
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
-from swarm.errors import TerrainError, missing
-from swarm.grid import MAX_CELLS, GridSpec, Window
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec, Window
 
-_WIDEST_M = 1000.0
-"""Lines that run so far outside the terrain are of no use to it."""
 _NAMED = 5
-_LEAST, _MOST = 1e-6, 1e6
+LEAST, MOST = 1e-6, 1e6
 """Factors and paces that a file may say."""
 
 
@@ -78,24 +66,6 @@ class Burnt:
     bridges: tuple[Window, Bools]
 
 
-@dataclass(frozen=True, eq=False)
-class Drawing:
-    """Shapes of a zone's file on a grid, in cells.
-
-    values   with a factor or pace
-    lethal   closed, each with its width
-    kept     all else is closed; empty if nothing is kept in
-    bridges  of roads
-    """
-
-    facts: FileFacts
-    values: list[Drawn] = field(default_factory=list)
-    lethal: list[Drawn] = field(default_factory=list)
-    kept: list[Drawn] = field(default_factory=list)
-    bridges: list[Drawn] = field(default_factory=list)
-    keeps: bool = False
-
-
 def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
     assert zone.file is not None
@@ -107,209 +77,14 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
         raise TerrainError(f"{where}: {error}") from error
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
+    from shared_map.importers.zones.burn import burn
+    from shared_map.importers.zones.drawings import closed_shapes, draw_zone
+
     drawn = draw_zone(zone, grid, what)
     closed, closes = burn(closed_shapes(drawn, grid), grid, what, everywhere=True)
     over, deck = burn(drawn.bridges, grid, what)
     burnt = burn(drawn.values, grid, what, least_wins=zone.kind == "road")
     return Burnt(drawn.facts, burnt, (closed, ~np.isnan(closes)), (over, ~np.isnan(deck)))
-
-
-def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
-    """The shapes of a vector file, for every use of it: each feature is drawn, lies outside of the terrain, or does
-    not count by its class; otherwise TerrainError names it."""
-    if importlib.util.find_spec("pyogrio") is None or importlib.util.find_spec("shapely") is None:
-        raise TerrainError(f"{what} cannot be read: it needs {missing('pyogrio')}")
-    path = Path(zone.file or "")
-    layers = open_layers(path, zone.layer, what)
-    facts = FileFacts(path.name, ", ".join(layer.name for layer in layers), "")
-    drawing, used, keeps = Drawing(facts), 0, False
-    faults = []
-    for layer in layers:
-        worth = _Worth(zone, layer, facts)
-        placing = Placing(grid, layer, zone.crs, _margin_m(zone, layer))
-        facts.crs = placing.crs
-        for features in read_features(layer, worth.columns):
-            placed = placing.place(features)
-            said = features.columns.get(INCLUSION, np.zeros(0, object))
-            keeps |= worth.closes and bool((said == "yes").any())
-            facts.features += len(features.numbers)
-            facts.outside += placed.outside
-            facts.mended += placed.mended
-            names = set()
-            for shape, id, way, bridge, inside in worth.of(features, placed):
-                names.add(id)
-                drawn = Drawn(shape, way.factor or 1.0, way.width_m / grid.resolution_m)
-                closing = drawing.kept if inside else drawing.lethal
-                (closing if way.factor is None else drawing.values).append(drawn)
-                if bridge:
-                    drawing.bridges.append(drawn)
-            used += len(names)
-        try:
-            placing.check_touched()
-        except TerrainError as error:
-            faults.append(error)
-    facts.used = used
-    if len(faults) == len(layers):
-        raise faults[0]
-    worth.check_used()
-    return replace(drawing, keeps=keeps)
-
-
-def closed_shapes(drawing: Drawing, grid: GridSpec) -> list[Drawn]:
-    """The shapes of all closed ground: those that close it, and all that lies outside of those that keep in."""
-    import shapely
-
-    if not (drawing.kept or drawing.keeps):
-        return drawing.lethal
-    kept = shapely.union_all([shapely.buffer(each.shape, each.width_cells / 2) for each in drawing.kept])
-    around = shapely.difference(shapely.box(-1, -1, grid.cols + 1, grid.rows + 1), kept)
-    return [*drawing.lethal, *(Drawn(part, 1.0, 0.0) for part in shapely.get_parts(around) if part.area > 0)]
-
-
-def _margin_m(zone: ZoneConfig, layer: Layer) -> float:
-    """The distance from the terrain up to which a feature may reach it."""
-    stated = [column for column in layer.columns if states_extent(column)]
-    widths = [way.width_m or 0.0 for way in zone.classes.values()] + [zone.width_m or 0.0, _WIDEST_M]
-    for features in read_features(layer, stated) if stated else ():
-        for n in range(len(features.numbers)):
-            with contextlib.suppress(ValueError):
-                widths.append(way_classes.width_of(features.tags(n)) or 0.0)
-    return max(widths) / 2
-
-
-class _Worth:
-    """Cost of each feature of a zone.
-
-    Raises TerrainError if the zone does not say how to tell.
-    """
-
-    def __init__(self, zone: ZoneConfig, layer: Layer, facts: FileFacts) -> None:
-        self._zone, self._layer, self._facts = zone, layer, facts
-        self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
-        self._by_class = bool(zone.classes) or (self._kind is not None and not self._is_plain())
-        self.columns = [*TAGS, *PACKED, *(column for column in layer.columns if states_extent(column))]
-        listed, name = self._listed(), zone.attribute
-        if name is not None:
-            if not {name, *PACKED} & set(layer.columns):
-                raise TerrainError(f"{layer.what} has no column {name!r}; it has {listed}")
-            self.columns.append(name)
-        elif self._kind is not None:
-            self.columns += COLUMNS[self._kind]
-        elif zone.classes:
-            raise TerrainError(f"{layer.what}: classes need an attribute; the columns are {listed}")
-        elif zone.kind in ("pace", "factor") and zone.value is None:
-            key = "factor" if zone.kind == "factor" else "pace_s_per_m"
-            raise TerrainError(
-                f"{layer.what}: set {key}, or attribute to the column that holds it; the columns are {listed}"
-            )
-        if zone.classes and zone.kind == "pace":
-            raise TerrainError(f"{layer.what}: classes have factors, which kind pace does not take")
-
-    def _is_plain(self) -> bool:
-        """True if each line is a road or a river of one width, as nothing tells of classes."""
-        zone, assumed = self._zone, COLUMNS[self._kind or "road"]
-        if zone.attribute is not None or {*assumed, *PACKED} & set(self._layer.columns):
-            return False
-        if zone.width_m is None:
-            raise TerrainError(
-                f"{self._layer.what} has no column {' or '.join(assumed)} (it has {self._listed()}); set attribute"
-                " to the column with the classes, or width_m, which takes each feature for one of this width"
-            )
-        return True
-
-    def _listed(self) -> str:
-        columns = self._layer.columns
-        return (", ".join(columns[:20]) + (" ..." if len(columns) > 20 else "")) or "none"
-
-    def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool, bool]]:
-        """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge, whether all
-        else is closed)."""
-        ways: dict[tuple[int, bool], tuple[Way | None, bool, bool]] = {}
-        for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
-            id = features.id(n)
-            key = n, shape.geom_type == "Polygon"
-            if key not in ways:
-                tags = way_classes.unpacked(features.tags(n))
-                if key[1]:  # an area has its own extent
-                    tags = {name: value for name, value in tags.items() if not states_extent(name)}
-                way = self._way(tags, id)
-                bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
-                self._facts.bridges += bridge
-                said = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
-                inside = self.closes and said.lower() in ("yes", "true", "1")
-                ways[key] = way, bridge, inside
-            way, bridge, inside = ways[key]
-            if way is not None:
-                if inside and not way.width_m and shape.geom_type != "Polygon":
-                    raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")
-                yield shape, id, way, bridge, inside
-
-    @property
-    def closes(self) -> bool:
-        return self._zone.kind in ("forbidden", "keep_in")
-
-    def _way(self, tags: dict[str, str], id: str) -> Way | None:
-        """Width and factor of a feature; None if it is left out, which the facts then tell."""
-        zone, kind = self._zone, self._kind
-        name = self._class_of(tags) if self._by_class else ""
-        if name is None:
-            self._facts.skip("without a class")
-            return None
-        if name:
-            way = way_classes.way_of(kind, name, zone.classes)
-            if way is None:
-                self._facts.skip(f"of class {name[:40]}", id)
-        elif zone.kind in ("pace", "factor") and zone.attribute is not None:
-            way = self._stated(tags, id)
-        else:
-            way = Way(0.0, zone.value or 1.0)
-        if way is None:
-            return None
-        if kind is not None and way_classes.is_tunnel(tags):
-            self._facts.skip("below the ground", id)
-            return None
-        if name:
-            self._facts.classes[name] += 1
-        closes = self.closes or (kind == "water" and not name)
-        try:
-            own_m = way_classes.width_of(tags)
-        except ValueError as error:
-            if closes or kind == "water":
-                raise unusable(self._layer.what, id, str(error)) from None
-            own_m = None
-        return Way(own_m or zone.width_m or way.width_m, None if closes else way.factor)
-
-    def _class_of(self, tags: dict[str, str]) -> str | None:
-        attribute = self._zone.attribute
-        return (
-            tags.get(attribute or "") if self._kind is None else way_classes.class_of(self._kind, tags, attribute)
-        )
-
-    def _stated(self, tags: dict[str, str], id: str) -> Way | None:
-        """The value that a feature's own attribute states."""
-        name = self._zone.attribute or ""
-        stated = tags.get(name, "nothing")
-        with contextlib.suppress(ValueError):
-            if _LEAST <= float(stated) <= _MOST:
-                return Way(0.0, float(stated))
-        self._facts.skip(
-            f"whose {name} is no {self._zone.kind} of {_LEAST:g} to {_MOST:g}", f"{id} ({stated[:40]})"
-        )
-        return None
-
-    def check_used(self) -> None:
-        """Raises TerrainError if features are on the terrain, and none counts for what they are."""
-        facts = self._facts
-        if facts.used:
-            return
-        reasons = ", ".join(f"{count} {why}" for why, count in facts.skipped.most_common(4))
-        raise TerrainError(
-            f"{self._layer.what}: none of its features on the terrain counts ({reasons}); set attribute and"
-            f" classes, the columns are {self._listed()}"
-        )
-
-
-# --- rasters of pace or factor ------------------------------------------------------------------------------
 
 
 def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
@@ -321,48 +96,25 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")
     with opened(path, where) as dataset:
-        values, crs = _values_on(dataset, grid, zone.crs, what)
+        placed = place_on(dataset, grid, zone.crs, what, "crs")
+        if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
+            found = f"{dataset.count} bands of {dataset.dtypes[0]}"
+            raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
+        # The nearest cell counts, or the mean where cells of the grid are half as large again.
+        with placed.on_grid("average" if placed.grows else "nearest") as cells:
+            values = cells.read(1) * np.float32(dataset.scales[0] or 1.0) + np.float32(dataset.offsets[0] or 0.0)
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]
-    if known.size and not _LEAST <= known.min() <= known.max() <= _MOST:
-        worst = known.min() if known.min() < _LEAST else known.max()
+    if known.size and not LEAST <= known.min() <= known.max() <= MOST:
+        worst = known.min() if known.min() < LEAST else known.max()
         raise TerrainError(
-            f"{what} holds {worst:g}, expected a {zone.kind} of {_LEAST:g} to {_MOST:g}, or inf where nothing"
-            " drives; declare what stands for no value as nodata"
+            f"{what} holds {worst:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf where nothing drives"
         )
     count = int(known.size + lethal.sum())
     if not count:
         raise TerrainError(f"{what} has no value on the terrain")
+    crs = "local" if zone.crs == "local" or placed.crs is None else crs_name(placed.crs)
     facts = FileFacts(path.name, "", crs, features=count, used=count)
     nothing = (Window(0, 0, 0, 0), np.zeros((0, 0), np.bool_))
     return Burnt(facts, (grid.window, values), (grid.window, lethal), nothing)
-
-
-def _values_on(dataset: Any, grid: GridSpec, crs: str | None, what: str) -> tuple[Floats, str]:
-    """The one band of a raster on a grid, float32, NaN where it has no value, and the name of its system. The
-    nearest cell counts, or the mean where cells of the grid are half as large again.
-
-    crs  its system, where the file does not say it; "local" is that of a terrain without a place
-
-    Raises TerrainError if it has several bands, is too large, or does not touch the grid.
-    """
-    import rasterio
-
-    if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
-        found = f"{dataset.count} bands of {dataset.dtypes[0]}"
-        raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
-    if dataset.height * dataset.width > MAX_CELLS:
-        raise TerrainError(f"{what} has {dataset.height} x {dataset.width} pixels; at most {MAX_CELLS} are read")
-    target, own = systems_of(grid, str(dataset.crs or ""), crs, what)
-    if own is None:
-        target = own = rasterio.CRS.from_epsg(3857)  # metres of the terrain's own map: which one does not matter
-    overlap(dataset, own, target, grid, what)
-    stored: Floats = dataset.read(1).astype(np.float32)
-    stored[dataset.read_masks(1) == 0] = np.nan
-    stored *= np.float32(dataset.scales[0] or 1.0)
-    stored += np.float32(dataset.offsets[0] or 0.0)
-    placed, values = Placed(dataset, grid, dataset.transform, own, target), np.full(grid.shape, np.nan, np.float32)
-    how = "average" if placed.grows else "nearest"
-    placed.warp(stored, values, how, src_nodata=math.nan, dst_nodata=math.nan)
-    return values, "local" if crs == "local" else crs_name(own)

@@ -105,6 +105,9 @@ class PlaceRouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("place
     vehicle_class: Id = GROUND
 
 
+PlaceStatus = Literal["ok", "growing", "lethal_goal", "outside_goal"]
+
+
 class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-route")):
     """Routes to a place, each with a proven lower bound.
 
@@ -118,7 +121,7 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
     incarnation: Incarnation
     map_version: Count
     routes: Routes
-    status: Literal["ok", "growing", "lethal_goal", "outside_goal"] = "ok"
+    status: PlaceStatus = "ok"
     vehicle_class: Id = GROUND
 
     def check(self) -> None:
@@ -126,10 +129,14 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
 
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):
-    """A newer route for a vehicle that follows this target."""
+    """A newer route for a vehicle that follows this target, or goes to a place.
+
+    target       None if it goes to a place
+    target_cell  of the target or of the place
+    """
 
     vehicle: VehicleId
-    target: Id
+    target: Id | None
     incarnation: Incarnation
     target_cell: Cell
     map_version: Count

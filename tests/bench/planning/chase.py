@@ -333,7 +333,7 @@ class _Racer:
         elif update.kind == "exact":
             tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
         if tree.wants_strides:
-            tree.take_strides(tree.stride_job().run())
+            tree.take_strides(tree.stride_job()())
         if count:
             self.tally.count(update.kind)
         if not (update.wants_full or grow):

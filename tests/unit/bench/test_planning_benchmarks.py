@@ -86,7 +86,7 @@ def test_an_array_that_is_no_field_is_refused(tmp_path: Path, array: Any, compla
 # --- chases ------------------------------------------------------------------------------------------------------
 
 
-def test_full_growths_have_no_gap_and_no_strategy_beats_the_optimum() -> None:
+def test_full_growths_have_no_gap_and_no_strategy_heartbeats_the_optimum() -> None:
     report = bench("gap", "--dem", "uniform", "--frames", "6", "--runs", "1", "--walk", "random,evade")
     assert [(row["walk"], row["strategy"]) for row in report["rows"]] == [
         (walk, strategy) for walk in ("random", "evade") for strategy in STRATEGIES
@@ -168,13 +168,6 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     without, compacted = bench("compaction", "--lives", "8")["rows"]
     assert (without["compact"], compacted["compact"]) == ("no", "yes")
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
-
-
-def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:
-    report = bench("air", "--cells", "24", "--routes", "1000")
-    assert report["clearance_broken"] == 0
-    assert report["lowest_m"] >= report["clearance_m"]
-    assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
 
 
 @pytest.mark.parametrize("field", ["terrain", "maze"])

@@ -2,35 +2,14 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import stat
 from pathlib import Path
 
 import pytest
-from cryptography import x509
-from cryptography.x509.oid import NameOID
 
-from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, issue, may_stay
 from swarm.errors import ConfigError, StoreError
-
-
-def read(path: Path) -> x509.Certificate:
-    return x509.load_pem_x509_certificate(path.read_bytes())
-
-
-def test_a_certificate_is_signed_by_the_folders_authority_and_names_its_bearer_and_hosts(tmp_path: Path) -> None:
-    path = issue(tmp_path / "certs", "router", ["10.0.0.1", "base.local"], 30)
-    ca, made = read(path.with_name("ca.pem")), read(path)
-    made.verify_directly_issued_by(ca)
-    (name,) = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    assert name.value == "router"
-    hosts = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    assert [str(host.value) for host in hosts] == ["10.0.0.1", "base.local"]
-    assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
-    good_for = made.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
-    assert 29 <= good_for.days <= 30
 
 
 def test_what_is_there_is_replaced_only_when_asked(tmp_path: Path) -> None:
@@ -66,16 +45,6 @@ def test_a_damaged_authority_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "ca.key").unlink()
     with pytest.raises(StoreError, match=r"ca\.key: No such file"):
         issue(tmp_path, "a1", [], 30)
-
-
-def test_a_certificate_may_stay_until_a_third_of_its_time_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert may_stay(issue(tmp_path, "a0", [], 1), [], "a0")
-    assert not may_stay(issue(tmp_path, "a1", [], 0), [], "a1")
-    monkeypatch.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
-    assert may_stay(issue(tmp_path, "a2", [], 11), [], "a2")
-    assert not may_stay(issue(tmp_path, "a3", [], 9), [], "a3")
 
 
 @pytest.mark.parametrize(

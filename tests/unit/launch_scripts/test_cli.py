@@ -9,6 +9,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,7 @@ from swarm.config.scenario import Scenario, TlsConfig
 from swarm.errors import BusError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import cell_of
-from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import CostReply, RouteReply
+from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
@@ -37,11 +37,6 @@ def test_the_version_is_the_packages(swarm: Swarm) -> None:
 
 def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
     program = "import launch_scripts.cli, sys; sys.exit('zenoh' in sys.modules or 'numpy' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
-def test_the_launcher_never_imports_numba_or_rerun() -> None:
-    program = "import launch_scripts.launcher.up, sys; sys.exit('numba' in sys.modules or 'rerun' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
@@ -82,11 +77,6 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
         ports.check_ports(scenario, ("router", "agent"))
 
 
-def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> None:
-    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000"
-    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000", "a run keeps its folder"
-
-
 def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(swarm: Swarm, tmp_path: Path) -> None:
     code, out, _ = swarm(
         "simulate", "synthetic", "--seconds", "2", "--seed", "9", "--runs", str(tmp_path), "--json"
@@ -111,10 +101,12 @@ FRAME = MapFrame(GRID)
 START = GRID.cell(10, 10)
 
 
-def answer(status: RouteStatus = RouteStatus.OK, target: int | None = START - 80 * 2 + 3) -> Answer:
+WAY: dict[str, Any] = {"directions": bytes([1, 1, 2]), "cost_s": 30.0, "lower_bound_s": 29.0, "length_m": 76.57}
+
+
+def answer(status: RouteStatus = RouteStatus.OK, target: int | None = START - 80 * 2 + 3, **way: Any) -> Answer:
     """A route of two steps to the north-east and one to the east, or none."""
-    found = {"directions": bytes([1, 1, 2]), "cost_s": 30.0, "lower_bound_s": 29.0, "length_m": 76.57}
-    route = Route(status=status, start=START, **(found if status is RouteStatus.OK else {}))
+    route = Route(status=status, start=START, **(WAY if status is RouteStatus.OK else way))
     reply = RouteReply(
         target="t3", incarnation=1, target_cell=target, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
         routes=RouteBatch.of([route]).columns(),
@@ -132,12 +124,6 @@ def test_an_answer_names_its_places_so_that_they_can_be_given_again(capsys: pyte
         assert cell_of(line.partition("latlon:")[2].partition(")")[0], FRAME, "--from") == cell
     show(answer(RouteStatus.LETHAL_START))
     assert "the cell is lethal" in capsys.readouterr().out
-    cost = CostReply(
-        target="t3", incarnation=1, target_cell=START, map_version=0, tree_age_ms=1.0,
-        cost_to_go_s=pack_column([12.5], "<f4"),
-    )  # fmt: skip
-    show(Answer(cost, FRAME, START, 1.0))
-    assert "to t3 at cell:10,10 (" in capsys.readouterr().out
 
 
 def test_programs_get_the_way_in_metres_and_degrees(tmp_path: Path) -> None:
@@ -161,36 +147,17 @@ def test_programs_get_the_way_in_metres_and_degrees(tmp_path: Path) -> None:
 def test_of_a_search_the_place_to_look_at_is_told_and_where_the_target_was_last(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    whole, cut = (
-        Route(
-            status=RouteStatus.SEARCHING,
-            start=START,
-            directions=bytes([1, 1, 2]),
-            cost_s=30.0,
-            length_m=76.57,
-            remaining_s=rest_s,
-        )
-        for rest_s in (0.0, 12.0)
-    )
-    seen = GRID.cell(50, 70)
-
-    def told(route: Route) -> Answer:
-        reply = RouteReply(
-            target="t3", incarnation=1, target_cell=seen, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
-            routes=RouteBatch.of([route]).columns(),
-        )  # fmt: skip
-        return Answer(reply, FRAME, START, 2.0)
-
-    fields = json.loads(as_json(told(whole)))
+    seen = answer(RouteStatus.SEARCHING, GRID.cell(50, 70), **{**WAY, "lower_bound_s": 0.0})
+    fields = json.loads(as_json(seen))
     assert fields["searching"] is True
     assert (fields["to"]["row"], fields["to"]["col"]) == (8, 13)
     assert (fields["last_seen"]["row"], fields["last_seen"]["col"]) == (50, 70)
-    assert json.loads(as_json(told(cut)))["to"] is None, "the end of a part is not the place"
+    nowhere = answer(RouteStatus.SEARCHING, GRID.cell(50, 70))
+    assert json.loads(as_json(nowhere))["to"] is None
     known = json.loads(as_json(answer()))
     assert (known["searching"], "last_seen" in known) == (False, False)
-    for route, place in ((whole, "cell:8,13"), (cut, "where this leads")):
-        show(told(route))
-        assert f"t3 is unseen; {place}" in capsys.readouterr().out
+    show(seen)
+    assert "t3 is unseen; cell:8,13" in capsys.readouterr().out
 
 
 def test_the_frame_is_that_of_most_processes() -> None:

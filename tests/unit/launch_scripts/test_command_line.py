@@ -18,7 +18,6 @@ from typer._completion_classes import BashComplete  # what a shell asks: there i
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
-from launch_scripts.command_line.old_names import COMMANDS, OPTIONS, current
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
 from swarm.config.setting_types import Walk
@@ -38,16 +37,12 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tu
         yield from commands(group.get_command(None, name), (*path, name))
 
 
-def shown(each: Any) -> list[Any]:
-    return [param for param in each.params if not getattr(param, "hidden", False)]
-
-
 EVERY = list(commands())
 
 
 def test_every_command_completes_its_options_and_its_sub_commands() -> None:
     for path, each in EVERY:
-        declared = {name for param in shown(each) for name in param.opts if name.startswith("--")}
+        declared = {name for param in each.params for name in param.opts if name.startswith("--")}
         assert declared | {"--help"} <= {*offered(*path, "--"), "--help"}, path
         assert declared <= set(offered(*path, "--")), path
         if hasattr(each, "list_commands"):
@@ -86,29 +81,9 @@ def test_the_short_help_fits_a_terminal(
     assert len(names) == 12
 
 
-def test_an_old_name_is_told_once_and_stands_for_a_command_that_there_is(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tree = {" ".join(path): each for path, each in EVERY}
-    for old, new in COMMANDS.items():
-        assert old not in tree
-        assert new in tree
-        assert current([*old.split(), "--id", "x"])[0] == [*new.split(), "--id", "x"]
-    for name, renamed in OPTIONS.items():
-        known = {option for param in tree[name].params for option in param.opts}
-        for old, new in renamed.items():
-            assert (new if new.startswith("--") else old).partition("=")[0] in known
-    assert current(["zone", "add", "--until=9s"])[0] == ["order", "zone", "add", "--for=9s"]
-    monkeypatch.setattr(sys, "argv", ["swarm", "export", "--mcap", "--runs", "/nowhere"])
-    assert main() == 2
-    named, option, _ = capsys.readouterr().err.splitlines()
-    assert named == "swarm: `swarm export` is now `swarm runs export`; the old name goes in 0.3"
-    assert option == "swarm: `--mcap` is now `--format mcap`; the old name goes in 0.3"
-
-
 def test_every_option_has_one_name_and_says_what_it_is() -> None:
     for path, each in EVERY:
-        for param in shown(each):
+        for param in each.params:
             assert param.help, (path, param.name)
             names = [name for name in param.opts if len(name) > 2 or name[0] != "-"]  # a letter may be beside it
             assert len(names) <= 1, (path, param.opts)

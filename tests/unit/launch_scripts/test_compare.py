@@ -49,10 +49,14 @@ def test_figures_stand_beside_each_other_also_of_a_run_that_has_fewer() -> None:
     assert "messages/s" not in rows
 
 
-def test_versions_that_differ_are_named() -> None:
+def test_what_makes_figures_incomparable_is_named() -> None:
     made = [{"versions": {"numpy": version}, "began": version, "machine": {"cores": 2}} for version in ("1", "2")]
-    runs = [left("a", {}, made=made[0]), left("b", {}, made=made[1])]
-    assert circumstances_that_differ(runs) == [("versions.numpy", ["1", "2"])]
+    live = left("a", {}, made=made[0], terrain={"digest": "ab"})
+    simulated = left("b", {}, made=made[1], terrain={"digest": "cd"}, simulated=True)
+    assert circumstances_that_differ([live, simulated]) == [
+        ("versions.numpy", ["1", "2"]), ("terrain", ["ab", "cd"]), ("simulated", [False, True])
+    ]  # fmt: skip
+    assert circumstances_that_differ([live, live]) == []
 
 
 @pytest.fixture
@@ -72,9 +76,10 @@ def test_the_command_shows_settings_and_figures(runs: Path, swarm: Swarm) -> Non
     assert ["seed", "1", "2"] in told
     assert ["certified", "gap,", "mean", "5.00%", "5.00%"] in told
     assert ["captures", "1", "2"] in told
-    found = json.loads(swarm("runs compare r1 r2 --json --runs", runs)[1])
-    assert found["scenario"] == {"seed": [1, 2]}
-    assert found["figures"]["certified gap, mean"] == [1.05, 1.05]
+    (runs / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
+    assert "\x1b" not in swarm("runs compare r1 r2 --runs", runs)[1]
+    found = json.loads(swarm("runs compare r1 r1 --json --runs", runs)[1])
+    assert (found["scenario"], found["figures"]["certified gap, mean"]) == ({}, [1.05, 1.05])
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,8 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     router = x509.load_pem_x509_certificate((certs / "router.0.pem").read_bytes())
     hosts = router.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
+    assert not router.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert 364 <= (router.not_valid_after_utc - datetime.datetime.now(datetime.UTC)).days <= 365
     files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
     assert files is not None
     scenario.write_text(

@@ -12,7 +12,10 @@ import tarfile
 from pathlib import Path
 
 import pytest
+import yaml
+from typer.testing import CliRunner
 
+from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
 from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
@@ -20,9 +23,9 @@ from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, make_plan
 from launch_scripts.deploy.revocations import revoke
 from launch_scripts.deploy.service_files import UNIT, systemd_files
-from launch_scripts.launcher.options import chosen_processes
+from launch_scripts.launcher.options import as_process, chosen_processes
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.errors import StoreError
+from swarm.errors import ConfigError, StoreError
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'
 ON_GROUND = (
@@ -52,6 +55,23 @@ def unpacked(plan: Plan, out: Path) -> list[Path]:
         with tarfile.open(archive) as file:
             file.extractall(out / "unpacked", filter="data")
     return [out / "unpacked" / f"swarm-{host.name}" for host in plan.hosts]
+
+
+def lay_ground(folder: Path) -> tuple[str, ...]:
+    """Names of the files that belong to `ON_GROUND`, which are made beside another one."""
+    (folder / "parks").mkdir()
+    own = ("hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.dbf", "parks/hill.prj")
+    for name in (*own, "hill.toml"):
+        (folder / name).write_text(name)
+    return own
+
+
+def test_an_address_of_version_6_is_written_in_brackets_and_standbys_need_machines() -> None:
+    first, other, *_ = planned(machines=hosts("fd00::1", "10.0.0.1", "10.0.0.2")).hosts
+    assert "tls/[fd00::1]:7447" in other.connect
+    assert first.listen == ("tls/[::]:7447",)
+    with pytest.raises(ConfigError, match="'planner' is among the roles of 3 machines, expected at least 4"):
+        planned(f"{SCENARIO}[standbys]\nplanner = 3\n")
 
 
 def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: Path) -> None:
@@ -180,10 +200,7 @@ def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_it
 def test_files_of_the_terrain_go_to_keepers_and_the_targets_process_with_all_that_belongs_to_them(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "parks").mkdir()
-    own = ("hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.dbf", "parks/hill.prj")
-    for name in (*own, "hill.toml"):
-        (tmp_path / name).write_text(name)
+    own = lay_ground(tmp_path)
     plan = planned(ON_GROUND, base=tmp_path)
     folders = unpacked(plan, tmp_path / "kits")
     having = [host.has_files for host in plan.hosts]
@@ -273,3 +290,38 @@ def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path)
         StoreError, match=r"plan\.json is no plan of `swarm deploy plan`: .*; write to another folder"
     ):
         keepers_before(tmp_path, plan.run_id)
+
+
+def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(tmp_path: Path) -> None:
+    lay_ground(tmp_path)
+    (tmp_path / "small.toml").write_text(ON_GROUND)
+    machines = (f'[[hosts]]\nname = "{name}"\naddress = "10.0.0.{n}"\n' for n, name in enumerate(("base", "north")))
+    (tmp_path / "hosts.toml").write_text("".join(machines))
+    (tmp_path / "swarm.whl").write_bytes(b"")
+    line = f"plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
+    done = CliRunner().invoke(app, [*line.split(), "--wheel", f"{tmp_path}/swarm.whl"])
+    assert "--wheel: found" in str(done.exception), "containers have an image"
+    done = CliRunner().invoke(app, line.split())
+    assert done.exit_code == 0, done.output
+    for host in ("base", "north"):
+        with tarfile.open(tmp_path / "kits" / f"{host}.tar.gz") as archive:
+            archive.extractall(tmp_path, filter="data")
+        kit = tmp_path / f"swarm-{host}"
+        compose = yaml.safe_load((kit / "compose.yaml").read_text())
+        for service in compose["services"].values():
+            for volume in service["volumes"]:
+                assert volume["type"] != "bind" or (kit / volume["source"]).exists()
+        assert all((kit / secret["file"]).is_file() for secret in compose["secrets"].values())
+        assert not (kit / "certs" / "operator.0.key").exists()
+        scenario = load_scenario(kit / "scenario.toml")
+        for name, service in compose["services"].items():
+            role, _, id = name.replace("--", ".").partition("-")
+            tls = as_process(scenario, role, id).network.tls
+            assert tls is not None
+            given = {secret["source"] for secret in service["secrets"]}
+            assert {Path(tls.certificate).name, Path(tls.key).name, "ca.pem"} == given
+            check_signed(Path(tls.ca), Path(tls.certificate), Path(tls.key))
+            if role == "router":
+                assert hosts_of(Path(tls.certificate)) >= {f"router-{host}"}
+        assert stat.S_IMODE((kit / "install").stat().st_mode) == 0o755
+        assert subprocess.run(["sh", "-n", kit / "install"], timeout=20).returncode == 0

@@ -152,10 +152,9 @@ def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
                 idle.sendall(b"GET / HT")
         time.sleep(0.5)
         assert threading.active_count() - before <= MOST_CONNECTIONS
-        deadline_s = time.monotonic() + 15
-        while threading.active_count() > before and time.monotonic() < deadline_s:
-            time.sleep(0.1)
-        assert threading.active_count() <= before, "they are still open at our end, and cut at theirs"
+        eventually(
+            lambda: threading.active_count() <= before, 15, "open at our end, and cut at theirs, their threads"
+        )
     monkeypatch.undo()
     assert ask(port, "GET", "/", {"Host": "evil.example"})[0] == 403
 
@@ -171,10 +170,7 @@ def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytes
         for _ in range(60):
             sinks.rec.log("noise", rr.Image(np.random.default_rng(1).integers(0, 255, (400, 400, 3), np.uint8)))
         sinks.rec.flush(timeout_sec=10)
-        deadline_s = time.monotonic() + 20
-        while threading.active_count() > before and time.monotonic() < deadline_s:
-            time.sleep(0.1)
-        assert threading.active_count() <= before
+        eventually(lambda: threading.active_count() <= before, 20, "the end of its thread")
 
 
 def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -> None:

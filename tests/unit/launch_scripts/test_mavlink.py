@@ -63,7 +63,7 @@ def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> 
     assert not of(world, Follow)
 
 
-def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_back() -> None:
+def test_one_that_drives_stays_an_obstacle_when_its_link_is_lost_and_gets_its_target_back() -> None:
     world = driving(MISSION)
     world.speaks = False
     said = world.run(8.0)
@@ -254,17 +254,6 @@ def mode_of(command: codec.Command) -> int:
     if command.command == codec.DO_SET_MODE and len(command.params) == 3:
         return int(command.params[1]) << 16 | int(command.params[2]) << 24
     return int(command.params[-1]) if command.params else 0
-
-
-def test_a_pilot_who_takes_over_keeps_the_vehicle() -> None:
-    vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=10.0)
-    assert (vehicle.armed, vehicle.mode) == (True, AUTO_MISSION)
-    vehicle.mode, vehicle.commands = 1 << 16, []
-    world.run(30.0)
-    assert vehicle.mode == 1 << 16
-    assert not vehicle.commands
-    assert "the vehicle's mode and motors are left alone from now on" in world.told()[-1]
 
 
 def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:

@@ -12,31 +12,25 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from prometheus_client.metrics_core import Metric
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
-from support.makers import planner_status, run_info, stats
-from support.swarm_model import PerfectLinks
+from support.makers import planner_status, stats
 
 from launch_scripts import web
-from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.summed_counts import Counts
-from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
-from swarm.bus.memory_bus import MemoryNetwork
-from swarm.bus.scheduler import Scheduler
-from swarm.clock import NS_PER_S, ManualClock
-from swarm.errors import BusError
-from swarm.liveness import Peer
+from launch_scripts.web.prometheus import HELP, MetricsEndpoint, Run, families, named
+from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Stats
-from swarm.wire.topics import RUN, STATS, STATUS
 
 _BEGAN_NS = 1_790_000_000 * NS_PER_S
 
 
-def _stats(role: str, id: str, counters: Counters, life: int = _BEGAN_NS) -> Stats:
-    return stats(role, id, counters, incarnation=life, stamp_ns=life + NS_PER_S)
+def _stats(role: str, id: str, counters: Counters, generation: int = _BEGAN_NS) -> Stats:
+    return stats(role, id, counters, incarnation=generation, stamp_ns=generation + NS_PER_S)
 
 
 def _status(target: str) -> PlannerStatus:
@@ -58,17 +52,17 @@ def _agent() -> Counters:
 
 
 @pytest.fixture
-def figures() -> Figures:
+def figures() -> list[Metric]:
     counts, targets = Counts(), Counters()
     targets.count("captures", 2)
     targets.count_by(CAPTURES_OF, "t0")
     counts.count(_stats("agent", "a0", _agent()))
     counts.count(_stats("targets", "0", targets))
-    return Figures(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
+    return families(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
 
 
 def _scraped(
-    endpoint: MetricsEndpoint, figures: Figures, path: str = "/metrics", **headers: str
+    endpoint: MetricsEndpoint, figures: list[Metric], path: str = "/metrics", **headers: str
 ) -> tuple[int, str]:
     """Status and text of a scrape, answered by this thread as its owner would."""
     found: list[tuple[int, str]] = []
@@ -84,7 +78,7 @@ def _scraped(
     visitor = threading.Thread(target=scrape)
     visitor.start()
     while visitor.is_alive():
-        endpoint.answer(lambda: families(figures))
+        endpoint.answer(lambda: figures)
         visitor.join(0.01)
     return found[0]
 
@@ -104,7 +98,7 @@ def _samples(text: str) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: Figures) -> None:
+def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
     status, text = _scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0")
     found = _samples(text)
     assert status == 200
@@ -126,21 +120,9 @@ def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: F
     assert under["le=+Inf"] == 4
 
 
-def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: Figures) -> None:
+def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
     _, text = _scraped(endpoint, figures)
     assert {family.name for family in plain_families(text)} >= {"swarm_captures", "swarm_route_query_seconds"}
-
-
-def test_other_paths_and_other_sites_get_nothing(endpoint: MetricsEndpoint, figures: Figures) -> None:
-    assert _scraped(endpoint, figures, "/")[0] == 404
-    status, text = _scraped(endpoint, figures, Host="example.org")
-    assert (status, "swarm_" in text) == (403, False)
-
-
-def test_a_taken_port_is_named(endpoint: MetricsEndpoint) -> None:
-    port = int(endpoint.url.rpartition(":")[2].partition("/")[0])
-    with pytest.raises(BusError, match=f"metrics port {port} cannot be opened"):
-        MetricsEndpoint(port, list)
 
 
 _names = st.one_of(
@@ -167,7 +149,7 @@ def test_no_name_from_the_network_breaks_a_scrape(
         Stats(role="agent", id="a0", incarnation=1, stamp_ns=1, counts=counts, gauges=gauges, histograms=histograms)
     )
     run = Run('a"\n\\b', "demo", _BEGAN_NS)
-    text = generate_latest(OneScrape(families(Figures(run, heard, {}, [("agent", "a0")])))).decode()
+    text = generate_latest(OneScrape(families(run, heard, {}, [("agent", "a0")]))).decode()
     found = _samples(text)
     assert found["swarm_process_up", "id=a0", "role=agent"] == 1
     assert found["swarm_run_info", 'run_id=a"\n\\b', "scenario=demo"] == 1
@@ -190,37 +172,3 @@ def test_the_dashboard_asks_for_what_is_exported() -> None:
     }
     assert len(asked) >= 10
     assert asked <= exported().keys()
-
-
-def test_whoever_follows_goes_on_to_the_next_run() -> None:
-    scheduler = Scheduler(ManualClock(_BEGAN_NS))
-    network = MemoryNetwork(scheduler, PerfectLinks())
-    bus = network.bus("agent-a0")
-    run_id = "r1"
-
-    def answer(event: object) -> None:
-        info = run_info(run_id=run_id, scenario="demo", started_ns=_BEGAN_NS)
-        event.answer(info, role="agent", id="a0")  # type: ignore[attr-defined]
-
-    bus.serve(RUN, answer, role="agent", id="a0")
-    observer = OutsideObserver(network.bus("metrics"), topics={STATS: 0.0, STATUS: 0.0}, follows=True)
-    bus.declare_alive(Peer("agent", "a0", 1))
-
-    def turn(seconds: float) -> None:
-        for _ in range(int(seconds * 10)):
-            observer.listen(scheduler.clock, 0.0)
-            scheduler.run_until(scheduler.clock.now_ns() + NS_PER_S // 10)
-
-    bus.publish(STATS, _stats("agent", "a0", _agent(), 1), role="agent", id="a0")
-    bus.publish(STATUS, _status("t0"), target="t0")
-    turn(8)
-    figures = figures_of(observer.run, observer.latest)
-    assert figures.run == Run("r1", "demo", _BEGAN_NS)
-    assert list(figures.up) == [("agent", "a0")]
-    assert figures.counts.total("messages_out") == 40
-    run_id = "r2"
-    turn(8)
-    figures = figures_of(observer.run, observer.latest)
-    assert figures.run == Run("r2", "demo", _BEGAN_NS)
-    assert list(figures.up) == [("agent", "a0")]
-    assert figures.counts.total("messages_out") is None, "another run's counts are no part of this one"

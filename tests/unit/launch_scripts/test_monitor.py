@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
@@ -11,11 +10,11 @@ import time
 import urllib.error
 import urllib.request
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import psutil
 import pytest
 from support.fake_run import fake_run
 from support.monitor_rig import (
@@ -27,6 +26,7 @@ from support.monitor_rig import (
     little_scenario,
     little_terrain,
 )
+from support.processes import eventually
 from support.target_reports import fleet
 
 from launch_scripts import parent_death
@@ -37,13 +37,13 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
-from swarm.errors import BusError, StoreError
+from swarm.errors import BusError
 from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Body, Followed
+from swarm.wire.messages.vehicles import Followed, Obstacle
 from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
 
@@ -133,8 +133,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
         assert set(parts) == {"positions", "colors", sentence}
         assert len(parts[sentence][-1]) == len(parts["positions"][-1])
     assert any(
-        ": on its way, route " in line
-        for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
     )
 
 
@@ -191,16 +190,16 @@ SEEN = Sighted(
     author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
     cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
 )  # fmt: skip
-BODY = Body(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, lease_s=0.7)
+OBSTACLE = Obstacle(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, lease_s=0.7)
 BELIEVED = Believed(
     target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
 )
 SENT = GoalState(name="a0-00", stamp_ns=1, done=0, state="underway", cell=9)
 DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]]] = {
     "a sighting ends": ([(NS_PER_S // 2, SEEN)], "targets/sighted", "strips", [0, 1, 0]),
-    "a body moves, and its lease ends": (
-        [(NS_PER_S // 2, BODY), (NS_PER_S, msgspec.structs.replace(BODY, seq=2, x_m=130.0))],
-        "bodies", "centers", [0, 1, 1, 0],
+    "an obstacle moves, and its lease ends": (
+        [(NS_PER_S // 2, OBSTACLE), (NS_PER_S, msgspec.structs.replace(OBSTACLE, seq=2, x_m=130.0))],
+        "obstacles", "centers", [0, 1, 1, 0],
     ),
     "a belief ends, and its planner is silent after another": (
         [
@@ -235,11 +234,6 @@ def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(
 
 def test_no_recording_replaces_another(tmp_path: Path) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
-
-
-def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"cannot write .*run\.rrd: No such file or directory"):
-        new_recording_path(tmp_path / "nowhere")
 
 
 def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
@@ -297,36 +291,13 @@ def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Ter
 # --- sinks: sockets and files ---------------------------------------------------------------------------------
 
 
-def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
-    deadline_s = time.monotonic() + within_s
-    while time.monotonic() < deadline_s:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return condition()
-
-
-def listeners(pid: int) -> set[str]:
-    """Local addresses, in the kernel's hex, on which a process listens."""
-    inodes = set()
-    for fd in Path(f"/proc/{pid}/fd").iterdir():
-        try:
-            target = os.readlink(fd)
-        except OSError:
-            continue
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
-    addresses = set()
-    for table in ("tcp", "tcp6"):
-        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if fields[3] == "0A" and fields[9] in inodes:
-                addresses.add(fields[1].rpartition(":")[0])
-    return addresses
+def listeners() -> set[str]:
+    """Addresses on which this process listens."""
+    open_now = psutil.Process().net_connections("tcp")
+    return {each.laddr.ip for each in open_now if each.status == psutil.CONN_LISTEN}
 
 
 @pytest.mark.network
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_home(
     terrain: Terrain, tmp_path: Path
 ) -> None:
@@ -336,7 +307,7 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     try:
         with urllib.request.urlopen(url, timeout=30) as reply:
             assert b"run_banner.js" in reply.read(), "the start page, at once"
-        assert eventually(lambda: b'"view": true' in urllib.request.urlopen(f"{url}/run.json").read())
+        eventually(lambda: b'"view": true' in urllib.request.urlopen(f"{url}/run.json").read(), 10)
         with urllib.request.urlopen(url, timeout=30) as reply:
             assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
             assert b"re_viewer.js" in reply.read()
@@ -347,8 +318,8 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
             assert reply.read(4) == b"\0asm"
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(f"{url}/etc/passwd", timeout=30)
-        assert eventually(lambda: len(listeners(os.getpid())) > 1)
-        assert all(address.endswith("7F") for address in listeners(os.getpid())), "127.x.x.x, all of it loopback"
+        eventually(lambda: len(listeners()) > 1, 10)
+        assert all(address.startswith("127.") for address in listeners())
     finally:
         began_s = time.monotonic()
         sinks.close()
@@ -373,24 +344,21 @@ path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
 mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
 sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
 watch = RecordingWatch(path, sinks.begin_file)
-for second in range(80):
-    if second == 68:
+for second in range(20):
+    if second == 8:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     for stream in sinks.streams:
         stream.set_time("tick", sequence=second)
         stream.log("a", rr.Scalars(second))
-    sentence, begun = watch.check(second * 10**9)
-    if sentence:
-        print(second, begun, sentence, flush=True)
+    if begun := watch.check(second * 10**9):
+        print(second, begun, flush=True)
 sinks.close()
 """
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
     ).stdout.splitlines()
-    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
-    begun = f"True the recording goes on in {tmp_path / 'run-2.rrd'}"
-    assert told == [f"5 False {ended}", f"65 False {ended}", f"76 {begun}"]
-    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 3
+    assert told == [f"15 {tmp_path / 'run-2.rrd'}"], "tried at 5 s, when it has not grown for long, and 10 s later"
+    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 4
 
 
 def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
@@ -398,8 +366,8 @@ def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
 ) -> None:
     rig = Rig(scenario, terrain, tmp_path / "run.rrd")
     watch = RecordingWatch(tmp_path / "run.rrd", rig.sinks.begin_file)
-    told = iter([(None, False), ("it goes on", True)])
-    watch.check = lambda now_ns: next(told, (None, False))  # type: ignore[method-assign]
+    told = iter([None, tmp_path / "run-2.rrd"])
+    watch.check = lambda now_ns: next(told, None)  # type: ignore[method-assign]
     rig.service._recording = watch
     rig.run(0.15)
     rig.sinks.begin_file(tmp_path / "run-2.rrd")
@@ -421,9 +389,9 @@ time.sleep(60)
     with subprocess.Popen([sys.executable, "-c", parent_script], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         child = Path(f"/proc/{int(parent.stdout.readline())}")
-        assert eventually(lambda: b"sleep" in (child / "cmdline").read_bytes())
+        eventually(lambda: b"sleep" in (child / "cmdline").read_bytes(), 10)
         parent.send_signal(signal.SIGKILL)
-    assert eventually(lambda: not child.exists() or "\nState:\tZ" in (child / "status").read_text())
+    eventually(lambda: not child.exists() or "\nState:\tZ" in (child / "status").read_text(), 10)
 
 
 @pytest.mark.network

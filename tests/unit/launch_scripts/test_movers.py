@@ -128,7 +128,7 @@ def test_the_legend_explains_every_state_and_kind_once(groups: list[str]) -> Non
     meanings = [look.meaning for look in legend]
     assert len(meanings) == len(set(meanings)) <= 15
     said = " ".join(meanings)
-    words = ("arrived", "waits", "stranded", "lost", "target", "seen", "body", "route", "alarm")
+    words = ("arrived", "waiting", "stranded", "lost", "target", "seen", "obstacle", "route", "alarm")
     assert not [word for word in words if word not in said]
 
 
@@ -141,10 +141,10 @@ def test_who_points_at_a_vehicle_reads_who_it_is_and_what_it_does() -> None:
     begun = route(1, 2, gap=1.0125, begun_ns=3 * NS_PER_S)
     groups = dict.fromkeys(vehicles.ids[:3], "all")
     assert vehicle_details(vehicles, groups, {"a0-00": begun, "a0-03": begun}, 5 * NS_PER_S) == [
-        "a0-00 to t0: on its way, route 2 s old, certified gap 1.25%; all",
+        "a0-00 to t0: following, route 2 s old, certified gap 1.25%; all",
         "a0-01 to t1: arrived; all",
         "a0-02: stranded; all",
-        "a0-03 to t1: waits for a route; ?",
+        "a0-03 to t1: waiting; ?",
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 import re
 import tracemalloc
 
@@ -16,8 +17,8 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import BegunRoute, Tracks
+from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -30,7 +31,7 @@ from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
-from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
+from swarm.wire.messages.processes import Alarm, Heartbeat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
@@ -130,7 +131,7 @@ def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_n
     assert report["restarts"] == 3
 
 
-def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
+def test_a_generation_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
     """A recorder of all incarnations has the same sums as a recorder of the last only."""
     first = stats("agent", "a0", 1, 2.0, {"marks": 7})
     second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
@@ -139,8 +140,31 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     hear(recorder, first, second)
     hear(late, second)
     assert recorder.report()["marks"] == late.report()["marks"] == 9
-    hear(recorder, other)  # one that was started by hand knows of no other life
+    hear(recorder, other)  # one that was started by hand knows of no other generation
     assert recorder.report()["marks"] == 109
+
+
+def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_count_is_lost() -> None:
+    """The size of all that a view keeps of a run whose agent is killed every second, in whatever order it hears."""
+    latest = LatestState(plan_of(scenario(), 0), GRID)
+
+    def live(from_s: int, until_s: int) -> int:
+        generations = [
+            msgspec.structs.replace(stats("agent", "a0", 2 + n, n, {"marks": n}, x=[n + 1.0]), since=2)
+            for n in range(from_s, until_s)
+        ]
+        for n, generation in zip(range(from_s, until_s), generations, strict=True):
+            late = random.Random(n).choice(generations[: n - from_s + 1])
+            for message in (generation, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+                latest.heard(message, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
+            latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
+        assert latest.total("marks") == until_s - 1
+        kept = {name: each for name, each in vars(latest).items() if name != "book"}
+        return len(pickle.dumps(kept))
+
+    minute = live(1, 60)
+    assert live(60, 3600) < 1.1 * minute
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
@@ -235,8 +259,8 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     def titles() -> list[str]:
         return [line.title for line in recorder.summary(0).targets]
 
-    def beat(id: str, leads: bool) -> Beat:
-        return Beat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
+    def heartbeat(id: str, leads: bool) -> Heartbeat:
+        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
     begun = Recorder(standing_by, GRID, 1)
@@ -244,12 +268,12 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     assert begun.summary(31 * NS_PER_S).targets[0].title == "t0 (planner down)"
     for id in ("t0", "t0.r1", "t1"):
         recorder.alive(Peer("planner", id, 1), True, 0)
-    hear(recorder, beat("t0", True), beat("t0.r1", False), beat("t1", True))
+    hear(recorder, heartbeat("t0", True), heartbeat("t0.r1", False), heartbeat("t1", True))
     assert titles() == ["t0", "t1"]
     recorder.alive(Peer("planner", "t0", 1), False, 0)
-    hear(recorder, beat("t0.r1", True))
+    hear(recorder, heartbeat("t0.r1", True))
     assert titles() == ["t0 (standby 1)", "t1"]
-    hear(recorder, beat("t0.r1", False), beat("t0", True))
+    hear(recorder, heartbeat("t0.r1", False), heartbeat("t0", True))
     assert titles() == ["t0", "t1"]
 
 
@@ -418,26 +442,3 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
     hear(recorder, ended, at_s=later_s + 1)
     assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
-
-
-def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(
-    recorder: Recorder,
-) -> None:
-    made: list[int] = []
-    summary = recorder.summary
-
-    def counted(now_ns: int) -> RunState:
-        made.append(now_ns)
-        return summary(now_ns)
-
-    recorder.summary = counted  # type: ignore[method-assign]
-    for tick in range(100):
-        now_ns = tick * NS_PER_S // 10
-        recorder.heard(status("t0", None), now_ns)
-        shown = [recorder.shown(now_ns) for _ in range(3)]
-        assert shown[0] is shown[1] is shown[2]
-        assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0
-    assert len(made) == 10
-    for second in range(12, 20, 2):  # the swarm has fallen silent
-        assert recorder.shown(second * NS_PER_S).elapsed_s == second
-    assert len(made) == 14

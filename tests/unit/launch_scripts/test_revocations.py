@@ -54,5 +54,5 @@ def test_what_cannot_be_read_or_written_is_an_error_that_names_it_and_a_wrong_na
     with pytest.raises(StoreError, match="cannot write"):
         revoke(tmp_path / "nowhere", ["keeper.0"])
     (tmp_path / "folder" / FILE).mkdir(parents=True)
-    with pytest.raises(StoreError, match="cannot read"):
+    with pytest.raises(ConfigError, match="cannot read"):
         revoked_in(tmp_path / "folder")

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from support.effort import few
 from support.ros_messages import path
 
-from launch_scripts.gateways.ros2.gateway import Channel, Declare, Gateway, Health, Put, Remove
+from launch_scripts.gateways.ros2.gateway import Channel, Gateway, Health, Put
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed
 from launch_scripts.gateways.ros2.map_messages import corners
@@ -35,7 +35,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
     packed_transforms,
     ros_name,
 )
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.client.own_marks import OwnMarks
@@ -73,12 +73,11 @@ def vehicle(
     return SeenVehicle(id, "all", x_m, y_m, heading_rad, "following", "t0")
 
 
-def gateway(text: str = "", fixes: bool = True) -> Gateway:
-    feed = MapFeed(GRID, None)
-    return Gateway(parse_settings(text), TYPES, RosMap(GRID), feed, (lambda x, y: (48.0, 9.0)) if fixes else None)
+def gateway(text: str = "", types: RosTypes = TYPES) -> Gateway:
+    return Gateway(parse_settings(text), types, RosMap(GRID), MapFeed(GRID, None), lambda x, y: (48.0, 9.0))
 
 
-def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = None) -> list[Any]:
+def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = None) -> list[Put]:
     since_ns = int(at_s * NS_PER_S)
     stamp_ns = BEGAN_NS + (since_ns if stamp_s is None else int(stamp_s * NS_PER_S))
     return gateway.tick(since_ns, stamp_ns, BEGAN_NS + since_ns, world, Health())
@@ -86,7 +85,7 @@ def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = No
 
 def puts(actions: list[Any], row: str) -> list[Any]:
     """Messages of a row, as a subscriber reads them."""
-    found = [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
+    found = [each.message for each in actions if each.channel.row == row]
     return [TYPES.unpack(each, ROWS[row].type_name) if isinstance(each, bytes) else each for each in found]
 
 
@@ -109,7 +108,6 @@ def test_messages_go_to_topics_that_are_declared_and_none_comes_more_often_than_
     moments: list[Any], bare: bool, text: str
 ) -> None:
     core = gateway(f"{text}\nframes.bare = {str(bare).lower()}")
-    declared: set[Channel] = set()
     times: dict[Channel, list[float]] = {}
     at_s = 0.0
     for step_s, vehicles, routes, targets in moments:
@@ -119,23 +117,12 @@ def test_messages_go_to_topics_that_are_declared_and_none_comes_more_often_than_
             {id: SeenTarget(id, *place, 0, None, lost) for id, (place, lost) in targets.items()},
             routes,
         )
-        for action in told(core, world, at_s):
-            match action:
-                case Declare(channels=channels):
-                    assert not declared & set(channels)
-                    assert len(set(channels)) == len(channels)
-                    declared |= set(channels)
-                case Remove(channels=channels):
-                    assert declared >= set(channels)
-                    declared -= set(channels)
-                case Put(channel=channel, message=message):
-                    assert channel in declared
-                    times.setdefault(channel, []).append(at_s)
-                    content = (
-                        message if isinstance(message, bytes) else TYPES.pack(message, ROWS[channel.row].type_name)
-                    )
-                    TYPES.unpack(content, ROWS[channel.row].type_name)
-        named = {channel.topic.split("/")[1] for channel in declared if channel.row == "odom"}
+        for put in told(core, world, at_s):
+            assert put.channel in core.channels
+            times.setdefault(put.channel, []).append(at_s)
+            name = ROWS[put.channel.row].type_name
+            TYPES.unpack(TYPES.pack(put.message, name), name)
+        named = {channel.topic.split("/")[1] for channel in core.channels if channel.row == "odom"}
         wanted = {ros_name(id) for id in vehicles if not text or id.startswith("a")}
         assert named == wanted or step_s <= 0.1, "looked at once in a period"
     for channel, at in times.items():
@@ -154,13 +141,25 @@ def test_a_clock_that_leaps_changes_stamps_and_nothing_else(moments: list[Any], 
         stamp_s = data.draw(st.floats(-1e8, 1e8))
         actions = told(steady, World(seen, routes=dict(routes)), at_s)
         others = told(leaping, World(seen, routes=dict(routes)), at_s, stamp_s)
-        assert [without_message(each) for each in actions] == [without_message(each) for each in others]
+        assert [each.channel for each in actions] == [each.channel for each in others]
         odometry = zip(puts(actions, "odom"), puts(others, "odom"), strict=True)
         assert all(one.twist.twist.linear.x == other.twist.twist.linear.x for one, other in odometry)
 
 
-def without_message(action: Any) -> Any:
-    return action.channel if isinstance(action, Put) else action
+@pytest.mark.parametrize("distribution", Distribution)
+def test_every_message_is_read_as_it_was_made_by_each_distribution(distribution: Distribution) -> None:
+    core, marks = gateway(types=types_of(distribution)), OwnMarks("all.a.1", "all", GRID)
+    target = SeenTarget("t0", 300_010.0, 5_199_610.0, 0, None, False)
+    route = {"a": [(300_000.0, 5_199_900.0), (300_100.0, 5_199_990.0)]}
+    actions = told(core, World({"a": vehicle("a")}, {"t0": target}, route), 0.0)
+    sets = marks.state([0], MarkKind.LETHAL, 0.0, BEGAN_NS) + marks.state([71], MarkKind.PACE, 0.2, BEGAN_NS)
+    actions += told(core, World({"a": vehicle("a")}, sets=sets), 1.0)
+    assert {each.channel.row for each in actions} == set(ROWS)
+    for each in actions:
+        name, types = ROWS[each.channel.row].type_name, types_of(distribution)
+        content = types.pack(each.message, name)
+        assert types.pack(types.unpack(content, name), name) == content
+        assert types.definition_of(name)
 
 
 def test_updates_of_the_map_keep_their_rate_and_lose_nothing() -> None:
@@ -183,11 +182,9 @@ def test_a_vehicle_that_leaves_takes_its_topics_along_and_frees_its_name() -> No
     both = World({"a-1": vehicle("a-1"), "a_1": vehicle("a_1")})
     told(core, both, 0.0)
     assert core.take_problems() == ["vehicle a_1 is not published to ROS: a-1 is called a_1, too"]
-    actions = told(core, World({"a_1": vehicle("a_1")}), 0.2)
-    (removed,) = [each.channels for each in actions if isinstance(each, Remove)]
-    (declared,) = [each.channels for each in actions if isinstance(each, Declare)]
-    assert removed == declared
-    assert {each.topic for each in declared} == {"/a_1/odom", "/a_1/pose", "/a_1/plan", "/a_1/fix"}
+    told(core, World({"a_1": vehicle("a_1")}), 0.2)
+    own = {each.topic for each in core.channels if each.topic.startswith("/a_1/")}
+    assert own == {"/a_1/odom", "/a_1/pose", "/a_1/plan", "/a_1/fix"}
     assert told(core, World({"a_1": vehicle("a_1")}), 0.4)
     assert core.take_problems() == []
 
@@ -225,9 +222,7 @@ def test_robots_of_ros_and_more_vehicles_than_there_may_be_are_not_told(monkeypa
     core = gateway()
     world = World({id: vehicle(id) for id in ("robot", "a", "b")})
     actions = core.tick(0, BEGAN_NS, BEGAN_NS, world, Health(), {"robot"})
-    assert [each.channel.topic for each in actions if isinstance(each, Put) and each.channel.row == "odom"] == [
-        "/a/odom"
-    ]
+    assert [each.channel.topic for each in actions if each.channel.row == "odom"] == ["/a/odom"]
     assert core.take_problems() == ["vehicle b is not published to ROS: there are 1 already"]
 
 
@@ -246,9 +241,7 @@ def test_a_plan_is_put_when_it_is_new_and_at_most_once_a_second() -> None:
 def test_targets_that_nobody_tracks_are_not_told() -> None:
     seen = {id: SeenTarget(id, 300_010.0, 5_199_610.0, 0, None, lost) for id, lost in (("t0", False), ("t1", True))}
     actions = told(gateway(), World(targets=seen), 0.0)
-    assert [
-        each.channel.topic for each in actions if isinstance(each, Put) and each.channel.row == "target_pose"
-    ] == ["/targets/t0/pose"]
+    assert [each.channel.topic for each in actions if each.channel.row == "target_pose"] == ["/targets/t0/pose"]
     (array,) = puts(actions, "targets")
     assert [(each.position.x, each.position.y) for each in array.poses] == [(10.0, 10.0)]
     (diagnostics,) = puts(actions, "diagnostics")
@@ -282,24 +275,13 @@ def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool)
             until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             world.sets += authors[author].state(cells, kind, pace, now_ns + n, until_ns)
         for action in told(core, world, at_s):
-            if isinstance(action, Put) and action.channel.row == "map":
+            if action.channel.row == "map":
                 heard = action.message.data.reshape(GRID.rows, GRID.cols).copy()
-            if isinstance(action, Put) and action.channel.row == "map_updates":
+            if action.channel.row == "map_updates":
                 m = action.message
                 heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
         assert heard is not None
         assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
-
-
-def test_without_the_terrain_the_map_holds_marks_alone() -> None:
-    marks = OwnMarks("all.a.1", "all", GRID)
-    world = World(
-        sets=marks.state([0], MarkKind.LETHAL, 0.0, BEGAN_NS) + marks.state([71], MarkKind.PACE, 0.2, BEGAN_NS)
-    )
-    (grid,) = puts(told(gateway(), world, 0.0), "map")
-    cells = grid.data.reshape(GRID.rows, GRID.cols)
-    assert (cells[-1, 0], cells[-2, 1]) == (100, 50), "row 0 is in the south"
-    assert Counter(cells.reshape(-1).tolist())[-1] == GRID.cells - 2
 
 
 def test_zones_and_marks_are_drawn_until_they_are_gone() -> None:

@@ -22,7 +22,6 @@ from support.ros_node import FakeNode
 from launch_scripts.gateways.ros2.gateway_settings import (
     Robots,
 )
-from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import (
     MOST_CELLS,
     FrameReader,
@@ -36,7 +35,7 @@ from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
-from swarm.errors import ConfigError, ProtocolError, SwarmError
+from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import MOST_M_PER_S
 
@@ -190,29 +189,6 @@ def test_a_queue_is_bounded_and_all_that_it_takes_is_answered() -> None:
     go.set()
     queue.give("late", refuse, failed.append)
     assert failed[2:] == ["the gateway ends"]
-
-
-# --- goals -----------------------------------------------------------------------------------------------------
-
-
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 4)), max_size=60), st.integers(1, 3))
-def test_a_goal_target_stands_where_all_who_use_it_go(steps: list[tuple[bool, int]], many: int) -> None:
-    stands: dict[str, int] = {}
-    frame = n(cell=lambda x_m, _: int(x_m))
-    swarm: Any = n(frame=frame, target=lambda id, tracker: n(at=lambda x_m, _: stands.update({id: int(x_m)})))
-    routes = PlaceRoutes(swarm, [f"g{each}" for each in range(many)])
-    lent: list[tuple[str, int]] = []
-    for take, cell in steps:
-        if take:
-            used = dict(lent)
-            try:
-                lent.append((routes.lend(Place(cell, 0.0)), cell))
-            except SwarmError:
-                assert cell not in used.values()
-                assert len(used) == many
-        elif lent:
-            routes.give_back(lent.pop(cell % len(lent))[0])
-        assert all(stands[id] == cell for id, cell in lent)
 
 
 # --- areas -----------------------------------------------------------------------------------------------------

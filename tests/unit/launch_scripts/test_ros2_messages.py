@@ -10,16 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from support.ros_messages import path
 
 from launch_scripts.gateways.ros2 import map_messages
 from launch_scripts.gateways.ros2.map_messages import Drawing, Form
 from launch_scripts.gateways.ros2.ros_messages import (
-    Level,
     RosMap,
     RosMessages,
-    Severity,
-    frames_of,
     heading_of,
     heading_of_quaternion,
     headings_along,
@@ -36,7 +32,6 @@ GRIDS = st.builds(
     st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 1.0, 10.0, 25.0]),
     st.floats(-1e6, 1e6), st.floats(-1e7, 1e7), st.just("EPSG:32632"),
 )  # fmt: skip
-FRAMES = frames_of("a1")
 GRID = GridSpec(4, 6, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 
 
@@ -136,28 +131,6 @@ def test_the_cell_under_a_point_of_ros_is_the_cell_under_ours(grid: GridSpec, da
     assert (sent.data.reshape(grid.rows, grid.cols)[::-1] == occupancy).all()
 
 
-@given(GRIDS, st.data())
-def test_an_update_changes_the_cells_of_its_window_and_no_others(grid: GridSpec, data: st.DataObject) -> None:
-    messages = maker(grid)
-    row0, col0 = data.draw(st.integers(0, grid.rows - 1)), data.draw(st.integers(0, grid.cols - 1))
-    window = Window(
-        row0, col0, data.draw(st.integers(row0 + 1, grid.rows)), data.draw(st.integers(col0 + 1, grid.cols))
-    )
-    whole = np.zeros((grid.rows, grid.cols), np.int8)
-    changed = whole.copy()
-    changed[window.row0 : window.row1, window.col0 : window.col1] = (
-        np.arange(window.cells).reshape(window.row1 - window.row0, -1) % 97 + 1
-    )
-    part = changed[window.row0 : window.row1, window.col0 : window.col1]
-    update = as_sent(messages, map_messages.occupancy_update(messages, STAMP_NS, part, window))
-    shown = np.array(map_messages.occupancy_grid(messages, STAMP_NS, whole).data).reshape(grid.rows, grid.cols)
-    # The rule of RViz for an update.
-    pasted = shown[update.y : update.y + update.height, update.x : update.x + update.width]
-    pasted[:] = update.data.reshape(update.height, update.width)
-    assert (shown.reshape(-1) == map_messages.occupancy_grid(messages, STAMP_NS, changed).data).all()
-    assert map_messages.flipped(map_messages.flipped(window, grid.rows), grid.rows) == window
-
-
 @given(GRIDS, st.integers(2, 7), st.data())
 def test_a_grid_of_blocks_lies_over_the_same_places(grid: GridSpec, side: int, data: st.DataObject) -> None:
     messages = maker(grid)
@@ -228,58 +201,6 @@ def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
 
 
 # --- every message, every distribution ----------------------------------------------------------------------------
-
-
-def every_message(messages: RosMessages) -> list[Any]:
-    x_m, y_m = 500_010.0, 5_199_990.0
-    places = np.array([[x_m, y_m], [x_m + 5, y_m - 5]])
-    return [
-        messages.pose_stamped(STAMP_NS, x_m, y_m, 1.0),
-        messages.pose_array(STAMP_NS, places, [0.5, None]),
-        messages.pose_array(STAMP_NS, places[:0]),
-        messages.odometry(STAMP_NS, FRAMES, (x_m, y_m, 0.0), 2.5, 0.25),
-        path(messages, STAMP_NS, places),
-        path(messages, STAMP_NS, []),
-        messages.transforms(
-            [messages.transform(STAMP_NS, ("map", FRAMES[0])), messages.transform(STAMP_NS, FRAMES, (10, 20), 0.0)]
-        ),
-        messages.fix(STAMP_NS, "a1-0/base_link", 46.9, 9.0),
-        messages.diagnostic("planner t1", Level.WARN, "slow", {"routes": 5, "gap": 1.25}),
-        messages.log(STAMP_NS, Severity.INFO, "targets", "t1 was captured"),
-        map_messages.occupancy_grid(messages, STAMP_NS, np.full((4, 6), -1, np.int8)),
-        map_messages.occupancy_update(messages, STAMP_NS, np.full((2, 3), 100, np.int8), Window(1, 1, 3, 4)),
-        map_messages.marker_array(
-            messages, STAMP_NS, [map_messages.route(GRID, LINE_M), *map_messages.marked_cells(GRID, [3], [4], [5])]
-        ),
-    ]
-
-
-@pytest.mark.parametrize("distribution", Distribution)
-def test_every_message_is_read_as_it_was_made(distribution: Distribution) -> None:
-    messages = maker(distribution=distribution)
-    for made in every_message(messages):
-        name = str(made.__msgtype__)
-        assert messages.types.pack(as_sent(messages, made), name) == messages.types.pack(made, name)
-        assert messages.types.definition_of(made.__msgtype__)
-
-
-def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
-    messages = maker()
-    x_m, y_m = messages.map.origin_m
-    odometry = messages.odometry(STAMP_NS, FRAMES, (x_m + 10, y_m + 20, math.pi / 2), 2.5, 0.25)
-    assert (odometry.header.frame_id, odometry.child_frame_id) == FRAMES == ("a1/odom", "a1/base_link")
-    place, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
-    assert (place.x, place.y, place.z) == (10, 20, 0)
-    assert (orientation.z, orientation.w) == pytest.approx((0, 1))
-    assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (2.5, -0.25)
-    assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
-    still = messages.types.make(
-        "tf2_msgs/msg/TFMessage", transforms=[messages.transform(STAMP_NS, FRAMES, (10, 20), 0.0)]
-    )
-    (base,) = still.transforms
-    assert (base.header.frame_id, base.child_frame_id) == FRAMES
-    assert (base.transform.translation.x, base.transform.translation.y) == (10, 20)
-    assert base.transform.rotation.z == pytest.approx(math.sqrt(0.5))
 
 
 def test_what_a_message_is_not_given_is_nothing_and_a_field_that_it_has_not_is_refused() -> None:

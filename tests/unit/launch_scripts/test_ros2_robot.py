@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,7 +14,6 @@ from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
-from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.robot import Robot
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
@@ -27,18 +25,18 @@ from swarm.clock import NS_PER_S
 TYPES = types_of(Distribution.JAZZY)
 
 
-class NoQueue(WorkQueue):
-    """Answers no question: a test checks the target that is followed."""
+class Questions:
+    """Questions for routes, which a test answers."""
 
     def __init__(self) -> None:
-        super().__init__("none", 1, 0)
+        self.asked: list[tuple[Place | str, Callable[[Any], None]]] = []
 
-    def give(self, what: str, work: Callable[[], None], failed: Callable[[str], None]) -> bool:
-        return True
+    def ask(self, goal: Place | str, start: Place, vehicle_class: str, answer: Callable[[Any], None]) -> None:
+        self.asked.append((goal, answer))
 
 
 class World:
-    """Two robots that share one goal target."""
+    """Two robots."""
 
     def __init__(self, taken: Collection[str] = (), **settings: Any) -> None:
         self.model = SwarmModel()
@@ -46,10 +44,18 @@ class World:
         self.node: Any = FakeNode(TYPES)
         map = RosMap(self.swarm.frame.grid)
         self.messages = RosMessages(TYPES, map)
-        self.routes = PlaceRoutes(self.swarm, ["goal0"], NoQueue())
+        self.routes: Any = Questions()
         robots = Robots(lease_s=10.0, **settings)
         self.robots = {
-            id: Robot(id, robots, self.node, self.swarm, self.routes, self.messages, taken.__contains__)
+            id: Robot(
+                id,
+                robots,
+                cast(Any, self.node),
+                self.swarm,
+                cast(Any, self.routes),
+                self.messages,
+                taken.__contains__,
+            )
             for id in ("one", "two")
         }
         self.now_ns = NS_PER_S
@@ -66,26 +72,33 @@ class World:
         self.now_ns += NS_PER_S // 4
         self.robots[id].tick(self.now_ns)
 
-    def follows(self, id: str) -> str | None:
+    def run(self, id: str, ticks: int) -> None:
+        for _ in range(ticks):
+            self.now_ns += NS_PER_S // 4
+            self.robots[id].tick(self.now_ns)
+
+    def follows(self, id: str) -> Any:
         vehicle = self.robots[id]._vehicle
         assert vehicle is not None
         return vehicle._target
 
 
-@pytest.mark.parametrize("target", [None, "fox"])
-def test_a_robot_whose_goal_cannot_be_lent_does_not_follow_that_of_another(target: str | None) -> None:
-    world = World(target=target)
+def test_a_goal_is_asked_for_until_the_robot_is_there_and_its_target_is_followed_again() -> None:
+    world = World(target="fox")
     world.say("one", "goal_pose", 5, 5)
-    assert world.follows("one") == "goal0"
-    world.say("two", "goal_pose", 6, 6)
-    assert world.follows("two") == target
-    world.say("two", "goal_pose", 5, 5)
-    assert world.follows("two") == "goal0", "one target serves all who go to one cell"
-    world.say("two", "goal_pose", 7, 7)
-    assert world.follows("two") == target, "goal0 still stands where one goes"
-    assert world.follows("one") == "goal0"
-    world.say("one", "goal_pose", 7, 7)
-    assert world.follows("one") == "goal0", "nobody else goes where it stood"
+    assert world.follows("one") is None
+    (_, answer), *_ = world.routes.asked
+    world.run("one", 20)
+    assert len(world.routes.asked) == 1, "one question at a time"
+    answer("no way leads there")
+    world.run("one", 12)
+    assert len(world.routes.asked) == 2, "every two seconds"
+    assert [each.message for each in world.node.heard["/one/plan_certificate"]] == ["no way leads there"]
+    world.say("one", "odom", 5, 5)
+    assert world.follows("one") == "fox"
+    world.routes.asked[1][1]("too late")
+    world.run("one", 20)
+    assert len(world.routes.asked) == len(world.node.heard["/one/plan_certificate"]) + 1 == 2
 
 
 @pytest.mark.parametrize("frame", ["odom", "targets/a b", "targets/"])
@@ -95,7 +108,9 @@ def test_a_goal_that_is_refused_ends_the_one_before_and_the_plan_says_so(frame: 
     world.say("one", "goal_pose", 6, 6, frame)
     assert world.follows("one") == "fox"
     assert world.node.heard["/one/plan_certificate"][-1].level == Level.ERROR
-    assert world.routes.lend(Place(5.0, -5.0)) == "goal0", "what it was lent is free"
+    world.routes.asked[0][1]("of the goal before")
+    world.run("one", 1)
+    assert len(world.node.heard["/one/plan_certificate"]) == 1
 
 
 def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(
@@ -113,42 +128,6 @@ def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(
     taken.add("two")
     world.say("two", "odom", 2, 3)
     assert not world.robots["two"].present, "the swarm's own was seen late"
-
-
-def test_a_robot_at_its_goal_follows_its_target_again_and_its_goal_target_is_free() -> None:
-    world = World(target="fox")
-    world.say("one", "goal_pose", 5, 5)
-    world.say("one", "odom", 5, 5)
-    assert world.follows("one") == "fox"
-    world.say("two", "goal_pose", 6, 6)
-    assert world.follows("two") == "goal0"
-
-
-def test_a_route_to_where_the_goal_target_stood_before_is_no_plan() -> None:
-    world = World()
-    world.say("one", "goal_pose", 5, 5)
-    robot: Any = world.robots["one"]
-    robot._hear_route(SimpleNamespace(target="goal0", target_cell=0, ok=False, remaining_s=1.0))
-    assert not world.node.heard["/one/plan"]
-
-
-def route_to(cell: int) -> Future[Any]:
-    found: Future[Any] = Future()
-    found.set_result(SimpleNamespace(target_cell=cell))
-    return found
-
-
-def test_a_planner_is_asked_until_it_goes_by_the_goal_and_no_longer_than_anybody_waits(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.place_routes.PATIENCE_S", 0.2)
-    answers = iter([route_to(1), route_to(1), route_to(7)])
-    swarm: Any = SimpleNamespace(route_soon=lambda *_, **__: next(answers, route_to(7)))
-    routes = PlaceRoutes(swarm, ["goal0"], NoQueue())
-    found: Any = routes._find("goal0", 7, Place(0.0, 0.0), "ground")
-    assert found.target_cell == 7
-    why = routes._find("goal0", 8, Place(0.0, 0.0), "ground")
-    assert why == "the planner of goal0 finds no path to the goal: no vehicle may be there"
 
 
 # --- areas, and whose topics are robots' --------------------------------------------------------------------------

@@ -29,8 +29,6 @@ PUBLISHED = {
     "tf2_msgs/msg/TFMessage": "e369d0f0",
     "std_msgs/msg/String": "df668c74",
     "std_srvs/srv/Trigger": "eeff2cd6",
-    "std_srvs/srv/SetBool": "abe9e4bb",
-    "std_srvs/srv/Empty": "5888399d",
     "nav_msgs/srv/GetPlan": "234f7aff",
     "nav_msgs/srv/GetMap": "c8ae77c9",
 }

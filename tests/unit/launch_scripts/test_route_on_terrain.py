@@ -131,7 +131,7 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
         assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
-        (["--row", "1"], "give --from, and --target or --to"),
+        (["--from", "cell:1,1"], "give --from, and --target or --to"),
     ):
         result = CliRunner().invoke(app, ["route", *words])
         assert isinstance(result.exception, SwarmError)

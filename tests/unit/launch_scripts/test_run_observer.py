@@ -49,7 +49,7 @@ def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None
     assert latest is not None
     assert latest.grid.rows == 40
     assert latest.vehicles().ids == ["a0-00"]
-    assert latest.ids_up("agent") == ["a0"]
+    assert latest.up() == [("agent", "a0")]
     assert latest.first_ns == 5
     assert not observer.whole, "a0 has not said what it counts"
     observer.take(Heard(STATS, {}, stats("a0")), 7)
@@ -88,7 +88,7 @@ def test_one_that_follows_forgets_the_run_before_but_not_who_is_there() -> None:
     assert observer.run.run_id == "r2"
     assert observer.latest is not None
     assert observer.latest.total("captures") is None
-    assert observer.latest.ids_up("agent") == ["a0"]
+    assert observer.latest.up() == [("agent", "a0")]
     assert not observer.over
 
 

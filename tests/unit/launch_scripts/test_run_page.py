@@ -37,18 +37,21 @@ from swarm.wire.messages.processes import Note
 HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
 
 
+GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's folder with a name in its notes, and in its scenario, that would rather be a script."""
     folder = tmp_path_factory.mktemp("runs") / "r1"
     folder.mkdir()
-    zone = "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[100, 100], [400, 100], [400, 300], [100, 300]]\n"
-    scenario = little_scenario(vehicles=4, time_scale=20, more=zone)
-    pace = np.full((24, 32), 0.1, np.float32)
-    pace[4:12, 4:16] = np.inf
-    terrain = terrain_of_pace(pace, 25.0)
+    zone = "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[200, 200], [800, 200], [800, 600], [200, 600]]\n"
+    scenario = little_scenario(20.0, vehicles=4, more=zone)
+    pace = np.full((48, 64), 0.1, np.float32)
+    pace[30:, 20:40], pace[8:24, 8:32] = 0.4, np.inf
+    terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
     truth = np.array(pace)
-    truth[14:20, 4:30] = np.inf
+    truth[28:40, 8:60], truth[5:12, 45:55] = np.inf, 0.3
     recorder = played(terrain, truth, scenario)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
     recorder.heard(note, recorder.observed.last_ns or 0)
@@ -121,7 +124,7 @@ def test_certified_gaps_over_time_are_of_the_routes_begun_in_between(run: Path) 
     told = np.array([np.nan if gap is None else gap for gap in series["certified_gap_mean"]])
     assert (np.isnan(told) == (begun == 0)).all()
     whole = json.loads((run / "report.json").read_text())["certified_gap"]
-    assert np.nansum((told - 1) * begun) / begun.sum() == pytest.approx(whole["mean"] - 1, rel=1e-3)
+    assert np.nansum((told - 1) * begun) / begun.sum() == pytest.approx(whole["mean"] - 1, rel=1e-3, abs=1e-5)
 
 
 def test_the_page_is_written_again_from_the_folder_alone(run: Path, tmp_path: Path, swarm: Swarm) -> None:
@@ -137,54 +140,20 @@ def test_the_page_is_written_again_from_the_folder_alone(run: Path, tmp_path: Pa
         assert (code > 0, told.count("\n"), sentence in told) == (True, 1, True)
 
 
-def test_a_comparison_says_first_what_makes_runs_unlike(run: Path, tmp_path: Path, swarm: Swarm) -> None:
-    for name, changes in (("r1", {}), ("r2", {"seed": 9}), ("r3", {"terrain": {"digest": "0" * 16}})):
-        (tmp_path / name).mkdir()
-        report = json.loads((run / "report.json").read_text()) | changes
-        (tmp_path / name / "report.json").write_text(json.dumps(report))
-        shutil.copy(run / "scenario.toml", tmp_path / name)
-    code, told, _ = swarm("runs compare r1 r2 r3 --runs", tmp_path)
-    assert code == 0
-    assert "The terrains differ" in told
-    assert "The seeds differ (3, 9, 3)" in told
-    (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
-    code, told, _ = swarm("runs compare r1 r2 --runs", tmp_path)
-    assert (code, "\x1b" in told) == (0, False)
-    assert json.loads(swarm("runs compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []
-
-
 # --- `swarm runs export --format mcap` ----------------------------------------------------------------------------
 
-GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 TOPICS = {"/map", "/marks", "/rosout", "/swarm/markers", "/swarm/poses", "/targets", "/tf", "/tf_static"}
 
 
 @pytest.fixture(scope="module")
-def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that a recorded run leaves."""
-    folder = tmp_path_factory.mktemp("runs") / "r1"
-    scenario = little_scenario(20.0, vehicles=4)
-    pace = np.full((48, 64), 0.1, np.float32)
-    pace[:10, :10], pace[30:, 20:40], pace[40:, 60:] = 0.2, 0.4, np.inf
-    terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
-    truth = np.array(pace)
-    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    recorder = played(terrain, truth, scenario)
-    note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
-    recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
-    leave(folder, recorder, terrain, truth)
-    return folder
+def tracks(run: Path) -> RunTracks:
+    return read_tracks(run / TRACKS_FILE)
 
 
 @pytest.fixture(scope="module")
-def tracks(recorded_run: Path) -> RunTracks:
-    return read_tracks(recorded_run / TRACKS_FILE)
-
-
-@pytest.fixture(scope="module")
-def recording(recorded_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
-    export_mcap(recorded_run, out, force=False)
+    export_mcap(run, out, force=False)
     return out / "r1.mcap"
 
 
@@ -284,9 +253,9 @@ def test_markers_show_the_route_that_each_vehicle_has_begun_last(
 
 
 def test_the_log_has_every_note_alarm_and_capture(
-    heard: dict[str, list[tuple[int, Any]]], recorded_run: Path, tracks: RunTracks
+    heard: dict[str, list[tuple[int, Any]]], run: Path, tracks: RunTracks
 ) -> None:
-    report = json.loads((recorded_run / "report.json").read_text())
+    report = json.loads((run / "report.json").read_text())
     lines = [(time_ns, told.name, told.msg, told.level) for time_ns, told in heard["/rosout"]]
     for note in report["notes"]:
         at_ns = BEGAN_NS + note["t_s"] * NS_PER_S
@@ -322,10 +291,10 @@ def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(record
         assert len(times) == summary.statistics.message_count
 
 
-def test_an_older_run_has_no_map_and_says_so(recorded_run: Path, tmp_path: Path, swarm: Swarm) -> None:
+def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     old = tmp_path / "old"
     old.mkdir()
-    shutil.copy(recorded_run / TRACKS_FILE, old)
+    shutil.copy(run / TRACKS_FILE, old)
     code, out, _ = swarm("runs export --format mcap", old)
     assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
     with (old / "export" / "old.mcap").open("rb") as file:
@@ -335,7 +304,7 @@ def test_an_older_run_has_no_map_and_says_so(recorded_run: Path, tmp_path: Path,
 
 
 def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
-    recorded_run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     damaged = tmp_path / "damaged"
     for file, content, complaint in (
@@ -347,14 +316,14 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
     ):
         damaged.mkdir(exist_ok=True)
         for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
-            (damaged / each).write_bytes(content if each == file else (recorded_run / each).read_bytes())
+            (damaged / each).write_bytes(content if each == file else (run / each).read_bytes())
         code, _, told = swarm("runs export --format mcap", damaged)
         assert (code > 0, complaint in told, told.count("\n")) == (True, True, 1), told
         assert not list(damaged.rglob("*.mcap*"))
     with monkeypatch.context() as patched:
         patched.delitem(sys.modules, "launch_scripts.report.mcap_export")
         patched.setitem(sys.modules, "mcap.writer", None)
-        code, _, told = swarm("runs export --format mcap", recorded_run)
+        code, _, told = swarm("runs export --format mcap", run)
     needed = "swarm: this needs mcap, which is not installed: install the extra 'ros2' (docs/start/install.md)"
     assert (code, told.strip()) == (2, needed)
     (tmp_path / "empty").mkdir()

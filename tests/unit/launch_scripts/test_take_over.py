@@ -1,4 +1,5 @@
-"""A launcher that takes over: successors are ready before anybody is asked to end; no two lives write one file."""
+"""A launcher that takes over: successors are ready before anybody is asked to end; no two generations write one
+file."""
 
 from __future__ import annotations
 
@@ -17,16 +18,15 @@ from support.effort import few
 
 from launch_scripts.launcher import takeover
 from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.launcher.options import UpOptions, common_run_id
+from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.process_table import ProcessSpec
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.runtime.health import BOARD_BYTES, LIFE_BEFORE, Board, Health
+from swarm.runtime.health import BOARD_BYTES, GENERATION_BEFORE, Board, Health
 
 LAUNCHER = 100
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
@@ -46,7 +46,7 @@ class Machine:
         self.said: list[str] = []
         self.now_s = 50.0
         self.predecessors = dict(PREDECESSORS)
-        """Name -> pid of the newest life that the launcher before has started."""
+        """Name -> pid of the newest generation that the launcher before has started."""
         patch.setattr(
             takeover,
             "processes",
@@ -89,7 +89,7 @@ class Machine:
             case "agent starts":
                 self.says("agent-a0", lambda health: health.starts("its start"))
             case "agent waits":
-                self.says("agent-a0", lambda health: health.starts(LIFE_BEFORE))
+                self.says("agent-a0", lambda health: health.starts(GENERATION_BEFORE))
             case "ten seconds pass":
                 self.now_s += 10.0
             case "one ends":
@@ -112,7 +112,9 @@ EVENTS = (
 
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(st.sampled_from(EVENTS), max_size=30))
-def test_nobody_is_asked_before_successors_are_ready_and_no_two_lives_write_one_file(history: list[str]) -> None:
+def test_nobody_is_asked_before_successors_are_ready_and_no_two_generations_write_one_file(
+    history: list[str],
+) -> None:
     with pytest.MonkeyPatch.context() as patch:
         machine = Machine(patch)
         seen: set[str] = set()
@@ -168,7 +170,7 @@ def test_who_crashed_before_is_begun_once_the_launcher_before_starts_it_no_more(
     assert machine.one("keeper-0").alive
 
 
-def test_an_agent_whose_life_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Machine(monkeypatch)
     for what in ("t0 answers", "t1 answers"):
         machine.happens(what)
@@ -244,9 +246,3 @@ def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_
     after.turned(observed, 0, [])
     assert after.url == before.url
     after.close()
-
-
-def test_parts_of_both_versions_agree_on_the_id_of_a_run_whose_scenario_has_no_key_that_is_new() -> None:
-    plain = 'name = "plain"\n[[groups]]\nvehicles = 3\n'
-    assert common_run_id(parse_scenario(plain)) == "plain-b1506df3"  # as the version before says
-    assert common_run_id(parse_scenario(f"{plain}[map]\nplot_regions = 2\n")) != "plain-b1506df3"

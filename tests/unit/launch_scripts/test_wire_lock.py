@@ -33,7 +33,7 @@ def stepped(
 ALLOWED: dict[str, Change] = {
     "nothing": lambda now: None,
     "a field is added": lambda now: fields(now).append("colour | id | None"),
-    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append("colour | id | None"),
+    "a field of a part is added": lambda now: fields(now, "host-state", "Stand").append("colour | id | None"),
     "a message and its key are added": lambda now: (
         now["messages"].update(new=copy.deepcopy(now["messages"]["fleet"])),
         now["keys"].update(new=copy.deepcopy(now["keys"]["fleet"])),
@@ -73,8 +73,8 @@ REFUSED: dict[str, tuple[Change, str]] = {
         lambda now: stepped(now, reads=(9,)), "fleet of version 8, which the build before writes, is no longer",
     ),
     "a part is written in another way": (
-        lambda now: now["messages"]["standing"]["layouts"].update(Stand="map"),
-        'Stand was "list" and is "map": standing',
+        lambda now: now["messages"]["host-state"]["layouts"].update(Stand="map"),
+        'Stand was "list" and is "map": host-state',
     ),
     "what is added later is refused from now on": (
         lambda now: now["messages"]["fleet"]["layouts"].update(Fleet="map, no other fields"), "Fleet was",

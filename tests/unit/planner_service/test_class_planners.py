@@ -139,7 +139,7 @@ def _apply(maps: ClassMaps, batch: list[Any], class_number: int = 0) -> None:
 
 
 class _World(SwarmModel):
-    def __init__(self, class_kernels: Callable[[], bool] | None = None) -> None:
+    def __init__(self, all_kernels: Callable[[], bool] | None = None) -> None:
         scenario, terrain, _ = _made()
         super().__init__(terrain=terrain, scenario=scenario)
         self.ear = Ear(self)
@@ -147,7 +147,7 @@ class _World(SwarmModel):
         worker = InlineWorker(self.scheduler)
         self.service = self.start(
             "planner-t",
-            lambda bus, post: PlannerService(setup, terrain, bus, post, worker, class_kernels=class_kernels),
+            lambda bus, post: PlannerService(setup, terrain, bus, post, worker, all_kernels=all_kernels),
             phase_ns=0,
         )
         self.target = _open_cell()

@@ -24,7 +24,7 @@ GRID = GridSpec(20, 30, 10.0)
 def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(
     asked: list[tuple[int, RouteStatus]],
 ) -> None:
-    followers = Followers("t", GRID, 10, 0)
+    followers = Followers(GRID, 10, 0)
     for n, (cell, status) in enumerate(asked):
         seconds = 1.0 if status is RouteStatus.OK else math.inf
         route = Route(
@@ -37,7 +37,7 @@ def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(
 
 def test_beyond_the_capacity_those_registered_first_make_way(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CAPACITY", 3)
-    followers = Followers("t", GRID, 100, 0)
+    followers = Followers(GRID, 100, 0)
     for n in range(5):
         followers.given(f"v{n}", Route(status=RouteStatus.UNREACHABLE, start=n), 0, n, 0)
     assert [each.cell for _, each in followers.all_items()] == [2, 3, 4]
@@ -45,13 +45,13 @@ def test_beyond_the_capacity_those_registered_first_make_way(monkeypatch: pytest
 
 def test_a_tick_pushes_a_bounded_number_and_every_follower_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_PUSHES", 4)
-    followers = Followers("t", GRID, 10**6, 0)
+    followers = Followers(GRID, 10**6, 0)
     for n in range(10):
         followers.given(f"v{n}", Route(status=RouteStatus.UNREACHABLE, start=n), 0, 0, n)
     pushed: list[str] = []
     for now_ns in (100, 101, 102):
         followers.touch(GRID.window, [])
-        for id, follower in list(followers.due(now_ns)):
+        for id, follower in (each for batch in followers.due(now_ns).values() for each in batch):
             pushed.append(id)
             followers.sent(follower, Route(status=RouteStatus.UNREACHABLE, start=follower.cell), now_ns + 1000)
     assert sorted(pushed) == sorted(f"v{n}" for n in range(10))
@@ -90,7 +90,7 @@ def crossed(route: Route, changed: list[Window]) -> bool:
 def test_whom_a_change_concerns_is_what_looking_at_every_cell_of_every_route_finds(seed: int) -> None:
     """Followers come, go and are given other routes meanwhile."""
     chance = random.Random(f"followers/{seed}")
-    followers = Followers("t", GRID, 10**9, 0)
+    followers = Followers(GRID, 10**9, 0)
     has: dict[str, tuple[Route, int]] = {}
     """Vehicle -> its route, and when it may be pushed another one."""
     stale: set[str] = set()
@@ -132,7 +132,7 @@ def test_whom_a_change_concerns_is_what_looking_at_every_cell_of_every_route_fin
 def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None:
     chance = random.Random(f"news/{seed}")
     for _ in range(200):
-        followers, old, other = Followers("t", GRID, 10**9, 0), random_route(chance), random_route(chance)
+        followers, old, other = Followers(GRID, 10**9, 0), random_route(chance), random_route(chance)
         followers.given("v", old, 0, 0, 0)
         ((_, follower),) = followers.all_items()
         if old.status is not RouteStatus.OK:
@@ -150,7 +150,7 @@ def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None
 
 def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
     """A route cut after 8 steps to the east, which goes on beyond them."""
-    followers, start = Followers("t", GRID, 10, 0), GRID.cell(5, 5)
+    followers, start = Followers(GRID, 10, 0), GRID.cell(5, 5)
     cut = Route(status=RouteStatus.OK, start=start, directions=bytes([2] * 8), cost_s=9.0, remaining_s=5.0)
     followers.given("v", cut, 8, 0, 0)
     ((_, follower),) = followers.all_items()
@@ -165,7 +165,7 @@ def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
 
 
 def test_that_there_is_no_way_is_told_once() -> None:
-    followers = Followers("t", GRID, 10, 0)
+    followers = Followers(GRID, 10, 0)
     none = Route(status=RouteStatus.UNREACHABLE, start=7, cost_s=math.inf, lower_bound_s=math.inf)
     followers.given("v", none, 0, 0, 0)
     ((_, follower),) = followers.all_items()
@@ -180,7 +180,7 @@ def test_a_change_concerns_routes_through_it_and_in_the_row_or_column_beside_it(
     away: int, side: int, across: bool
 ) -> None:
     """A diagonal step depends on the cells beside it."""
-    followers, directions = Followers("t", GRID, 10, 0), bytes([4 if across else 2] * 6)
+    followers, directions = Followers(GRID, 10, 0), bytes([4 if across else 2] * 6)
     route = Route(status=RouteStatus.OK, start=GRID.cell(7, 7), directions=directions, cost_s=1.0)
     followers.given("v", route, 0, 0, 0)
     row, col = (9, 7 + side * away) if across else (7 + side * away, 9)

@@ -14,15 +14,16 @@ from support.swarm_model import SwarmModel
 import planner_service.places.service as places
 from planner_service.places.service import PlacesService
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.config.agents import place_job, places_of
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.wire.messages.map_data import MarkKind
-from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest
-from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import PLACE_ROUTE
+from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PushedRoute
+from swarm.wire.messages.vehicles import Chasers
+from swarm.wire.route_columns import Route, RouteStatus
+from swarm.wire.topics import PLACE_ROUTE, PUSHED_ROUTE, SENT
 
 GROUPS = {"red": ["*"], "blue": [], "green": ["*"]}
 Pace = np.ndarray[Any, np.dtype[np.float32]]
@@ -38,7 +39,23 @@ class PlacesWorld(SwarmModel):
             "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
         )
         self.client = self.bus("client")
+        self.pushed: list[PushedRoute] = []
+        self.client.subscribe(PUSHED_ROUTE, self._heard)
         self.run(1.0)
+
+    def _heard(self, event: Event) -> None:
+        assert isinstance(event, Heard)
+        assert isinstance(event.message, PushedRoute)
+        self.pushed.append(event.message)
+
+    def tell(self, goals: dict[str, tuple[int, int]], agent: str = "all.a0.1") -> None:
+        """Says that vehicles on cells go to places."""
+        ids, cells, places = (
+            list(goals),
+            *(np.array([pair[n] for pair in goals.values()], np.uint32).tobytes() for n in range(2)),
+        )
+        told = Chasers(target=None, author=agent, stamp_ns=self.now_ns, ids=ids, cells=cells, goals=places)
+        self.client.publish(SENT, told, places=self._job, author=agent)
 
     def ask(self, to: int, *cells: int, asker: str = "rover.r1", **fields: Any) -> list[Event]:
         """The list to which the events of a question are added."""
@@ -96,6 +113,56 @@ def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) 
         writer.sync.publish(writer.replica.write(marked, kinds, stated, world.now_ns))
         now.reshape(-1)[marked] = paces
         world.run(1.0)
+
+
+@pytest.mark.seeds(5)
+def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_once(seed: int) -> None:
+    pace, chance = rough(seed, lethal=0.05), random.Random(seed)
+    free = np.flatnonzero(np.isfinite(pace)).tolist()
+    world = PlacesWorld(pace)
+    writer, now = world.writer("all.a0.1"), np.array(pace)
+    goals = {f"a0-{n:02d}": (chance.choice(free), chance.choice(free)) for n in range(6)}
+    given: dict[str, Route] = {}
+    for id, (cell, to) in goals.items():
+        (given[id],) = world.answer(to, cell, vehicles=[id], asker="agent.a0").routes
+    for turn in range(6):
+        if turn == 3:
+            goals["a0-00"] = goals["a0-00"][0], chance.choice(free)
+        world.tell(goals)
+        kept = [cell for pair in goals.values() for cell in pair]
+        marked = np.array(sorted(set(chance.sample(free, 40)).difference(kept)), np.uint32)
+        paces = np.array([chance.choice((0.05, 0.6, np.inf)) for _ in marked], np.float32)
+        kinds = np.where(np.isinf(paces), np.uint8(MarkKind.LETHAL), np.uint8(MarkKind.PACE)).astype(np.uint8)
+        stated = np.where(np.isinf(paces), np.float32(0), paces).astype(np.float32)
+        writer.sync.publish(writer.replica.write(marked, kinds, stated, world.now_ns))
+        now.reshape(-1)[marked] = paces
+        world.run(3.0)
+        given.update({each.vehicle: each.route for each in world.pushed})
+        for id, (cell, to) in goals.items():
+            best = optimum_s(now, to)[cell]
+            if math.isinf(best):
+                assert given[id].status is RouteStatus.UNREACHABLE
+            else:
+                assert driven_s(now, given[id]) == pytest.approx(best, rel=1e-5)
+                assert walk(GRID, cell, given[id].directions)[-1] == to
+    told = [each.vehicle for each in world.pushed]
+    assert max(told.count(id) for id in goals) <= 6 + 1, "a change is pushed once"
+    world.pushed.clear()
+    world.tell(dict(list(goals.items())[:1]))
+    now.reshape(-1)[marked] = 0.01
+    writer.sync.publish(writer.replica.write(marked, MarkKind.PACE, 0.01, world.now_ns))
+    world.run(3.0)
+    assert {each.vehicle for each in world.pushed} <= {"a0-00"}, "who goes nowhere is pushed nothing"
+
+
+def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
+    groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
+    world = PlacesWorld(flat(), groups, "red")
+    world.tell({"a0-00": (1, 300), "a1-00": (2, 300)}, "red.a0.1")
+    world.run(0.5)
+    world.tell({"a0-00": (1, 400), "a1-00": (2, 400)}, "red.a0.1")
+    world.run(2.0)
+    assert {each.vehicle for each in world.pushed} == {"a0-00"}
 
 
 def test_a_part_of_a_route_says_what_the_rest_costs() -> None:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.kernel_oracle import find_strides
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_bounds import LowerBounds
+from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
@@ -89,13 +89,6 @@ def test_a_window_lies_inside_the_grid(tree: CostToGoTree, window: Window) -> No
         tree.move(1, window)
     with pytest.raises(OutsideGridError):
         tree.grow_strides(window, network, 9)
-
-
-def test_strides_are_of_the_map_that_the_tree_lies_on(tree: CostToGoTree) -> None:
-    other = CostGrid(GridSpec(9, 9, 1.0), PlannerConfig())
-    other.load(np.ones((9, 9), np.float32))
-    with pytest.raises(ValueError, match="networks of 121 padded cells, the map has 110"):
-        tree.grow_strides(GRID.window, find_strides(other), 9)
 
 
 @pytest.mark.parametrize(("root", "window"), [(1, Window(0, 1, 4, 4)), (70, Window(0, 0, 4, 4))])

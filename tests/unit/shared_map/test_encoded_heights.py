@@ -11,8 +11,7 @@ import rasterio
 from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, written
 
-from shared_map.importers.encoded_heights import ENCODINGS, decoded, is_plausible
-from shared_map.importers.rasters import contents_of
+from shared_map.importers.rasters import ENCODINGS, contents_of, decoded, is_plausible
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
@@ -145,10 +144,10 @@ def test_the_setting_wins_and_what_it_cannot_mean_is_refused(tmp_path: Path) -> 
     with pytest.raises(TerrainError, match="has 3 bands"):
         load(path, elevation_encoding="metres")
     grey = written(tmp_path / "grey.tif", hills(1, 300))
-    with pytest.raises(TerrainError, match="has 1 bands of float32; Terrarium is three bands of uint8"):
+    with pytest.raises(TerrainError, match="has 1 bands of float32; Terrarium has three of uint8"):
         load(grey, elevation_encoding="terrarium")
     png = tile(tmp_path / "a.png", image, "PNG")
-    with pytest.raises(TerrainError, match=r"an image has no scale; set terrain\.resolution_m"):
+    with pytest.raises(TerrainError, match=r"does not say how large a cell is; set terrain\.resolution_m"):
         load(png)
     black = tile(tmp_path / "black.tif", np.zeros((3, 40, 40), np.uint8), **PLACE)
     with pytest.raises(TerrainError, match="no heights at all"):

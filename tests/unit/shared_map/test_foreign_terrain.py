@@ -99,7 +99,7 @@ def test_a_raster_in_a_zip_is_read_and_a_bad_zip_is_refused_in_a_sentence(tmp_pa
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
         archive.write(plain, "a.tif")
         archive.write(plain, "b.tif")
-    with pytest.raises(TerrainError, match="holds 2 rasters"):
+    with pytest.raises(TerrainError, match="holds 2 files of the kinds"):
         load(tmp_path / "two.zip")
     (tmp_path / "no.zip").write_bytes(b"PK no")
     with pytest.raises(TerrainError, match=r"damaged or no \.zip"):

@@ -22,7 +22,7 @@ from swarm.config.load import COVER_TABLES, parse_scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 
-EUROPE, USA = "EPSG:32632", "EPSG:32617"
+EUROPE = "EPSG:32632"
 PLACE = from_origin(500_000, 5_000_000, 20, 20)
 
 
@@ -82,24 +82,20 @@ def test_codes_of_each_table_become_its_grounds(tmp_path: Path, dem: Path, key: 
 # --- which table ----------------------------------------------------------------------------------------------
 
 
-def test_an_ambiguous_map_is_asked_for_and_the_place_may_answer(tmp_path: Path) -> None:
-    codes = patches([11, 21, 31, 41, 42, 43])
-    grid = GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, USA)
-    here = written(tmp_path / "a.tif", codes, "uint8", crs=USA)
-    cover = read_cover(here, grid, TerrainConfig())
-    assert said(cover.notes, "NLCD, known by its codes and where it lies")
-    nowhere = written(tmp_path / "b.tif", codes, "uint8", crs='LOCAL_CS["site",UNIT["metre",1]]')
+def test_an_ambiguous_map_is_asked_for(tmp_path: Path) -> None:
+    grid = GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, EUROPE)
+    two = written(tmp_path / "a.tif", patches([11, 21, 31, 41, 42, 43]), "uint8")
     with pytest.raises(TerrainError, match=r"set terrain\.cover_codes = 'corine' or 'nlcd'$") as asked:
-        read_cover(nowhere, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000), TerrainConfig())
+        read_cover(two, grid, TerrainConfig())
     assert "\n" not in str(asked.value)
-    both = written(tmp_path / "c.tif", patches([10, 20, 30, 40]), "uint8", crs=EUROPE)
+    both = written(tmp_path / "c.tif", patches([10, 20, 30, 40]), "uint8")
     with pytest.raises(
         TerrainError, match=r"are those of ESA WorldCover, and of CORINE .*, and of GlobeLand30, and of"
     ):
-        read_cover(both, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, EUROPE), TerrainConfig())
+        read_cover(both, grid, TerrainConfig())
 
 
-@pytest.mark.parametrize("evidence", ["palette", "names", "attributes", "metadata", "file name"])
+@pytest.mark.parametrize("evidence", ["palette", "names", "metadata", "file name"])
 def test_a_table_is_known_by_what_the_file_says_of_itself(tmp_path: Path, dem: Path, evidence: str) -> None:
     codes = patches([11, 21, 31, 41, 42, 43])
     grounds = TABLES["nlcd"].grounds
@@ -110,21 +106,13 @@ def test_a_table_is_known_by_what_the_file_says_of_itself(tmp_path: Path, dem: P
         if evidence == "metadata":
             file.update_tags(title="National Land Cover Database 2021")
     names = "".join(f"<Category>{grounds[n].name if n in grounds else ''}</Category>" for n in range(96))
-    rows = "".join(
-        f'<Row index="{n}"><F>{code}</F><F>{ground.name}</F></Row>'
-        for n, (code, ground) in enumerate(grounds.items())
-    )
-    described = {
-        "names": f"<CategoryNames>{names}</CategoryNames>",
-        "attributes": '<GDALRasterAttributeTable><FieldDefn index="0"><Name>Value</Name><Type>0</Type></FieldDefn>'
-        f'<FieldDefn index="1"><Name>Class</Name><Type>2</Type></FieldDefn>{rows}</GDALRasterAttributeTable>',
-    }.get(evidence)
-    if described is not None:
+    if evidence == "names":
+        described = f"<CategoryNames>{names}</CategoryNames>"
         text = f'<PAMDataset><PAMRasterBand band="1">{described}</PAMRasterBand></PAMDataset>'
         Path(f"{path}.aux.xml").write_text(text, encoding="utf-8")
     source = load(dem, cover=str(path))
     np.testing.assert_array_equal(source.classes, expected(codes, "nlcd")[0])
-    how = {"palette": "palette", "names": "names", "attributes": "names"}.get(evidence, "its name or metadata")
+    how = evidence if evidence in ("palette", "names") else "its name or metadata"
     assert said(source.notes, "land cover: NLCD, known by")
     assert said(source.notes, how)
 

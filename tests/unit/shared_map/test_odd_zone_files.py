@@ -14,7 +14,7 @@ from rasterio.warp import transform as to_crs
 from support import height_models
 from support.zone_shapes import UTM, feature, geojson, middles, painted, squares, written
 
-from shared_map.importers.zones.outlines import outlines_of
+from shared_map.importers.zones.drawings import outlines_of
 from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
@@ -48,7 +48,11 @@ REFUSED = {
         collection({"type": "Point", "coordinates": [1e300, -1e300]}).replace("1e+300", "1e999"),
         "is damaged",
     ),
-    "sqlite": ("SQLite format 3\0" + "x" * 5000, "is damaged"),
+    "sqlite": (
+        "SQLite format 3\0" + "x" * 5000,
+        "is SQLite, but no GeoPackage, perhaps SpatiaLite; it is not read",
+    ),
+    "geopackage": ("SQLite format 3\0".ljust(68, "x") + "GPKG" + "x" * 5000, "is damaged"),
     "shapefile": ("\0\0\x27\x0a" + "\xff" * 500, "is damaged"),
     "zip": ("PK\3\4" + "x" * 200, "is damaged or no .zip"),
 }

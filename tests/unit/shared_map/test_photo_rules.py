@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -16,7 +14,8 @@ from shared_map.importers.cover.photo_rules import (
     Features,
     ground_readings,
 )
-from shared_map.importers.sources import Source, classified
+from shared_map.importers.cover.photos import Photo
+from shared_map.importers.sources import Source, with_photo
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig
@@ -126,8 +125,9 @@ def test_an_import_hands_on_what_its_photo_may_show() -> None:
     photo[:, :30] = (70, 88, 60)  # between the greens of forest and of meadow
     photo += np.random.default_rng(1).integers(0, 5, photo.shape).astype(np.uint8)  # no drawn map
     level = np.zeros((40, 60), np.float32)
-    source = Source(GridSpec(40, 60, 10.0), level, np.zeros((40, 60), np.uint8), photo=photo)
-    found = classified(replace(source), TerrainConfig(), lambda what, share: None)
+    source = Source(GridSpec(40, 60, 10.0), level, np.zeros((40, 60), np.uint8))
+    seen = np.ones((40, 60), np.bool_)
+    found = with_photo(source, Photo(photo, seen, ()), TerrainConfig(), lambda what, share: None)
     assert found.readings is not None
     assert (found.readings[5:35, 5:25] == BIT[TerrainClass.GRASS] | BIT[TerrainClass.FOREST]).mean() > 0.9
     assert not found.readings[5:35, 35:].any()

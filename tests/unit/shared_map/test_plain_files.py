@@ -63,14 +63,12 @@ def test_an_ascii_grid_in_degrees_is_put_on_metres_when_told(tmp_path: Path) -> 
     assert 80 < source.grid.resolution_m < 100
 
 
-def test_arrays_come_from_npz_with_resolution_and_photo(tmp_path: Path) -> None:
+def test_arrays_come_from_npz_with_resolution(tmp_path: Path) -> None:
     heights = np.arange(20.0).reshape(4, 5)
-    photo = np.full((4, 5, 3), 90, np.uint8)
-    np.savez(tmp_path / "a.npz", elevation=heights, resolution_m=30.0, photo=photo)
+    np.savez(tmp_path / "a.npz", elevation=heights, resolution_m=30.0)
     source = load(tmp_path / "a.npz")
     np.testing.assert_array_equal(source.elevation_m, heights)
     assert source.grid.resolution_m == 30
-    assert source.photo is not None
     assert load(tmp_path / "a.npz", resolution_m=60.0).elevation_m.shape == (2, 2)
 
 
@@ -186,10 +184,10 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
         (YAML, b"P5 a b 255\n\0", "invalid literal"),
         (YAML, b"P2 2 1 255\n1 x\n", "no PGM"),
         (YAML, b"P5 2 1 0\n\0\0", "maxval must be greater than 0"),
-        (YAML.replace("resolution: 0.05\n", ""), b"P5 1 1 255\n\0", "resolution is missing"),
+        (YAML.replace("resolution: 0.05\n", ""), b"P5 1 1 255\n\0", "missing required field `resolution`"),
         (YAML.replace("0.05", "wide"), b"P5 1 1 255\n\0", "wide"),
         (YAML.replace("0.0]", "0.7]"), b"P5 1 1 255\n\0", "turned by 0.7 rad"),
-        (YAML + "mode: fancy\n", b"P5 1 1 255\n\0", "mode is 'fancy'"),
+        (YAML + "mode: fancy\n", b"P5 1 1 255\n\0", "mode: found 'fancy'; allowed"),
         (YAML + "what is this\n", b"P5 1 1 255\n\0", "line 7"),
         (YAML.replace("0.25", "0.9"), b"P5 1 1 255\n\0", "free <= occupied"),
     ],

@@ -12,6 +12,7 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 from support.height_models import written
 
+from shared_map.importers.cover.photos import read_photo
 from shared_map.importers.georeference import metres_per_degree
 from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
@@ -146,10 +147,10 @@ def test_a_photo_of_another_projection_and_depth_with_alpha(tmp_path: Path) -> N
     photo[3, :, :60] = 0
     write(tmp_path / "photo.tif", photo, where, "EPSG:4326", photometric="rgb", alpha="yes")
     source = load(tmp_path / "dem.tif", photo=str(tmp_path / "photo.tif"))
-    assert source.seen is not None
-    assert not source.seen[:, :23].any()
-    assert source.seen[2:-2, 27:-1].all()
-    assert (source.classes[~source.seen] == TerrainClass.UNKNOWN).all()
+    seen = read_photo(tmp_path / "photo.tif", source.grid, None).seen
+    assert not seen[:, :23].any()
+    assert seen[2:-2, 27:-1].all()
+    assert (source.classes[~seen] == TerrainClass.UNKNOWN).all()
     assert said(source, "stretched")
 
 
@@ -226,7 +227,7 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (promise_in_16384, "truncated"),
     (lambda f: text(f, "a.tif"), "no raster"),
     (lambda f: text(f, "a.qqq"), ".qqq is unknown; give .tif.*gdal_translate"),
-    (lambda f: {"source": f / "nowhere.tif"}, "nowhere.tif does not exist"),
+    (lambda f: {"source": f / "nowhere.tif"}, r"cannot read terrain .*nowhere\.tif: No such file"),
     (lambda f: {"source": f}, "is a folder"),
 ]
 

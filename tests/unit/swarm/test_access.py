@@ -48,6 +48,7 @@ def test_what_only_one_process_knows_only_that_process_says() -> None:
         ("marks", "serve", "keeper"),
         ("stats", "serve", "keeper"),  # what processes that are gone have counted
         ("pushed-route", "put", "planner"),
+        ("pushed-route", "put", "places"),
         ("pose", "put", "targets"),  # it moves all simulated targets
         ("true-pose", "put", "targets"),
         ("body", "put", "targets"),  # and all simulated rovers

@@ -49,8 +49,11 @@ def test_every_way_to_write_a_cell_leads_back_to_it(name: str, where: float) -> 
     fields = fields_of(frame, cell)
     said, _, rest = written(frame, cell).partition(" (")
     forms = [said, *rest.rstrip(")").split(", "), f"xy:{fields['x_m']!r}, {fields['y_m']!r}"]
-    for text in [*forms, f"latlon:{fields['lat']:.9f},{fields['lon']:.9f}", (row, col), f"cell:{row}.7,{col}.1"]:
+    for text in [*forms, f"latlon:{fields['lat']:.9f},{fields['lon']:.9f}", (row, col)]:
         assert cell_of(text, frame, "--at") == cell
+    for text in (f"cell:{row}.7,{col}", f"cell:{row},{col}.0", (row + 0.5, col)):
+        with pytest.raises(ConfigError, match="expected whole numbers: a row and a column"):
+            cell_of(text, frame, "--at")
     assert len(forms) == 4
     assert (fields["row"], fields["col"]) == (row, col)
     corners = corners_of([f"cell:{row},{col}", f"xy:{fields['x_m']},{fields['y_m']}"], frame, "--polygon")

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from support.agent_world import OPEN, AgentWorld, FakePlaces, pace_of, scenario
+from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
+from planner_service.places.service import PlacesService
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event, Heard, Replied
+from swarm.bus.scheduler import InlineWorker
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, GoalState, GoalStates, SendVehicle, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState
@@ -27,13 +29,21 @@ class SentWorld(AgentWorld):
         super().__init__(text, pace_of(picture))
         self.store = KeeperStore(":memory:")
         self.keeper("k", self.store)
-        self.places = FakePlaces(self)
+        self.generations = 0
+        self.start_places()
         self.progress: dict[str, GoalState] = {}
         self.person = self.bus("person")
         self.person.subscribe(GOAL_STATES, self._told)
         self.put_target("t", 1, 1)
         self.start_all()
         self.until(lambda: len(self.vehicles()) == self.scenario.vehicle_count, within_s=20)
+
+    def start_places(self) -> None:
+        self.generations += 1
+        setup = self.setup("places", "all", self.generations)
+        self.start(
+            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+        )
 
     def _told(self, event: Event) -> None:
         assert isinstance(event, Heard)
@@ -125,9 +135,6 @@ def test_a_place_without_a_way_blocks_until_there_is_one_and_a_stop_is_a_standby
     alarms = world.agents["a0"]._member.alarms
     assert [(each.kind, each.about) for each in alarms.current()] == [("goal-blocked", "a0-00")]
     world.ask(ZONES, replace(zone, action="remove", polygon=[]))
-    world.run(0.2)
-    world.places.bus.close()
-    world.places = FakePlaces(world)  # the fake one cannot take marks back
     world.until(lambda: world.states_of_goals() == {"underway": 1}, within_s=10)
     world.ask(GIVE_ORDER, GiveOrder(subject="vehicle", name="a0-00", stamp_ns=world.now_ns))
     world.until(lambda: world.states_of_goals() == {"standby": 1}, within_s=5)
@@ -147,8 +154,6 @@ def test_a_better_way_that_opens_is_taken_on_the_way() -> None:
     world.until(lambda: world.where()["a0-00"][1] >= 8, within_s=60)
     begun = len(world.followed)
     world.ask(ZONES, replace(zone, action="remove", polygon=[]))
-    world.places.bus.close()
-    world.places = FakePlaces(world)
     crossed: list[tuple[int, int]] = []
     world.after_tick.append(lambda: crossed.append(world.where()["a0-00"]))
     world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=300)
@@ -170,10 +175,10 @@ def test_goals_and_progress_survive_the_agent_the_keeper_and_the_planner_of_plac
     world.start_agent("a0")
     world.until(lambda: "a0-00" in world.progress, within_s=10)
     assert world.progress["a0-00"].done >= 1
-    world.places.bus.close()
+    world.kill("places")
     world.until(lambda: world.states_of_goals()["blocked"] == 1, within_s=60)
     assert world.progress["a0-00"].reason == "no process plans routes to places"
-    world.places = FakePlaces(world)
+    world.start_places()
     world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=60)
     world.until(lambda: all(vehicle.target == "t" for vehicle in world.vehicles()), within_s=10)
     world.assert_lawful()

@@ -53,7 +53,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
     for seed in range(20):
         chance = random.Random(seed)
         report = ChasersReport("all.a0.1")
-        planners = {target: Followers(target, GRID, 5 * NS_PER_S, 0) for target in ("t0", "t1", "t2")}
+        planners = {target: Followers(GRID, 5 * NS_PER_S, 0) for target in ("t0", "t1", "t2")}
         driven: dict[str, int] = {f"v{n}": 200 * n for n in range(6)}
         chased: dict[str, str | None] = dict.fromkeys(driven)
         messages = 0
@@ -79,7 +79,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
 
 
 def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() -> None:
-    followers = Followers("t0", GRID, 5 * NS_PER_S, 0)
+    followers = Followers(GRID, 5 * NS_PER_S, 0)
 
     def hear(author: str, stamp_ns: int, cell: int) -> None:
         [message] = ChasersReport(author).reports([("v", "t0", (cell,))], stamp_ns)
@@ -91,7 +91,7 @@ def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() ->
 
 
 def test_a_planner_remembers_no_more_authors_than_followers() -> None:
-    followers = Followers("t0", GRID, 5 * NS_PER_S, 0)
+    followers = Followers(GRID, 5 * NS_PER_S, 0)
     for n in range(5000):
         followers.on_chasers(Chasers(target="t0", author=f"x{n}", stamp_ns=0, ids=[], cells=b""), 0)
     assert len(followers._told) == 4096

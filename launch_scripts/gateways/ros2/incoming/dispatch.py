@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.place_routes import TRACKER, PlaceRoutes
+from launch_scripts.gateways.ros2.incoming.place_routes import RouteQuestions
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.incoming.robot import Robot
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
@@ -35,6 +35,8 @@ _MOST_ORDERS = 8
 """Orders of which one is being obeyed, which takes seconds, while the rest wait; more are refused at once
 (docs/design/ros2-gateway.md)."""
 _TRIGGER = "std_srvs/srv/Trigger"
+_TRACKER = "ros2"
+"""Name of the tracker that the gateway is: its next start takes its targets over at once."""
 
 
 class Incoming:
@@ -62,7 +64,7 @@ class Incoming:
         self._map = map or RosMap(swarm.frame.grid)
         self._messages = RosMessages(node.types, self._map)
         self._reader = FrameReader(self._map)
-        self._routes = PlaceRoutes(swarm, settings.goal_targets)
+        self._routes = RouteQuestions(swarm)
         self._orders = WorkQueue("ros2-orders", 1, _MOST_ORDERS)
         """An order waits until it is obeyed, and the next one for it."""
         self._robots: dict[str, Robot] = {}
@@ -74,7 +76,7 @@ class Incoming:
         self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
         """Names in ROS of vehicles that agents of the swarm have. A vehicle published by another gateway looks like
-        a robot, and would be a body at the position of the vehicle itself."""
+        a robot, and would be an obstacle at the position of the vehicle itself."""
         self._taken_due_ns = 0
         self._sendable: set[str] = set()
         """Names in ROS of vehicles whose goals are taken from there."""
@@ -178,7 +180,7 @@ class Incoming:
 
     def _target_input(self, id: str) -> Input:
         """A person who clicks once in RViz puts a target somewhere: it stays there while the gateway lives."""
-        target = self._swarm.target(id, tracker=TRACKER)
+        target = self._swarm.target(id, tracker=_TRACKER)
 
         def take(message: Any, _: int) -> None:
             place = self._reader.pose(message.header, message.pose)

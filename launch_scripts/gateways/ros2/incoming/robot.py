@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
+from launch_scripts.gateways.ros2.incoming.place_routes import RouteQuestions
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, Place, Track
 from launch_scripts.gateways.ros2.incoming.work_queue import Input
 from launch_scripts.gateways.ros2.rmw import Qos
@@ -25,7 +25,10 @@ log = logging.getLogger(__name__)
 
 _GOAL_HZ = 10.0
 """A robot is given no more goals; of several the newest counts."""
+_ROUTE_AGAIN_NS = 2 * NS_PER_S
+"""A route to a goal is asked for again this long after the question before: marks may have closed it since."""
 _MOST_POSTED = 64
+_NEVER_NS = 1 << 63
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
@@ -45,7 +48,7 @@ class Robot:
         robots: Robots,
         node: Node,
         swarm: Swarm,
-        routes: PlaceRoutes,
+        routes: RouteQuestions,
         messages: RosMessages,
         is_taken: Callable[[str], bool] = lambda name: False,
     ) -> None:
@@ -60,8 +63,10 @@ class Robot:
         self._vehicle: Vehicle | None = None
         self._followed: Stream[Route] | None = None
         """Routes to the target that it follows."""
-        self._goal: tuple[str, int] | None = None
-        """Target that is lent for its goal, and its cell; None while it has no goal of its own."""
+        self._goal: Place | None = None
+        """Place to which it was sent; None while it has no goal of its own."""
+        self._goal_due_ns = 0
+        """Time when the route to the goal is asked for; `_NEVER_NS` while that waits for its answer."""
         self._goal_cell: int | None = None
         """Cell of the last published goal_pose."""
         self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
@@ -93,6 +98,12 @@ class Robot:
         self._goals.tick(now_ns)
         while self._followed is not None and (route := self._followed.next(0.0)) is not None:
             self._hear_route(route)
+        if (goal := self._goal) is not None and self._track.place is not None and now_ns >= self._goal_due_ns:
+            self._goal_due_ns = _NEVER_NS
+            self._routes.ask(
+                goal, self._track.place, self._robots.vehicle_class,
+                lambda found: self._posted.append(lambda: self._hear_goal_route(goal, found, now_ns)),
+            )  # fmt: skip
 
     def close(self) -> None:
         """Takes it away, with all that was declared for it."""
@@ -121,7 +132,8 @@ class Robot:
             )  # fmt: skip
             log.info("robot %s of ROS is a vehicle: %s", self.id, self.topic)
         self._vehicle.at(place.x_m, place.y_m, heading_rad=place.heading_rad, speed_m_per_s=place.speed_m_per_s)
-        at_goal = self._goal is not None and self._vehicle.cell == self._goal[1]
+        goal = self._goal
+        at_goal = goal is not None and self._vehicle.cell == self._swarm.frame.cell(goal.x_m, goal.y_m)
         if at_goal:
             log.info("robot %s is at its goal", self.id)
             self._end_goal()
@@ -144,8 +156,6 @@ class Robot:
 
     def _end_goal(self) -> None:
         """It follows nothing any more."""
-        if self._goal is not None:
-            self._routes.give_back(self._goal[0])
         self._goal = self._followed = None
         if self._vehicle is not None:
             self._vehicle.unfollow()
@@ -154,40 +164,31 @@ class Robot:
         """Raises SwarmError if it cannot have this goal: then it has none, as its plan says."""
         self._end_goal()
         try:
-            if self._vehicle is None or self._track.place is None:
+            if self._vehicle is None:
                 raise ConfigError(f"robot {self.id} has not said where it is, so it gets no goal")
             if (target := _target_frame(message)) is not None:
                 self._follow(target)
-                return
-            goal, start = self._reader.pose(message.header, message.pose), self._track.place
-            lent = self._routes.lend(goal)
-            self._goal = sought = lent, self._swarm.frame.cell(goal.x_m, goal.y_m)
-            self._follow(lent)
+            else:
+                self._goal, self._goal_due_ns = self._reader.pose(message.header, message.pose), now_ns
         except SwarmError as error:
-            self._end_goal()
             self._put_plan(str(error))
             self._follow(self._robots.target)
             raise
-        # The first route is asked for at once; newer ones are pushed.
-        self._routes.to_target(
-            lent, start, self._robots.vehicle_class,
-            lambda found: self._posted.append(lambda: self._hear_first(sought, found)), sought[1],
-        )  # fmt: skip
 
-    def _hear_first(self, sought: tuple[str, int], found: Route | str) -> None:
-        if not isinstance(found, str):
-            self._hear_route(found)
-        elif self._goal == sought:
-            self._goals.refuse(found)
+    def _hear_goal_route(self, goal: Place, found: Route | str, asked_ns: int) -> None:
+        """Takes in the answer for a goal; of a goal that it has no more, nothing."""
+        if self._goal is goal:
+            self._goal_due_ns = asked_ns + _ROUTE_AGAIN_NS
             self._put_plan(found)
+            if isinstance(found, str):
+                self._goals.refuse(found)
 
     def _hear_route(self, route: Route) -> None:
-        """A route to where its goal's target stood before is none of it."""
-        if self._vehicle is None or (self._goal is not None and (route.target, route.target_cell) != self._goal):
+        if self._vehicle is None:
             return
         self._put_plan(route)
         end = route.cells[-1] if route.ok and route.remaining_s == 0 else None
-        if self._goal is None and end is not None and end != self._goal_cell:
+        if end is not None and end != self._goal_cell:
             self._goal_cell = end
             pose = self._messages.pose_stamped(time.time_ns(), *self._swarm.frame.centre_m(end))
             self._put(self._goal_out, pose)
@@ -216,11 +217,8 @@ class Robot:
         try:
             start = self._start_of(request.start)
             what = "goal"
-            if (target := _target_frame(request.goal)) is not None:
-                self._routes.to_target(target, start, self._robots.vehicle_class, answer)
-            else:
-                goal = self._reader.pose(request.goal.header, request.goal.pose)
-                self._routes.to_place(goal, start, self._robots.vehicle_class, answer)
+            goal = _target_frame(request.goal) or self._reader.pose(request.goal.header, request.goal.pose)
+            self._routes.ask(goal, start, self._robots.vehicle_class, answer)
         except ConfigError as error:
             answer(f"{what}: {error}")
 

@@ -1,0 +1,115 @@
+"""The set-up that all processes which plan routes share: the network, who leads, orders, the map of each class."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from shared_map.cost_map import CostMap
+from shared_map.learning.learned_factors import LearnedGauges
+from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.replica_sync import MapSync
+from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import class_terrains
+from shared_map.vehicle_class_maps import ClassMaps
+from swarm.bus.bus import Asked, Bus, Event, Post, Worker
+from swarm.config.agents import agent_of
+from swarm.config.vehicle_classes import GROUND, class_numbers
+from swarm.liveness import job_of
+from swarm.runtime.election import Candidacy
+from swarm.runtime.membership import Member
+from swarm.runtime.order_client import OrderClient
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.orders import Obey
+from swarm.wire.messages.planning import PushedRoute
+from swarm.wire.topics import PUSHED_ROUTE, Topic
+
+
+class PlanningProcess:
+    """One process of several with one job, of which the leader serves.
+
+    groups         those whose marks it may know; None if all
+    served         topics that the leader serves, and the fields of their keys
+    all_kernels    whether all may be called by now, not only those for whole trees of "ground"; if not given, they
+                   may
+    """
+
+    def __init__(
+        self,
+        setup: RoleSetup,
+        terrain: Terrain,
+        bus: Bus,
+        post: Post,
+        worker: Worker,
+        groups: frozenset[str] | None,
+        served: Mapping[Topic, dict[str, str]],
+        all_kernels: Callable[[], bool] | None,
+    ) -> None:
+        scenario = setup.scenario
+        self._scenario, self._job, self._incarnation = scenario, job_of(setup.id), setup.incarnation
+        self._bus, self._post, self._worker = bus, post, worker
+        self._served_topics = served
+        self._all_kernels = all_kernels or (lambda: True)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
+        self.counters = self._member.counters
+        cost_map = CostMap(terrain, learning=scenario.map.learning)
+        self._mark_filter = MarkFilter(terrain.grid, groups)
+        self._maps = ClassMaps(cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
+        self._cost_maps = {GROUND: cost_map} | self._maps.of
+        self._replica = MapReplica(terrain.grid, self._maps, filter=self._mark_filter)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        self._learned = LearnedGauges(cost_map.keys, self.counters)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
+        self._leads = False
+        self._now_ns = 0
+        self._member.needs("the shared map", lambda: self._sync.joined)
+
+    def _obeys(self, order: Obey) -> bool:
+        """Returns True if all that the process answers follows this order."""
+        raise NotImplementedError
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._sync.start(now_ns)
+        self._obedience.start(now_ns)
+        self._candidacy.start()
+        self._lead(self._candidacy.leads, now_ns)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        """Gives an event to the one part that takes it."""
+        if not self._member.on_member_event(event):
+            handlers = (
+                self._sync.on_map_event,
+                self._candidacy.on_election_event,
+                self._obedience.on_order_event,
+            )
+            any(handle(event, now_ns) for handle in handlers)
+
+    def _take_map(self, now_ns: int) -> None:
+        """Begins a tick: takes what others say about the map."""
+        self._now_ns = now_ns
+        self._sync.tick(now_ns)
+        self._learned.tick(self._cost_maps[GROUND].factors)
+
+    def _lead(self, leads: bool, now_ns: int) -> None:
+        """Serves, or leaves that to another. A query which comes meanwhile is answered all the same."""
+        if leads == self._leads:
+            return
+        self._leads = leads
+        for topic, fields in self._served_topics.items():
+            if leads:
+                self._bus.serve(topic, self._post, undecoded=True, **fields)
+            else:
+                self._bus.unserve(topic, **fields)
+        self._candidacy.tell(self._member, now_ns)
+
+    def _push(self, route: PushedRoute) -> None:
+        self._bus.publish(PUSHED_ROUTE, route, agent=agent_of(route.vehicle), vehicle=route.vehicle)
+
+    def _refuse(self, event: Asked, reason: str) -> None:
+        event.refuse(reason)
+        event.end()
