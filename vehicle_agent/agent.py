@@ -34,7 +34,7 @@ from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
 from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.detours import Detours
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.steering import FAR_CELLS, Steering
 
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
@@ -104,7 +104,9 @@ class Agent:
         grid, pace = local_map.grid, local_map.pace
         climb = local_map.climb
         self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.obstacles, climb)
-        near_cells, seed = config.reserve_cells + 2, f"{scenario.seed}/{plan.id}"
+        holdings.keeps = config.reserve_cells
+        reach_cells = max(config.reserve_cells, FAR_CELLS) + FAR_CELLS
+        near_cells, seed = reach_cells + 2, f"{scenario.seed}/{plan.id}"
         self._wishes = CellRequests(
             grid, self._steering, holdings, self.obstacles, near_cells, self._target_cell, self._in_reach, seed
         )
@@ -137,7 +139,7 @@ class Agent:
         self._unassigned = False
         """True if vehicles have been placed that have no assignment yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
-        self._sight_cells = max(sense_cells, config.reserve_cells + 1)
+        self._sight_cells = max(sense_cells, reach_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
         self.seen_lethal: set[int] = set()
         """Cells in zones over which no way out leads, as vehicles have seen."""
@@ -379,7 +381,8 @@ class Agent:
             reason = vehicle.route_request(now_ns)
             if reason is not None and vehicle.target is not None:
                 key = vehicle.target, reason is Reason.RAN_OUT
-                asks.setdefault(key, []).append((vehicle.id, path[-1], reason))
+                start = path[: self.holdings.keeps + 1][-1]
+                asks.setdefault(key, []).append((vehicle.id, start, reason))
             if stopped:
                 self._wishes.stay(vehicle.id)
                 continue

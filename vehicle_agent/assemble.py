@@ -39,6 +39,7 @@ from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
+from vehicle_agent.traffic.steering import FAR_CELLS
 
 _ACTS = 5
 """Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them."""
@@ -91,7 +92,7 @@ class AgentParts:
         near = scenario.map.interest == "near"
         self.sync = MapSync(self.replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
         self.zones = ZonesAround(self.replica, self.maps)
-        lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
+        lead_cells = max(scenario.vehicles.reserve_cells, FAR_CELLS) + FAR_CELLS + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * range_m)
         self.near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
@@ -101,7 +102,8 @@ class AgentParts:
         layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
         side = scenario.map.shard_regions * REGION_CELLS
-        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
+        others, proven = spawns.keys() - beside.keys(), scenario.network.tls is not None
+        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=others, proven=proven)
         tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
         core = RightOfWay(
             setup.id, shards, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns

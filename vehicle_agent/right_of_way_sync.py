@@ -16,8 +16,18 @@ from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import Claim, Granted, HostState, Known, KnownRequest, Left, Stored, Table
-from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, Topic
+from swarm.wire.messages.traffic import (
+    Claim,
+    Granted,
+    HostState,
+    Known,
+    KnownRequest,
+    Left,
+    Stored,
+    Table,
+    Word,
+)
+from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, WORD, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import SLOW_NS, AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -127,6 +137,8 @@ class RightOfWaySync:
         self._bus.subscribe(TABLE, self._post, member=self._id)
         self._bus.subscribe(STORED, self._post, member=self._id)
         keep(GRANTED, host=self._id)
+        if self.core.shards.proven:
+            keep(WORD, host=self._id)
         keep(LEFT, host=self._id)
         self._ask_known(now_ns)
 
@@ -136,6 +148,7 @@ class RightOfWaySync:
         core.silent = not self._store.ready
         match event:
             case Heard(message=Table() as table):
+                self._take_standings(now_ns)  # by which it is judged
                 self._perform(core.hear_table(table, own_ns))
             case Heard(message=Stored() as stored):
                 self._perform(core.hear_stored(stored, own_ns))
@@ -168,8 +181,9 @@ class RightOfWaySync:
         """Takes in what leaders have granted, and other hosts have left, since the last time, before vehicles
         drive. Yields the vehicles that have found their places by each message; they are to be placed before the
         next."""
-        for heard in (*self._bus.collected(LEFT), *self._bus.collected(GRANTED)):
-            yield self.hear(heard.message, now_ns)
+        for topic in (LEFT, GRANTED, WORD):
+            for heard in self._bus.collected(topic):
+                yield self.hear(heard.message, now_ns)
 
     def is_awaited(self, message: Message) -> bool:
         """Returns True if a vehicle may stand because it waits for what this says."""
@@ -179,6 +193,8 @@ class RightOfWaySync:
                 return holdings.waits
             case Granted(grants=grants):
                 return any(len(entries) > 1 and len(holdings.path(id)) < 2 for id, entries in grants.items())
+            case Word(shard=shard):
+                return holdings.is_pending(shard)
             case HostState(vehicles=stands):
                 return any(stand.better for stand in stands)
         return False
@@ -187,8 +203,8 @@ class RightOfWaySync:
         """Takes up what a host or a leader says. Returns the vehicles that have found their places by it."""
         match message:
             case Left():
-                return self.core.host.hear_left(message)
-            case Granted():
+                return self.core.hear_left(message)
+            case Granted() | Word():
                 return self.core.host.hear_granted(message, self._own_time.at(now_ns))
             case HostState():
                 self.core.hear_host_state(message, self._own_time.at(now_ns))
@@ -203,8 +219,7 @@ class RightOfWaySync:
         self._look_after_store(now_ns)
         if waited and asked_ns is not None:
             self._begin()
-        for heard in self._bus.collected(HOST_STATE):
-            self.hear(heard.message, now_ns)
+        self._take_standings(now_ns)
         self._perform(self.core.tick(wishes, own_ns))
         self._tell_slow(now_ns)
         unled = self.core.host.unled(own_ns)
@@ -213,6 +228,10 @@ class RightOfWaySync:
             if now_ns >= self._unled_due_ns[shard]:
                 self._unled_due_ns[shard] = now_ns + _WAITING_AGAIN_NS
                 self._warn("waiting", text)
+
+    def _take_standings(self, now_ns: int) -> None:
+        for heard in self._bus.collected(HOST_STATE):
+            self.hear(heard.message, now_ns)
 
     def _tell_slow(self, now_ns: int) -> None:
         """States which agents answer so late that vehicles wait longer for cells."""
@@ -308,6 +327,8 @@ class RightOfWaySync:
                     self._bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case Granted():
                     self._bus.publish(GRANTED, action, shard=action.shard, host=action.host, agent=self._id)
+                case Word():
+                    self._bus.publish(WORD, action, shard=action.shard, host=action.host, agent=self._id)
                 case Table():
                     self._tell_members(TABLE, action)
                 case Stored():

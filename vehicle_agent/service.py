@@ -36,7 +36,7 @@ from swarm.wire.messages.planning import (
     Sighted,
     TargetPose,
 )
-from swarm.wire.messages.traffic import Granted, HostState, Left
+from swarm.wire.messages.traffic import Granted, HostState, Left, Word
 from swarm.wire.messages.vehicles import Followed, Obstacle, Removed, RemoveVehicles, SharedCosts, VehicleState
 from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
@@ -180,7 +180,7 @@ class AgentService:
             self.agent.obstacles.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
-        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | HostState):
+        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | HostState | Word):
             awaited = self._right_of_way.is_awaited(event.message)
             self._place(self._right_of_way.hear(event.message, now_ns))
             if awaited:
@@ -268,7 +268,8 @@ class AgentService:
         self._report(columns, now_ns)
         paths = agent.holdings.paths
         self._tell_goals(now_ns)
-        chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
+        kept = agent.holdings.keeps + 1
+        chasing = [(id, vehicle.target, paths[id][:kept]) for id, vehicle in agent.vehicles.items()]
         for chasers in parts.chasers.reports(chasing, now_ns):
             if chasers.target is None:
                 self._bus.publish(SENT, chasers, places=self._places_job, author=self._author)

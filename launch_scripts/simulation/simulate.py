@@ -111,6 +111,7 @@ class Simulation:
         chance = random.Random(f"simulation/{scenario.seed}")
         self.links = FaultyLinks(self.faults, chance, EPOCH_NS, scenario.network.lease_s)
         self.network = MemoryNetwork(self.scheduler, self.links, self.log.delivery)
+        self.network.proves_names = scenario.network.tls is not None
         self.nodes: dict[str, Node] = {}
         self.after_tick: list[Callable[[Node], None]] = []
         self.after_boot: list[Callable[[Node], None]] = []

@@ -278,6 +278,11 @@ class Bus(Protocol):
         ...
 
     @property
+    def proves_names(self) -> bool:
+        """True if certificates prove who sends a message under a key that bears the sender's name."""
+        ...
+
+    @property
     def counts(self) -> Mapping[str, int]:
         """Counters since the bus was opened, as in `new_counts`."""
         ...

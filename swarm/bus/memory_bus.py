@@ -323,11 +323,14 @@ class MemoryNetwork:
     """Simulated counterpart of a Zenoh router: connects the buses of all nodes.
 
     links  may be replaced at any time; messages under way arrive as the earlier model decided
+
+    proves_names  as in `Bus`
     """
 
     def __init__(self, scheduler: Scheduler, links: LinkModel, trace: Trace | None = None) -> None:
         self.scheduler = scheduler
         self.links = links
+        self.proves_names = False
         self.trace = trace
         self.buses: list[MemoryBus] = []
         """Open buses in the order of their opening, which is the order of queries and tokens."""
@@ -387,6 +390,7 @@ class MemoryBus:
         self.network = network
         self.node = node
         self.namespace = namespace
+        self.proves_names = network.proves_names
         self.authenticator = authenticator
         self.closed = False
         """Once true, nothing is sent or posted any more."""

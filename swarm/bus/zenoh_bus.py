@@ -170,7 +170,8 @@ def open_bus(
         if patient:
             wait_for_router(endpoints)
         try:
-            return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
+            session = zenoh.open(session_config(network, mode))
+            return ZenohBus(session, network.namespace, authenticator, proves_names=network.tls is not None)
         except zenoh.ZError as error:
             if not patient or any(map(keeps_open, endpoints)):
                 raise _why_not(error, network, mode) from error
@@ -195,8 +196,16 @@ class ZenohBus:
     Zenoh's, goes to `threading.excepthook`, by which `Process` ends.
     """
 
-    def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        namespace: str,
+        authenticator: Authenticator | None = None,
+        *,
+        proves_names: bool = False,
+    ) -> None:
         self._session = session
+        self._proves_names = proves_names
         self._namespace = namespace
         self.intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
@@ -217,6 +226,10 @@ class ZenohBus:
     @property
     def namespace(self) -> str:
         return self._namespace
+
+    @property
+    def proves_names(self) -> bool:
+        return self._proves_names
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -100,6 +100,10 @@ class BoundaryBus:
         return self._bus.namespace
 
     @property
+    def proves_names(self) -> bool:
+        return self._bus.proves_names
+
+    @property
     def counts(self) -> Mapping[str, int]:
         return self._crossing.read_as("counts of the bus", lambda: dict(self._bus.counts), dict[str, int])
 

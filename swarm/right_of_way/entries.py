@@ -12,8 +12,9 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
    back while the first is still used. Entries of the same vehicle, of an earlier generation, do not count.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
-4. An entry that was left, given back or passed over is never used again by this host.
-5. A host acts on tables for its own generation only, and in their order.
+4. An entry that was left, given back, passed over or disclaimed is never used again by this host.
+5. A host acts on tables for its own generation only, and in their order. It takes an entry only from the first
+   table that can list it: later its statements may have released the number.
 6. A new generation begins with no entry. The entries of generations before it stay in their orders until these are
    proved to have ended, which a generation with a proof gives in its first statement. Then one of them passes to
    the new generation if the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new
@@ -37,15 +38,16 @@ BEFORE_ALL: Stamp = (0, 0)
 class HostEntries:
     """The entries of the vehicles of one generation of a host.
 
-    shard_of  shard of a cell
-    adjacent  whether one step leads from one cell to another
-    bodies    vehicle -> the cell of its body, or where it would enter, while it has no place and that is known
-    away      vehicles that have left in this generation: they take no entry
-    paths     vehicle -> its entries in driving order, its own cell first
-    placed    vehicles that are on the first cell of their paths; the others are nowhere
-    over      shard -> numbers that this generation has left, given back or passed over, and its table still lists
-    heard     (number, host) of which that host has said that it is over; entries of paths know it
-    knows     shard -> the newest table acted on
+    shard_of    shard of a cell
+    adjacent    whether one step leads from one cell to another
+    bodies      vehicle -> the cell of its body, or where it would enter, while it has no place and that is known
+    away        vehicles that have left in this generation: they take no entry
+    paths       vehicle -> its entries in driving order, its own cell first
+    placed      vehicles that are on the first cell of their paths; the others are nowhere
+    over        shard -> numbers that this generation has left, given back or passed over, and its table still lists
+    disclaimed  shard -> numbers that no table has granted yet, and that are over by our word to a member
+    heard       (number, host) of which that host has said that it is over; entries of paths know it
+    knows       shard -> the newest table acted on
     """
 
     generation: int
@@ -56,6 +58,7 @@ class HostEntries:
     paths: dict[str, list[Entry]] = field(default_factory=dict)
     placed: set[str] = field(default_factory=set)
     over: dict[int, set[Number]] = field(default_factory=dict)
+    disclaimed: dict[int, set[Number]] = field(default_factory=dict)
     heard: dict[tuple[Number, str], None] = field(default_factory=dict)
     knows: dict[int, Stamp] = field(default_factory=dict)
 
@@ -85,11 +88,13 @@ class HostEntries:
     ) -> set[str]:
         """A usable table of a shard names these entries of our vehicles. Returns the vehicles of which the path has
         other entries now."""
-        if generation != self.generation or stamp <= self.knows.get(shard, BEFORE_ALL):
+        known = self.knows.get(shard, BEFORE_ALL)
+        if generation != self.generation or stamp <= known:
             return set()
         self.knows[shard] = stamp
         over = self.over.setdefault(shard, set())
         over.intersection_update(entry.number for entries in grants.values() for entry in entries)
+        no_more = self.disclaimed.get(shard, set())
         longer = set()
         for vehicle, entries in grants.items():
             path = self.paths.get(vehicle, [])
@@ -98,7 +103,9 @@ class HostEntries:
                 if entry.number in at:
                     index = at[entry.number]
                     path[index] = self._waiting(entry, path[index].after)
-                elif entry.number not in over and self._follows(vehicle, path, entry):
+                elif (
+                    entry.number[1:] > known and entry.number not in no_more and self._follows(vehicle, path, entry)
+                ):
                     path.append(self._waiting(entry, entry.after))
                     longer.add(vehicle)
                 else:
@@ -166,6 +173,18 @@ class HostEntries:
         for entry in self.paths[vehicle]:
             found.setdefault(self.shard_of(entry.cell), []).append(entry.number)
         return found
+
+    def disclaim(self, shard: int, numbers: Iterable[Number]) -> list[Number]:
+        """Returns those of some numbers that we do not hold and never take. The entries of the run's start are ours
+        until a table says otherwise."""
+        no_more, knows = self.disclaimed.setdefault(shard, set()), self.knows.get(shard, BEFORE_ALL)
+        no_more.difference_update([number for number in no_more if number[1:] <= knows])
+        held = {entry.number for path in self.paths.values() for entry in path}
+        ours = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
+        new = [number for number in ours if number[1] and number[1:] > knows]
+        if len(no_more) + len(new) <= _MOST_HEARD:
+            no_more.update(new)
+        return [number for number in ours if number in no_more or number[1:] <= knows]
 
     def holds(self, shard: int) -> dict[str, list[Number]]:
         """Returns vehicle -> its entries in a shard: all others that its newest table lists are over."""

@@ -25,8 +25,8 @@ from swarm.right_of_way.incarnations import MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id
-from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
-from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left, Word
+from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, WORD
 
 _NOBODY_NS = 10 * NS_PER_S
 """Time without a reply after which an external vehicle is informed of it."""
@@ -84,15 +84,15 @@ class ExternalService:
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role=_ROLE)
-        self._bus.subscribe(GRANTED, self._post, host=self.name)
-        self._bus.subscribe(LEFT, self._post, host=self.name)
+        for topic in (GRANTED, WORD, LEFT):
+            self._bus.subscribe(topic, self._post, host=self.name)
         self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
         self._began_ns = now_ns
         self._ask(now_ns)
 
     def stop(self) -> None:
-        self._bus.unsubscribe(GRANTED, host=self.name)
-        self._bus.unsubscribe(LEFT, host=self.name)
+        for topic in (GRANTED, WORD, LEFT):
+            self._bus.unsubscribe(topic, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
         """Asks for the cell on which the vehicle stands. Raises as `ExternalVehicle.enter`."""
@@ -115,7 +115,7 @@ class ExternalService:
     def on_external_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about the right of way of this external vehicle."""
         match event:
-            case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
+            case Heard(message=(Granted() | Word()) as granted) if granted.host == self.name:
                 if self.external is not None:
                     self.external.hear_granted(granted, now_ns)
             case Heard(topic=topic, message=Left() as left) if topic is LEFT and left.host == self.name:
@@ -162,7 +162,7 @@ class ExternalService:
                     (f"{self.name} is an agent of this run's scenario: an external vehicle needs another name",)
                 )
                 return
-            shards = Shards(self._grid, known.agents, known.shard_cells)
+            shards = Shards(self._grid, known.agents, known.shard_cells, proven=self._bus.proves_names)
             self.external = ExternalVehicle(shards, self.name, self._generations.generations)
             for peer in self._tokens:
                 self.external.hear_token(peer, up=True)
@@ -404,6 +404,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     clock = MonotonicClock()
     bus.watch_alive(inbox.post)
     bus.subscribe(GRANTED, inbox.post, host=name)
+    bus.subscribe(WORD, inbox.post, host=name)
     bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
     removal: Removal | None = None
     begun, due_ns = False, 0
@@ -418,7 +419,8 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                         f"{name} is an agent of the scenario, not an external vehicle: start it again instead"
                     )
                 if removal is None or (not begun and known.shard_cells > removal.shards.side):
-                    removal = Removal(Shards(grid, known.agents, known.shard_cells), name)
+                    shards = Shards(grid, known.agents, known.shard_cells, proven=bus.proves_names)
+                    removal = Removal(shards, name)
                 if known.shard_cells == removal.shards.side:
                     removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
@@ -428,7 +430,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 begun = True
             case AskEnded() if not begun:
                 bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
-            case Heard(message=Granted() as granted) if removal is not None:
+            case Heard(message=(Granted() | Word()) as granted) if removal is not None:
                 removal.hear_granted(granted, now_ns)
             case _:
                 pass

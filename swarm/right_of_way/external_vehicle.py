@@ -9,13 +9,11 @@ from itertools import pairwise
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Granted, Known, Left
+from swarm.wire.messages.traffic import Granted, Known, Left, Word
 
-MOST_AHEAD = 16
-"""Cells ahead of itself that an external vehicle is granted at most."""
 _PATIENCE_NS = 3 * NS_PER_S
 """For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
@@ -157,8 +155,8 @@ class ExternalVehicle:
         self._host.holdings.enter(self.vehicle, self._cell)
         return [SaveGenerations(self._generations)]
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> bool:
-        """A leader's word to us. Returns True if the vehicle has entered by it."""
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> bool:
+        """A leader's grant, or a member's word on one. Returns True if the vehicle has entered by it."""
         return bool(self._host.hear_granted(granted, now_ns))
 
     def hear_left(self, left: Left) -> bool:
@@ -251,7 +249,7 @@ class Removal:
         self._host.begin(sorted(self._generations)[1 - GENERATIONS_KEPT :], chance)
         self._host.holdings.end_at_once()
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> None:
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> None:
         self._host.hear_granted(granted, now_ns)
 
     def tick(self, now_ns: int) -> list[Tell]:

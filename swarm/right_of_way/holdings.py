@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import blake2b
 from itertools import chain, takewhile
 
 import msgspec
@@ -12,12 +13,14 @@ import msgspec
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand
+from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand, Word
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
 """A host that has not heard a shard's leader for so long speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
+MOST_AHEAD = 16
+"""Cells ahead that one statement may request."""
 _MOST_CELLS = 1 << 12
 """Cells whose shard is remembered: more than the vehicles of one host have near them."""
 
@@ -39,6 +42,13 @@ _NO_WISH = Wish()
 _NO_STANDS: Mapping[str, _Told] = {}
 
 
+def part_of(generation: int, grants: Mapping[str, Sequence[Entry]]) -> int:
+    """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and a thief
+    of a name has a fraction of a second to find other grants with the same digest."""
+    said = msgspec.msgpack.encode((generation, sorted(grants.items())))
+    return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
+
+
 @dataclass(frozen=True, slots=True)
 class Tell:
     """Send a host state to these members of its shard."""
@@ -54,11 +64,15 @@ class _View:
     leader    of the last grant, and the time when that was received
     heard     the newest host state of ours that the table in use takes into account
     seen      vehicle -> its entries in the table in use
-    followed  other host -> entries of ours behind which its vehicles wait, by the same table
+    followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
+    asked     member -> entries that it lacks our word about
     left      other host -> those of these that are over, as we told it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
     others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet     the first host state from which on we want nothing here; None while we do
+    words     member -> its last word, where names are proven; a grant is its leader's word. An older one that comes
+              late does no harm: no entry is taken that a used table could have granted
+    pending   leader -> its last grant, until a majority has the same on file, and its digest
     told      the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
     """
@@ -68,10 +82,13 @@ class _View:
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
+    asked: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
+    words: dict[str, Word] = field(default_factory=dict)
+    pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
     same: bool = False
@@ -86,6 +103,7 @@ class _Said(msgspec.Struct, frozen=True):
 
     wish: Wish
     path: list[int]
+    held: list[Number]
     stands: dict[int, _Told]
 
 
@@ -94,6 +112,7 @@ class Holdings:
 
     vehicles  those of the host; None for all that bear its name
 
+    keeps       cells ahead that a vehicle keeps though others wait for them
     generation  which generation of the host this is; 0 before `begin`
     shards      those that concern the host now: it speaks to their members and listens to their tables
     replaced    a later generation of this host has spoken: this one must end
@@ -105,6 +124,7 @@ class Holdings:
         self._shards = shards
         self._shard_of = lru_cache(_MOST_CELLS)(shards.of)
         self._agent = agent
+        self.keeps = MOST_AHEAD
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
         self.end()
@@ -126,6 +146,8 @@ class Holdings:
         self._stands: dict[int, dict[str, _Told]] = {}
         """Shard -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
+        self._followed: set[Number] = set()
+        """Entries of ours behind which others wait."""
         self._seq = 0
 
     def begin(self, generation: int, dead: Sequence[int]) -> None:
@@ -246,6 +268,10 @@ class Holdings:
         """The vehicles that have entries in a shard, as far as its table in use tells."""
         return list(self._views[shard].seen) if shard in self._views else []
 
+    def is_pending(self, shard: int) -> bool:
+        """Returns True if a grant of a shard waits for words of its members."""
+        return shard in self._views and bool(self._views[shard].pending)
+
     def heard_ns(self, shard: int) -> int:
         """Time when a shard's leader was heard last; 0 if none was."""
         return self._views[shard].heard_ns if shard in self._views else 0
@@ -269,6 +295,45 @@ class Holdings:
         if granted.agent != self._shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
         view.leader, view.heard_ns = granted.agent, now_ns
+        if not self._shards.proven:
+            return self._take(view, granted)
+        part = part_of(granted.generation, granted.grants)
+        view.pending[granted.agent] = granted, part
+        word = Word(
+            shard=granted.shard,
+            host=self._agent,
+            agent=granted.agent,
+            epoch=granted.epoch,
+            seq=granted.seq,
+            part=part,
+        )
+        return self.hear_word(word)
+
+    def hear_word(self, word: Word) -> list[str]:
+        """A member has something on file for us: use the grants that a majority has. Returns the vehicles that have
+        found their place."""
+        if word.agent not in self._shards.members(word.shard):
+            return []
+        if word.asks:
+            self.watch([word.shard])
+        view = self._views.get(word.shard)
+        if view is None:
+            return []
+        view.words[word.agent] = word
+        view.asked[word.agent] = word.lacks
+        placed: list[str] = []
+        for leader, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
+            same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
+            if same >= self._shards.majority:
+                del view.pending[leader]
+                placed += self._take(view, granted)
+        return placed
+
+    def _take(self, view: _View, granted: Granted) -> list[str]:
+        """Acts on a grant that counts."""
+        knows = self._entries.knows.get(granted.shard, BEFORE_ALL)
+        if granted.stamp < knows:
+            return []
         self.newest = max(self.newest, granted.generation)
         if granted.generation > self.generation and not self.replaced:
             self.replaced = True
@@ -291,6 +356,11 @@ class Holdings:
         self._seen_anew.update(changed, [id for id in before if before[id] != view.seen.get(id)])
         for vehicle in changed & self._paths.keys():
             self._set_path(vehicle)
+        self._followed = {number for view in self._views.values() for number in chain(*view.followed.values())}
+        for vehicle in ours.keys() & self._paths.keys() if granted.followed else ():
+            far = [entry.number for entry in self._entries.paths[vehicle][self.keeps + 1 :]]
+            if not self._followed.isdisjoint(far):
+                self.give_back(vehicle, self.keeps + 1 + [number in self._followed for number in far].index(True))
         return self._place()
 
     def hear_left(self, left: Left) -> list[str]:
@@ -346,9 +416,13 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for shard, view in self._views.items():
             over = self._entries.over.get(shard, set())
-            for host, numbers in view.followed.items():
+            others = {host: of for host, of in view.followed.items() if host != self._agent}
+            said = {host: [number for number in of if number in over] for host, of in others.items()}
+            for member, lacks in view.asked.items():
+                if lacks:
+                    said[member] = [*said.get(member, ()), *self._entries.disclaim(shard, lacks)]
+            for host, left in said.items():
                 told, told_ns = view.left.get(host, (None, 0))
-                left = [number for number in numbers if number in over]
                 if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
@@ -362,7 +436,7 @@ class Holdings:
             if (
                 before is not None
                 and before.wish is wish
-                and before.path is path
+                and (before.path is path or self._is_no_news(before, path))
                 and not (anew and vehicle in anew)
             ):
                 continue
@@ -379,6 +453,13 @@ class Holdings:
             for vehicle in self._paths:
                 for shard, told in known[vehicle].stands.items():
                     self._stands.setdefault(shard, {})[vehicle] = told
+
+    def _is_no_news(self, said: _Said, path: list[int]) -> bool:
+        """Returns True if a vehicle has only driven on, out of cells for which none waits, and has as many ahead as
+        it keeps."""
+        left = len(said.path) - len(path)
+        drove = left > 0 and len(path) > self.keeps and said.path[left:] == path
+        return drove and self._followed.isdisjoint(said.held[:left])
 
     def _say_all_again(self) -> None:
         """Statements of all shards may change."""
@@ -399,7 +480,7 @@ class Holdings:
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]
-        if view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+        if not self._shards.proven and view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
             return (view.leader,)
         return self._shards.members(shard)
 
@@ -432,9 +513,9 @@ class Holdings:
         held = [entry.number for entry in self._entries.paths[vehicle]]
         for shard in near:
             holds = held if len(near) == 1 else [number for number in held if shard_of(number[0]) == shard]
-            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms)
+            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms, self.keeps)
             stands[shard] = stand, (vehicle, path[0], holds, ahead, better)
-        return _Said(wish, path, stands)
+        return _Said(wish, path, held, stands)
 
     def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leaves the shards where we hold and want nothing, once their tables show that they know it."""

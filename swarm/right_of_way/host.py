@@ -11,7 +11,7 @@ from swarm.liveness import Peer, Roster
 from swarm.right_of_way.holdings import Holdings, Tell, Wish
 from swarm.right_of_way.incarnations import first_generation, is_far_ahead
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Granted, Left
+from swarm.wire.messages.traffic import Granted, Left, Word
 
 GENERATIONS_KEPT = 32
 """Numbers of generations on file, as many as a `Standing` has room for."""
@@ -60,7 +60,8 @@ class Host:
         if self._told_by.issuperset(self.shards.agents):
             return True
         every = map(self.shards.members, self.shards.all)
-        return all(len(self._told_by.intersection(of)) > len(of) - self.shards.majority for of in every)
+        enough = self.shards.liars - self.shards.majority
+        return all(len(self._told_by.intersection(of)) > len(of) + enough for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
         """Begins a new generation, once those who could be asked have answered. Returns those to keep on file;
@@ -73,9 +74,13 @@ class Host:
         self.holdings.begin(generation, dead)
         return [*dead[1 - GENERATIONS_KEPT :], generation]
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """A leader's word to us. Returns the vehicles that have found their place."""
-        if not self.holdings.generation or granted.shard not in self.holdings.shards:
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> list[str]:
+        """A leader's grant, or a member's word on one. Returns the vehicles that have found their place."""
+        if not self.holdings.generation or granted.shard not in self.shards.all:
+            return []
+        if isinstance(granted, Word):
+            return self.holdings.hear_word(granted)
+        if granted.shard not in self.holdings.shards:
             return []
         placed = self.holdings.hear_granted(granted, now_ns)
         if self.holdings.heard_ns(granted.shard) == now_ns:

@@ -14,6 +14,8 @@ _LAYERS = 2
 """The ground and the air."""
 FEWEST_FOR_MAJORITY = 3
 """Members of a shard; a layer of fewer agents has one for each shard."""
+_FEWEST_FOR_A_LIAR = 4
+"""Members of a shard of which one may lie: any two groups of three share two, and one of these is honest."""
 
 
 def fitting_regions(rows: int, cols: int, agents: int) -> int:
@@ -37,7 +39,8 @@ class Shards:
     processes with the same side agree.
 
     The members of a shard are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998). With
-    fewer than three agents there is one member: a majority of two would need both to be alive.
+    fewer than three agents there is one member: a majority of two would need both to be alive. Where names are
+    proven there are four, if the layer has four agents: then one of them may lie (docs/design/right-of-way.md).
 
     Ground and air are two layers, with shards and agents of their own: no vehicle in one requests, holds or waits
     for anything in the other.
@@ -47,11 +50,14 @@ class Shards:
             shards mean more messages
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no external vehicle may take their names
+    proven  certificates prove who sends a message; all processes of a run agree on it
 
-    all    the numbers of the layer's shards. Shards of different sizes have different numbers, so a statement about
-           a shard of another size is ignored and cannot release cells
-    spare  how many agents may use another shard size while agents with this size act as members (for shards larger
-           than a region, see `has_quorum`)
+    majority  members that have to have a table on file before it counts
+    liars     members of a shard that may lie without harm
+    all       the numbers of the layer's shards. Shards of different sizes have different numbers, so a statement
+              about a shard of another size is ignored and cannot release cells
+    spare     how many agents may use another shard size while agents with this size act as members (for shards
+              larger than a region, see `has_quorum`)
 
     Raises ConfigError where the numbers of so narrow a grid do not fit into a message.
     """
@@ -63,8 +69,11 @@ class Shards:
         side: int = REGION_CELLS,
         layer: int = 0,
         others: Collection[str] = (),
+        *,
+        proven: bool = False,
     ) -> None:
         self.grid = grid
+        self.proven = proven
         self.agents = tuple(agents)
         self.side = side
         self._cells, self._cols = grid.cells, grid.cols
@@ -81,7 +90,11 @@ class Shards:
                 f"map.shard_regions is {side // REGION_CELLS}: a grid of {grid.rows} x {grid.cols} cells is too"
                 " narrow for shards larger than a region"
             )
-        self.majority = 2 if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
+        self._seats = FEWEST_FOR_MAJORITY if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
+        if proven and len(self.agents) >= _FEWEST_FOR_A_LIAR:
+            self._seats = _FEWEST_FOR_A_LIAR
+        self.majority = self._seats // 2 + 1
+        self.liars = int(self._seats == _FEWEST_FOR_A_LIAR)
         self.spare = FEWEST_FOR_MAJORITY - 1 if self.majority > 1 else 0
 
     def of(self, cell: int) -> int:
@@ -103,7 +116,7 @@ class Shards:
         members = self._members.get(shard)
         if members is None:
             by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{shard}/{agent}".encode()).digest())
-            members = self._members[shard] = tuple(by_hash[: FEWEST_FOR_MAJORITY if self.majority > 1 else 1])
+            members = self._members[shard] = tuple(by_hash[: self._seats])
         return members
 
     def leader(self, shard: int, epoch: int) -> str:

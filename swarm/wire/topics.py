@@ -267,6 +267,13 @@ GRANTED = Topic(
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
+WORD = Topic(
+    "word", "word/{shard}/{host}/{agent}", traffic.Word,
+    "a member's word on what it has on file for a host, which counts a grant with those of a majority; sent where "
+    "certificates prove names", "on change, else 5 Hz",
+    access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
+    put_bytes=_SHORT,
+)  # fmt: skip
 LEFT = Topic(
     "left", "left/{host}/{agent}", traffic.Left,
     "which cells vehicles of a host have left, for another host whose vehicles follow them; each counts",
@@ -443,9 +450,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SENT, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, LEFT,
-    STORED, KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, OBSTACLE, ROUTE, COST, PLACE_ROUTE,
-    NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SENT, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, WORD,
+    LEFT, STORED, KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, OBSTACLE, ROUTE, COST,
+    PLACE_ROUTE, NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip
 

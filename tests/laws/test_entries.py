@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from support.careless_hosts import takes_what_an_older_table_added
 from support.order_world import OrderWorld
 
 from swarm.right_of_way.entries import HostEntries
@@ -57,28 +58,6 @@ def says_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
         return enter(self, vehicle)
 
     patch.setattr(HostEntries, "enter_next", early)
-
-
-def _forgetting(patch: pytest.MonkeyPatch, before: Callable[[HostEntries], object]) -> None:
-    """A host takes up a table without what it knows to be over, or forgets what it has passed over by it."""
-    hear = HostEntries.hear_granted
-
-    def forgetful(self: HostEntries, *what: Any) -> set[str]:
-        over = {shard: set(numbers) for shard, numbers in self.over.items()}
-        before(self)
-        changed = hear(self, *what)
-        self.over = over
-        return changed
-
-    patch.setattr(HostEntries, "hear_granted", forgetful)
-
-
-def takes_back_what_it_gave(patch: pytest.MonkeyPatch) -> None:
-    _forgetting(patch, lambda entries: entries.over.clear())
-
-
-def takes_later_what_it_passed_over(patch: pytest.MonkeyPatch) -> None:
-    _forgetting(patch, lambda entries: None)
 
 
 def acts_on_what_was_granted_to_another_generation(patch: pytest.MonkeyPatch) -> None:
@@ -162,8 +141,7 @@ RULES: list[Mutation] = [
     enters_at_once,
     waits_for_the_last_before_it_only,
     says_left_when_it_sets_out,
-    takes_back_what_it_gave,
-    takes_later_what_it_passed_over,
+    takes_what_an_older_table_added,
     acts_on_what_was_granted_to_another_generation,
     believes_that_another_vehicle_of_the_cell_has_left,
     forgets_who_is_before,
@@ -180,7 +158,7 @@ RULES: list[Mutation] = [
 ]
 
 
-FIRST = {"takes_later_what_it_passed_over": 121, "forgetful": 72, "proves_too_much": 49}
+FIRST = {"forgetful": 72, "proves_too_much": 49}
 """Histories tried before the others: rare faults are found soon."""
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from support.careless_hosts import takes_what_an_older_table_added
 from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
@@ -114,16 +115,6 @@ def a_silent_external_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Leader, "tick", leasing)
 
 
-def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-
-    def again(self: HostEntries, *what):  # type: ignore[no-untyped-def]
-        self.over.clear()
-        return hear(self, *what)
-
-    patch.setattr(HostEntries, "hear_granted", again)
-
-
 def a_robot_that_is_replaced_says_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
     def talkative(self: ExternalVehicle, now_ns: int):  # type: ignore[no-untyped-def]
         actions = self._host.standings({}, now_ns)
@@ -167,7 +158,7 @@ def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPat
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     first_cells_are_entered_while_others_are_there,
     a_silent_external_loses_its_cells,
-    a_first_cell_is_taken_from_a_table_that_is_about_to_free_it,
+    takes_what_an_older_table_added,
     a_robot_that_is_replaced_says_that_it_has_ended,
     a_robot_drives_on_though_it_is_replaced,
     a_cell_that_was_shut_for_a_external_is_anybodys,
@@ -176,7 +167,6 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
 
 
 FIRST = {
-    "a_first_cell_is_taken_from_a_table_that_is_about_to_free_it": 66,
     "a_robot_that_is_replaced_says_that_it_has_ended": 3,
     "a_robot_drives_on_though_it_is_replaced": 4,
     "a_cell_that_was_shut_for_a_external_is_anybodys": 3,

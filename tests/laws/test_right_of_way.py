@@ -14,6 +14,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.careless_hosts import takes_what_an_older_table_added
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.entries import HostEntries
@@ -230,19 +231,6 @@ def says_that_it_has_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Holdings, "lefts", early)
 
 
-def takes_again_what_it_gave_back(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-
-    def greedy(self: HostEntries, *what):  # type: ignore[no-untyped-def]
-        over, self.over = self.over, {}
-        changed = hear(self, *what)
-        for shard, numbers in over.items():
-            self.over.setdefault(shard, set()).update(numbers)
-        return changed
-
-    patch.setattr(HostEntries, "hear_granted", greedy)
-
-
 def a_new_generation_takes_what_the_last_one_held(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Orders, "_fence", lambda self, host, generation: None)
 
@@ -282,7 +270,7 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     follows_without_a_word,
     follows_on_the_word_of_the_last_before_it,
     says_that_it_has_left_when_it_sets_out,
-    takes_again_what_it_gave_back,
+    takes_what_an_older_table_added,
     a_new_generation_takes_what_the_last_one_held,
     seats_a_file_that_is_not_the_first,
     acts_on_a_table_that_is_not_the_newest,

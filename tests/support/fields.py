@@ -105,7 +105,7 @@ def from_file(path: Path) -> Pace:
             from swarm.config.scenario import Scenario
 
             pace = build_terrain(Scenario(terrain=TerrainConfig(source=str(path)))).pace_s_per_m
-    return np.ascontiguousarray(pace, np.float32)
+    return np.array(pace, np.float32, order="C")  # arrays of files may be read-only, which kernels refuse
 
 
 def _read_npy(path: Path) -> NDArray[np.floating[Any]]:

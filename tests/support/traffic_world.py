@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table
+from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table, Word
 from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -134,7 +135,7 @@ class Process:
                 case Stored():
                     for member in self.world.shards.members(action.shard):
                         self.world.send(self, member, lambda to, s=action: to.hear_stored(s))
-                case Granted():
+                case Granted() | Word():
                     self.world.send(self, action.host, lambda to, g=action: to.hear_granted(g))
                 case Left():
                     self.world.send(self, action.host, lambda to, left=action: to.hear_left(left))
@@ -149,11 +150,14 @@ class Process:
     def hear_stored(self, stored: Stored) -> None:
         self.perform(self.rights.hear_stored(stored, self.now_ns))
 
-    def hear_granted(self, granted: Granted) -> None:
+    def hear_claim(self, shard: int, epoch: int) -> list[Action]:
+        return self.rights.hear_claim(shard, epoch, self.now_ns)
+
+    def hear_granted(self, granted: Granted | Word) -> None:
         self.place(self.rights.host.hear_granted(granted, self.now_ns))
 
     def hear_left(self, left: Left) -> None:
-        self.place(self.rights.host.hear_left(left))
+        self.place(self.rights.hear_left(left))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
@@ -231,10 +235,24 @@ class Process:
 
 
 class TrafficWorld:
-    """`collisions` are pairs of different vehicles that were on one cell, also of the dead and the replaced."""
+    """`collisions` are pairs of different vehicles that were on one cell, also of the dead and the replaced.
+
+    stolen  an agent of which the vehicles do not count, as its name is used by a thief
+    """
+
+    stolen = ""
 
     def __init__(
-        self, seed: int, agents: int, per_agent: int, size: int, side: int, faults: Faults, walls: float = 0.0
+        self,
+        seed: int,
+        agents: int,
+        per_agent: int,
+        size: int,
+        side: int,
+        faults: Faults,
+        walls: float = 0.0,
+        *,
+        proven: bool = False,
     ) -> None:
         self.chance = random.Random(seed)
         self.faults = faults
@@ -242,7 +260,7 @@ class TrafficWorld:
         self.now_ns = 0
         self.grid = GridSpec(size, size, 1.0)
         names = [f"a{k}" for k in range(agents)]
-        self.shards = Shards(self.grid, names, side)
+        self.shards = Shards(self.grid, names, side, proven=proven)
         # Pillars on every fourth cell at most, so that the rest hangs together.
         pillars = {
             row * size + col
@@ -296,8 +314,8 @@ class TrafficWorld:
 
     def look(self) -> None:
         """The law: different vehicles are on different cells, whatever their hosts."""
-        on = {cell: vehicle for vehicle, cell in self.unmoved.items()}
-        for disks in self.disks.values():
+        on = {cell: vehicle for vehicle, cell in self.unmoved.items() if agent_of(vehicle) != self.stolen}
+        for disks in (of for agent, of in self.disks.items() if agent != self.stolen):
             for disk in disks:
                 for vehicle, cell in disk.bodies.items():
                     other = on.setdefault(cell, vehicle)
@@ -354,7 +372,7 @@ class TrafficWorld:
 
     def claim(self, source: Process, claim: AskPromises, member: str) -> None:
         def ask(to: Process) -> None:
-            actions = to.rights.hear_claim(claim.shard, claim.epoch, to.now_ns)
+            actions = to.hear_claim(claim.shard, claim.epoch)
             to.perform([action for action in actions if not isinstance(action, Table)])
             for table in actions:
                 if isinstance(table, Table):

@@ -114,7 +114,7 @@ class Driver:
                     motion.row[DRIVEN_S] = math.nan
                     return left_s  # in this tick another of ours may leave yet
             else:
-                path = self._holdings.open(vehicle.id)
+                path = self._holdings.open(vehicle.id)[: self._holdings.keeps + 1]
                 passes = partial(vehicle.route.point, cols=self._cols)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground

@@ -43,6 +43,8 @@ class Orders:
         self.fenced: dict[tuple[str, int], dict[str, list[Number]]] = {}
         self.orders: dict[int, dict[Number, str]] = {}
         self._fences: set[Number] = set()
+        self._told: dict[str, list[Entry]] = {}
+        """Vehicle -> its entries, each with those before it, as long as neither these nor those change."""
         self.newest = 0
         """The highest sequence of an entry with which a vehicle has begun."""
         for vehicle, entries in table.grants.items():
@@ -127,7 +129,10 @@ class Orders:
     def granted(self, host: str) -> dict[str, list[Entry]]:
         """Returns the entries of a host's vehicles, each with those before it."""
         vehicles = self.by_host.get(host, ())
-        return {vehicle: [self._entry(number, vehicle) for number in self.of[vehicle]] for vehicle in vehicles}
+        for vehicle in vehicles:
+            if vehicle not in self._told:
+                self._told[vehicle] = [self._entry(number, vehicle) for number in self.of[vehicle]]
+        return {vehicle: self._told[vehicle] for vehicle in vehicles}
 
     def _entry(self, number: Number, vehicle: str) -> Entry:
         if len(self.order(number[0])) <= 1:  # none if a table of a stolen name lists an entry twice
@@ -136,13 +141,13 @@ class Orders:
         return Entry(number, before)
 
     def followed(self) -> dict[str, dict[str, list[Number]]]:
-        """Returns host -> other host -> entries of the first behind which vehicles of the other wait."""
+        """Returns host -> host -> entries of the first behind which vehicles of the second wait."""
         found: dict[str, dict[str, list[Number]]] = {}
         for order in self.orders.values():
             if len(order) > 1:
                 hosts = [(number, agent_of(vehicle)) for number, vehicle in order.items()]
                 for index, (number, host) in enumerate(hosts):
-                    for other in {other for _, other in hosts[index + 1 :]} - {host}:
+                    for other in {other for _, other in hosts[index + 1 :]}:
                         found.setdefault(host, {}).setdefault(other, []).append(number)
         return found
 
@@ -257,6 +262,7 @@ class Orders:
         return True
 
     def _set(self, vehicle: str, entries: list[Number]) -> None:
+        self._told.pop(vehicle, None)
         vehicles = self.by_host.setdefault(agent_of(vehicle), {})
         if entries:
             self.of[vehicle] = entries
@@ -268,5 +274,7 @@ class Orders:
     def _drop(self, number: Number) -> None:
         order = self.orders.get(number[0], {})
         order.pop(number, None)
+        for vehicle in order.values():
+            self._told.pop(vehicle, None)
         if not order:
             self.orders.pop(number[0], None)

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table
-from vehicle_agent.traffic.shard_leader import Leader
+from swarm.wire.messages.traffic import Granted, HostState, Left, Stamp, Stored, Table, Word
+from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
+from vehicle_agent.traffic.witness import Witness
 
 LEASE_NS = 3 * HEARTBEAT_NS
 """A leader that is silent for so long may be replaced, later where answers take long. Until then its members refuse
@@ -31,8 +32,6 @@ SLOW_NS = 3 * NS_PER_S // 10
 """Above this round trip a link is reported as slow: an election then takes longer than on a fast link."""
 _ASKED_KEPT = 16
 """Tables and claims of which it is kept when they were sent."""
-_TABLES_KEPT = 16
-"""More than may be on the way at once: an older one is never asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ class Refused:
     text: str
 
 
-MemberAction = Save | AskPromises | Refused | Table | Stored | Granted
+MemberAction = Save | AskPromises | Refused | Table | Stored | Granted | Word
 
 
 class RoundTrips:
@@ -122,6 +121,7 @@ class Member:
         self._me = me
         self._fleets = fleets
         self._members = shards.members(self.shard)
+        self._witness = Witness(me) if shards.proven else None
         self._others = tuple(member for member in self._members if member != me)
         self._rank = self._members.index(me)
         self._claimed = 0
@@ -131,7 +131,8 @@ class Member:
         self._led_until_ns = now_ns  # the leader that we know of is in charge at least so long
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
-        self._acked_ns = now_ns
+        self._acked_ns = dict.fromkeys(self._others, now_ns)
+        """Other member -> when it acknowledged our claim or table last."""
         self._told: list[Table] = []
         """Tables published as leader, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
@@ -175,10 +176,16 @@ class Member:
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
             start_ns = max(_START_NS, self._trips.bound_ns(self._others) + self._tick_ns)
             self._due_ns = max(self._due_ns, now_ns + (start_ns if led else 0) + self._turn_ns())
-            self._acked_ns = now_ns
+            self._acked_ns = dict.fromkeys(self._others, now_ns)
         self._wanted_ns = now_ns
+        if self._witness is not None:
+            self._witness.hear_host_state(standing, now_ns)
         if self.leader is not None:
             self.leader.take_host_state(standing, now_ns)
+
+    def hear_left(self, left: Left) -> None:
+        if self._witness is not None:
+            self._witness.hear_left(left)
 
     # --- what members say -----------------------------------------------------------------------------------
 
@@ -199,8 +206,11 @@ class Member:
         self._led(now_ns, table.agent)
         actions: list[MemberAction] = []
         if table.stamp > self.stored.stamp:
+            if not self._accepts(table):
+                return self._words(now_ns)
             self.promised, self.stored = table.epoch, table
             actions.append(Save(self.promised, self.stored))
+            actions += self._words(now_ns)
         if table.stamp == self.stored.stamp:
             self._said = min(self._said, (table.epoch, table.seq - 1))  # a repeated table is acknowledged again
             if self._shards.leader(self.shard, table.epoch + 1) == self._me:
@@ -210,6 +220,13 @@ class Member:
     def _say(self, now_ns: int) -> Stored:
         self._said, self._said_ns = self.stored.stamp, now_ns
         return self.on_file
+
+    def _accepts(self, table: Table) -> bool:
+        return self._witness is None or self._witness.accepts(self.stored, table)
+
+    def _words(self, now_ns: int) -> list[MemberAction]:
+        """Returns our words to hosts, where these need more than the leader's."""
+        return [] if self._witness is None else [*self._witness.words(self.stored, now_ns)]
 
     def _say_late(self, now_ns: int) -> list[MemberAction]:
         """Returns the reply of the member that is second after the leader about its file. With the leader the first
@@ -253,10 +270,10 @@ class Member:
         if self.leader is None:
             return []
         if stored.epoch == self.leader.epoch:
-            self._acked_ns = now_ns
+            self._acked_ns[stored.agent] = now_ns
             if stored.seq and stored.agent == self._shards.leader(self.shard, stored.epoch + 1):  # replies at once
                 self._answered(stored.agent, (stored.epoch, stored.seq), now_ns)
-            return self._on_file(self.leader, stored.seq, now_ns)
+            return [] if self._witness is not None else self._on_file(self.leader, stored.seq, now_ns)
         if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
         return []
@@ -289,7 +306,7 @@ class Member:
         if wanted and self.leader is not None and self._claim_above <= self.leader.epoch:
             return self._lead(self.leader, now_ns)
         if not wanted or (self.leader is None and now_ns < self._due_ns):
-            return self._say_late(now_ns)
+            return [*self._say_late(now_ns), *self._words(now_ns)]
         return self._claim(now_ns)
 
     def _claim(self, now_ns: int) -> list[MemberAction]:
@@ -306,7 +323,8 @@ class Member:
         return actions
 
     def _lead(self, leader: Leader, now_ns: int) -> list[MemberAction]:
-        if self._others and now_ns - self._acked_ns > self._lease_ns:
+        acked_ns = sorted(self._acked_ns.values(), reverse=True)[: self._shards.majority - 1]
+        if acked_ns and now_ns - acked_ns[-1] > self._lease_ns:
             self.leader = None  # no messages arrive in one direction: leave it to the others
             self._led(now_ns, self._me)
             return []
@@ -317,23 +335,29 @@ class Member:
             self._ask(table.stamp, now_ns)
             if table is not self.stored:
                 self.stored = table
-                self._told = [*self._told[-_TABLES_KEPT:], table]
+                self._told = [*self._told[-TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
             # A table on file with both others needs no more than its number: at rest tables were a fifth of all
             # bytes.
-            answered = now_ns - self._acked_ns < 2 * HEARTBEAT_NS
+            answered = all(now_ns - acked_ns < 2 * HEARTBEAT_NS for acked_ns in self._acked_ns.values())
             known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
             actions.append(self.on_file if known and answered else table)
-            if self._shards.majority == 1:
+            if self._witness is not None:
+                actions += leader.granted(table, now_ns)  # the hosts count the members' words
+            elif self._shards.majority == 1:
                 actions += self._on_file(leader, table.seq, now_ns)
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
-        if self.leader is None and len(self._promises) >= self._shards.majority:
-            newest = max(self._promises.values(), key=lambda table: table.stamp)
-            self.leader = Leader(self._shards, self._me, self._claimed, newest, self._fleets)
+        if self.leader is not None or len(self._promises) < self._shards.majority:
+            return
+        known = sorted(self._promises.values(), key=lambda table: table.stamp, reverse=True)
+        while self._witness is not None and known and self._witness.contradicts(known[0]):
+            del known[0]  # stored by a member which a thief told another table
+        if known and self._accepts(known[0]):
+            self.leader = Leader(self._shards, self._me, self._claimed, known[0], self._fleets)
             self._told = []
-            self._acked_ns = now_ns
+            self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.
             self._claimed, self._promises = 0, {}
 

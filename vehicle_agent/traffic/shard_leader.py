@@ -18,7 +18,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Granted, HostState, Number, Stamp, Stand, Table
+from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
@@ -41,6 +41,8 @@ MOST_CELLS_OF_EXTERNALS = 1 << 14
 _NO_ENTRIES: Sequence[Number] = []
 _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
+TABLES_KEPT = 16
+"""More than may be on the way at once: an older one is never asked for."""
 _MOST_CELLS = 64
 """Limit for one vehicle: the largest `Grant`."""
 
@@ -65,6 +67,11 @@ def _lot(vehicle: str, step: int) -> int:
 def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
     """Returns True if a vehicle has no entry but that of its cell."""
     return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
+
+
+_Content = tuple[dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int]
+"""Content of a `Granted`: entries, those that are followed, vehicles to make way, and cells of others; then its
+generation, and what it was heard to say if it waits for that alone."""
 
 
 @dataclass(slots=True)
@@ -116,6 +123,8 @@ class Leader:
         self._changed = False  # or anything else
         self._told: Table | None = None
         self._told_ns = 0
+        self._content: dict[Stamp, dict[str, _Content]] = {}
+        """Stamp of a table -> host -> what it is told of that."""
         self._said_of: Table | None = None
         self._said_ns = 0
 
@@ -132,7 +141,10 @@ class Leader:
                 f"shard {self._shard} has known {MOST_EXTERNALS} external vehicles: {host} cannot enter"
             )
             return
-        known = self._hosts.setdefault(host, _Host(now_ns))
+        if host not in self._hosts:
+            self._hosts[host] = _Host(now_ns)
+            self._changed = True
+        known = self._hosts[host]
         known.spoke_ns = now_ns
         generation, seq = self._orders.hosts.get(host, (0, 0))
         if standing.ended:
@@ -202,6 +214,9 @@ class Leader:
         if self._told is None or self._granted or self._changed:
             self.seq += 1
             self._told = self._orders.table(self._shard, self._me, (self.epoch, self.seq), self._pushed)
+            self._content[self._told.stamp] = self._content_of(self._told)
+            if len(self._content) > TABLES_KEPT:
+                del self._content[next(iter(self._content))]
         self._changed = self._granted = False
         self._told_ns = now_ns
         return self._told
@@ -212,25 +227,15 @@ class Leader:
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
-        current = table is self._told and not (self._granted or self._changed)
-        orders = self._orders if current else Orders(table)
-        held, cols, followed = orders.orders.keys(), self._shards.grid.cols, orders.followed()
-        for name, host in self._hosts.items():
+        for name, content in self._content.get(table.stamp, {}).items():
+            host = self._hosts[name]
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             generation, heard = table.hosts.get(name, (0, 0))
-            grants = orders.granted(name)
-            # Also around those under way: their requests once they come to rest depend on the cells around.
-            stands = () if host.standing is None else host.standing.vehicles
-            others = held - {each.cell for entries in grants.values() for each in entries}
-            near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
-            occupied = sorted(others.intersection(chain.from_iterable(near)))
-            pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
-            behind = followed.get(name, {})
-            says = (generation, grants, behind, pushed, occupied, 0 if stands else heard)
-            if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
+            if content == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
                 continue
-            host.told, host.told_ns = says, now_ns
+            host.told, host.told_ns = content, now_ns
+            grants, behind, pushed, occupied, *_ = content
             yield Granted(
                 shard=table.shard,
                 host=name,
@@ -244,6 +249,23 @@ class Leader:
                 pushed=pushed,
                 occupied=occupied,
             )
+
+    def _content_of(self, table: Table) -> dict[str, _Content]:
+        """Returns host -> what is new to it in the table that has just been made."""
+        orders, cols = self._orders, self._shards.grid.cols
+        held, followed = orders.orders.keys(), orders.followed()
+        found: dict[str, _Content] = {}
+        for name, host in self._hosts.items():
+            grants = orders.granted(name)
+            # Also around those under way: their requests once they come to rest depend on the cells around.
+            stands = () if host.standing is None else host.standing.vehicles
+            others = held - {each[0] for vehicle in grants for each in orders.of[vehicle]}
+            near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
+            occupied = sorted(others.intersection(chain.from_iterable(near)))
+            pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
+            generation, heard = table.hosts.get(name, (0, 0))
+            found[name] = grants, followed.get(name, {}), pushed, occupied, generation, 0 if stands else heard
+        return found
 
     def _plan(self, now_ns: int) -> None:
         hosts = [
@@ -307,10 +329,13 @@ class Leader:
         return not self._goes_on(order[number], number)
 
     def _goes_on(self, vehicle: str, number: Number) -> bool:
-        """Returns True if a vehicle of which the host has spoken lately has an entry behind this one."""
+        """Returns True if a vehicle of which the host has spoken lately has an entry behind this one, or gives this
+        one back as soon as it is followed."""
         stand, entries = self._stands.get(vehicle), self._orders.entries(vehicle)
         if stand is None or number not in entries or self._orders.is_fenced(number[0]):
             return False
+        if entries.index(number) > stand.keeps:
+            return True
         # Into a shard of a greater number only: no leader sees circles over two, and so there are none.
         return number != entries[-1] or (
             number[0] != stand.end and number in stand.holds and self._shards.of(stand.end) > self._shard
@@ -325,7 +350,8 @@ class Leader:
         return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
 
     def _grant(self, stand: Stand, ahead: Sequence[int], taken: dict[int, str]) -> None:
-        """Append entries up to the first that is not possible, or that waits: none goes behind that."""
+        """Append entries up to the first that is not possible, or that waits: none goes behind that. Further than
+        the vehicle keeps them only where no other vehicle is near."""
         orders, vehicle = self._orders, stand.vehicle
         for cell in ahead:
             mine = taken.setdefault(cell, vehicle) == vehicle
@@ -334,13 +360,21 @@ class Leader:
             order = orders.order(cell)
             if order and not self._may_follow(stand, order):
                 return
-            if len(orders.entries(vehicle)) >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
+            held = len(orders.entries(vehicle))
+            if held >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
+                return
+            if held > stand.keeps and self._is_near(cell, vehicle):
                 return
             if not orders.append(vehicle, cell, self._next_stamp):
                 return
             self._granted = True
             if len(order) > 1:
                 return
+
+    def _is_near(self, cell: int, vehicle: str) -> bool:
+        """Returns True if another vehicle has an entry of a cell, or of one beside it."""
+        orders = map(self._orders.order, (cell, *cells_beside(cell, self._shards.grid.cols)))
+        return any(other != vehicle for order in orders for other in order.values())
 
     def _may_follow(self, stand: Stand, order: Mapping[Number, str]) -> bool:
         """Returns True if a vehicle may be put behind those in an order."""

@@ -29,6 +29,9 @@ _OCCUPIED = 0.9
 """Cost of pushing another vehicle, in cells: less than a step, so that a vehicle without another path pushes."""
 _LEAST_GAIN = 0.01
 """Advantage of the route's next cell over staying, at least, in cells."""
+FAR_CELLS = 8
+"""A vehicle with no more cells than these ahead requests as many more: half of what a statement has room for."""
+_UNDER_WAY = Wish()
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
@@ -42,7 +45,7 @@ class Steering:
     rest from there; so a host needs no tree of the planner, and one that is pushed aside finds back by itself.
 
     pace       float32 (rows, cols), s/m; inf is lethal; read at each call
-    reserve    cells ahead of itself that a vehicle may be granted
+    reserve    cells ahead of itself that a vehicle keeps though others wait for them
     obstacles  vehicles without right of way: their cells are passed like lethal ones, but by routes
     climb      says which steps are too steep; None if none is
 
@@ -156,7 +159,7 @@ class Steering:
             return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
         ahead = self._ahead(vehicle, path)
         if not still:
-            return Wish(ahead, (), 0, age_ms)
+            return Wish(ahead, (), 0, age_ms) if ahead else _UNDER_WAY
         near = self._places(vehicle.route.near(_NEAR_CELLS))
         stays = self._cost(here, near)
         cost, one_way = self._costs(here, stays, near)
@@ -204,8 +207,8 @@ class Steering:
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""
-        left = self._reserve - len(path) + 1
-        ahead = vehicle.route.after(path[-1], left) if left > 0 else []
+        asks = len(path) <= max(FAR_CELLS + 1, self._reserve)
+        ahead = vehicle.route.after(path[-1], FAR_CELLS) if asks else []
         for index, (tail, head) in enumerate(pairwise((path[-1], *ahead))):
             if not self.passable(tail, head):
                 return ahead[:index]

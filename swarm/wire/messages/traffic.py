@@ -34,6 +34,7 @@ class Stand(Part, frozen=True, array_like=True):
     wants   where else it could go from its cell, the best first; only while it stands
     better  how many of those are better than to stay; the others serve to make way
     age_ms  time for which it has been on its way: the vehicle with the longest goes first
+    keeps   how many cells ahead it keeps: its host gives back those further on once a vehicle waits for them
     """
 
     vehicle: VehicleId
@@ -44,6 +45,7 @@ class Stand(Part, frozen=True, array_like=True):
     wants: Annotated[list[Cell], Meta(max_length=8)]
     better: Annotated[int, Meta(ge=0, le=8)]
     age_ms: Milliseconds
+    keeps: Annotated[int, Meta(ge=0, le=16)] = 16
 
 
 class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 9)):
@@ -131,7 +133,7 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     epoch, seq         of the table
     generation, heard  the newest host state of the host that counts in the table; 0 if none does
     grants             vehicle of the host -> its entries, in driving order
-    followed           other host -> entries of this one behind which its vehicles wait
+    followed           host -> entries of this one behind which its vehicles wait
     pushed             vehicle of the host -> the age with which it is to make way into another shard
     occupied           of the cells around where vehicles of the host end, those that others hold
     """
@@ -151,6 +153,27 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     @property
     def stamp(self) -> Stamp:
         return self.epoch, self.seq
+
+
+class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
+    """A member of a shard has on file what the leader grants to one host. Sent where certificates prove names:
+    there a grant counts with the words of a majority.
+
+    agent       the member
+    epoch, seq  of the newest table on its file
+    part        digest of what the table grants to the host
+    asks        the member lacks a statement of the host, without which it stores no later table
+    lacks       entries of the host that such a table omits: the host says `Left` of those that it does not hold
+    """
+
+    shard: Shard
+    host: Id
+    agent: Id
+    epoch: Natural
+    seq: Natural
+    part: Natural
+    asks: bool = False
+    lacks: Held = []
 
 
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):

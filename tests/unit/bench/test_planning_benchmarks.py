@@ -55,7 +55,9 @@ def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
 def test_a_field_may_be_an_array_a_map_or_a_terrain(tmp_path: Path) -> None:
     pace = np.array([[1, 2, np.inf], [3, 4, 5]], np.float64)
     np.save(tmp_path / "pace.npy", pace)
-    np.testing.assert_array_equal(make_field(str(tmp_path / "pace.npy"), 9), pace.astype(np.float32))
+    made = make_field(str(tmp_path / "pace.npy"), 9)
+    np.testing.assert_array_equal(made, pace.astype(np.float32))
+    assert made.flags.writeable, "kernels take no array that may only be read"
     (tmp_path / "a.map").write_text("type octile\nheight 2\nwidth 3\nmap\n..@\nT.G\n", encoding="ascii")
     np.testing.assert_array_equal(
         make_field(str(tmp_path / "a.map"), 9), np.array([[1, 1, np.inf], [np.inf, 1, 1]], np.float32)
@@ -168,6 +170,13 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     without, compacted = bench("compaction", "--lives", "8")["rows"]
     assert (without["compact"], compacted["compact"]) == ("no", "yes")
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
+
+
+def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:
+    report = bench("air", "--cells", "24", "--routes", "1000")
+    assert report["clearance_broken"] == 0
+    assert report["lowest_m"] >= report["clearance_m"]
+    assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
 
 
 @pytest.mark.parametrize("field", ["terrain", "maze"])

@@ -71,6 +71,43 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     assert list(holdings.path("a0-00")) == [9, 10]
 
 
+def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once() -> None:
+    holdings = holdings_of()
+    holdings.keeps = 2
+    cells = [8, 9, 10, 11, 12, 13, 14]
+    hear(holdings, table_of(1, 1, a0=cells))
+    wish = {"a0-00": Wish()}
+    holdings.standings(wish, S)
+    for seq, followed, left in ((2, 10, cells), (3, 13, cells[:5])):
+        table = granted_of(table_of(1, seq, a0=cells))
+        holdings.hear_granted(msgspec.structs.replace(table, followed={"a1": [(followed, 1, 1)]}), S)
+        assert holdings.path("a0-00") == left
+    assert [word.entries for word in holdings.lefts(S)] == [[(13, 1, 1)]]
+    (told,) = holdings.standings(wish, S)
+    assert told.standing.vehicles[0].holds == [(cell, 1, 1) for cell in cells[:5]]
+
+
+def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left() -> None:
+    holdings = holdings_of()
+    holdings.keeps = 2
+    cells, wish = [8, 9, 10, 11, 12, 13, 14], {"a0-00": Wish()}
+    hear(holdings, table_of(1, 1, a0=cells))
+
+    def held_by_word() -> list[int]:
+        return [cell for told in holdings.standings(wish, S) for cell, *_ in told.standing.vehicles[0].holds]
+
+    assert held_by_word() == cells
+    holdings.moved("a0-00", 10)
+    assert held_by_word() == []
+    table = granted_of(table_of(1, 2, a0=cells))
+    holdings.hear_granted(msgspec.structs.replace(table, followed={"a1": [(8, 1, 1)]}), S)
+    assert held_by_word() == cells[2:]
+    holdings.moved("a0-00", 12)
+    assert held_by_word() == []
+    holdings.moved("a0-00", 13)
+    assert held_by_word() == cells[5:]
+
+
 def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))

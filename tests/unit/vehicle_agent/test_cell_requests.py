@@ -16,7 +16,7 @@ from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.steering import FAR_CELLS, Steering
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
 TICK_NS = NS_PER_S // 10
@@ -52,7 +52,7 @@ class Place:
             self.steering,
             self.held,  # type: ignore[arg-type]
             self.obstacles,
-            RESERVE + 2,
+            2 * FAR_CELLS + 2,
             lambda target: self.target,
             lambda target, cell: GRID.distance_cells(cell, self.target) < 3,
             str(seed),

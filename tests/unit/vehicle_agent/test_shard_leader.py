@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-from support.shard_tables import (
-    SHARDS,
-    S,
-    cells_of,
-    entries,
-    standing,
-    table_of,
-)
+from msgspec.structs import replace
+from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_of
 
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.incarnations import HEARTBEAT_NS, first_generation, is_far_ahead
@@ -121,6 +115,18 @@ def test_a_vehicle_follows_one_that_goes_on_and_none_that_stays() -> None:
     assert plan(stays)["a2-00"] == [8, 16]
 
 
+def test_a_grant_reaches_far_where_no_other_vehicle_is_near_and_may_be_followed_to_its_end_there() -> None:
+    far = replace(stand_of("a1", [8], ahead=[9, 10, 11, 12, 13, 14], wants=[9]), keeps=2)
+    assert plan({"a1": far}) == {"a1-00": [8, 9, 10, 11, 12, 13, 14]}
+    near = plan({"a1": far, "a2": stand_of("a2", [21])})
+    assert near["a1-00"] == [8, 9, 10, 11]  # 12 is beside 21
+    holds = stand_of("a1", [8, 9, 10, 11])
+    follows = {"a1": replace(holds, keeps=2), "a2": stand_of("a2", [19], wants=[11])}
+    assert plan(follows)["a2-00"] == [19, 11]  # the host of a1 gives 11 back
+    keeps = {"a1": replace(holds, keeps=3), "a2": stand_of("a2", [19], wants=[11])}
+    assert plan(keeps)["a2-00"] == [19]
+
+
 def test_who_is_pushed_and_who_pushes_are_granted_their_cells_by_one_table() -> None:
     pushed = {"a1": stand_of("a1", [9], wants=[10]), "a2": stand_of("a2", [8], wants=[9], age=9)}
     assert plan(pushed) == {"a1-00": [9, 10], "a2-00": [8, 9]}
@@ -136,6 +142,7 @@ def test_no_two_exchange_places_and_none_go_around_in_a_ring() -> None:
 
 def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_heartbeat() -> None:
     leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
+    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=1), 0)
     first = leader.tick(0)
     assert first is not None
     leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=2), 0)
