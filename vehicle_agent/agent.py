@@ -11,6 +11,7 @@ from itertools import chain, islice, zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.terrain.step_climb import may_be_pulled
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
@@ -109,7 +110,7 @@ class Agent:
         self._wishes = CellRequests(
             grid, self._steering, holdings, self.obstacles, near_cells, self._target_cell, self._in_reach, seed
         )
-        self._pulled = scenario.planner.routes == "pulled"
+        self._pulled = scenario.planner.routes == "pulled" and may_be_pulled(climb)
         self._driver = Driver(
             local_map,
             holdings,

@@ -127,6 +127,7 @@ class LawBook:
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
+        self._slow = simulation.faults.delay_ms >= SLOW_MS
         self.collisions: list[BrokenLaw] = []
         self.lethal: list[BrokenLaw] = []
         self.driven_into: list[BrokenLaw] = []
@@ -292,10 +293,6 @@ class LawBook:
             when_s, vehicle, cell = self.longest
             wait = f"{vehicle} waits {self.longest_s:.1f} s on cell {cell}"
             yield BrokenLaw("no wait without a reason", f"{wait} without a reason, until {when_s:.1f} s", when_s)
-
-    @property
-    def _slow(self) -> bool:
-        return self.simulation.faults.delay_ms >= SLOW_MS
 
     def never_routed(self) -> list[str]:
         """Vehicles that have had no route since `whole_s`."""

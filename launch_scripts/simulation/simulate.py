@@ -1,16 +1,14 @@
 """The whole swarm in one process: the same services on a memory network and a manual clock.
 
 A seed decides everything: the same scenario, seed and faults give the same events, byte for byte, on any machine
-with the same versions. Only `SimulationResult.wall_s` is measured on a real clock.
+with the same versions.
 """
 
 from __future__ import annotations
 
 import contextlib
 import random
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from hashlib import blake2s
 from pathlib import Path
@@ -81,20 +79,6 @@ BACKOFF_S = 0.5
 _STOP_S = 0.1
 """Seconds from the stop to the end. The recorder receives everything after 1 ms, and ended services are not ticked
 any more: a longer wait would add nothing but time on the run's clock."""
-
-
-@dataclass(frozen=True, eq=False)
-class SimulationResult:
-    """Outcome of a simulation.
-
-    simulation  at its end; its scenario has the seed and the seconds that it ran with
-    report      the numbers of report.json; the same for the same seed
-    wall_s      seconds that it took on this machine
-    """
-
-    simulation: Simulation
-    report: dict[str, Any]
-    wall_s: float
 
 
 class Simulation:
@@ -233,13 +217,13 @@ class Simulation:
 
 def run_to_end(
     simulation: Simulation, tell: Callable[[str, float], None] = lambda what, share: None
-) -> SimulationResult:
-    """Runs a simulation for the seconds of its scenario.
+) -> dict[str, Any]:
+    """Runs a simulation for the seconds of its scenario. Returns the numbers of report.json; the same for the same
+    seed.
 
     tell  called after each tenth of a second with what is done, and the share of it
     """
     seconds = simulation.scenario.seconds
-    began_s = time.perf_counter()
     with collected_rarely():
         for step in range(1, round(seconds * _STEPS_PER_S)):
             simulation.run_until(step / _STEPS_PER_S)
@@ -247,5 +231,4 @@ def run_to_end(
         simulation.run_until(seconds)
         simulation.finish()
     simulation.log.flush()
-    wall_s = time.perf_counter() - began_s
-    return SimulationResult(simulation, simulation.report(seconds), wall_s)
+    return simulation.report(seconds)

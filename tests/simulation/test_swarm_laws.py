@@ -117,6 +117,6 @@ def test_targets_that_evade_jump_or_stand_still_are_caught():
         for walk, caught in zip(walks, ("jump", "stay", "jump", "stay"), strict=True)
     )
     result = simulate(msgspec.structs.replace(SMALL, targets=targets), seed=4, seconds=15)
-    assert result.report["captures"] > 0
-    assert result.report["collisions"] == result.report["lethal_entries"] == 0
-    assert result.report["targets"] == 4
+    assert result["captures"] > 0
+    assert result["collisions"] == result["lethal_entries"] == 0
+    assert result["targets"] == 4

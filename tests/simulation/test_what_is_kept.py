@@ -17,7 +17,6 @@ from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
-from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.wire.messages.traffic import Entry, Granted, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.cell_orders import Orders
@@ -63,7 +62,7 @@ WORLDS = pytest.mark.parametrize(
 
 @WORLDS
 def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(name, seed, monkeypatch):
-    looked, logs, make, say = [0, 0], [io.StringIO(), io.StringIO()], CellRequests.make, Holdings._say_changed
+    looked, logs, make = [0, 0], [io.StringIO(), io.StringIO()], CellRequests.make
     run = 0
 
     def make_wishes(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
@@ -72,13 +71,7 @@ def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(n
             wishes.make_anew()
         make(wishes, vehicles, now_ns)
 
-    def say_all(holdings: Holdings, wishes: dict[str, Wish]) -> None:
-        if run:
-            holdings._said.clear()
-        say(holdings, wishes)
-
     monkeypatch.setattr(CellRequests, "make", make_wishes)
-    monkeypatch.setattr(Holdings, "_say_changed", say_all)
     simulation_of(name, seed, logs[0], slower=4.0).run_until(SECONDS)  # several ticks a cell
     monkeypatch.setattr(Vehicle, "needs_nothing", property(lambda vehicle: False))
     run = 1

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from launch_scripts.process_table import planner_spec, spec_of
 from launch_scripts.simulation.faults import OBSERVER, FaultPlan
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation, SimulationResult, run_to_end
+from launch_scripts.simulation.simulate import Simulation, run_to_end
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
@@ -35,8 +35,8 @@ def simulate(
     faults: FaultPlan | None = None,
     trace: TextIO | None = None,
     record_to: Path | None = None,
-) -> SimulationResult:
-    """Runs a scenario to its end.
+) -> dict[str, Any]:
+    """Runs a scenario to its end. Returns the numbers of its report.
 
     seed      instead of the scenario's own
     trace     where the event log is written

@@ -222,10 +222,8 @@ class Vehicle:
     @property
     def needs_nothing(self) -> bool:
         """True if no time that passes lets `route_request` return a reason, while it rolls on."""
-        route = self.route
-        near_end = route.left <= PREFETCH_CELLS if route.partial else not route.left
-        goes = self.target is not None and self.goal is None and not self.in_reach
-        return goes and self._need is None and self.state is not VehicleState.STRANDED and not near_end
+        goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
+        return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
 
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
         """Begins the route, if it leads to the target and passes a cell of the vehicle's path."""

@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import compress, pairwise
 
-from shared_map.terrain.step_climb import Climb, may_be_pulled
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Entry
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, Point, roll, together
+from vehicle_agent.driving.motion import COL, DRIVEN_S, ROW, TO_COL, TO_ROW, Motion, roll, together
 
 
 class Driver:
@@ -52,7 +52,7 @@ class Driver:
         self._passable = passable
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
-        self._pulled = pulled and may_be_pulled(local_map.climb)
+        self._pulled = pulled
         self._left: list[tuple[Vehicle, float]] = []
         """Vehicles that are still to be driven in this tick, and the seconds that each has left."""
         self._vehicles: list[Vehicle] = []
@@ -61,9 +61,6 @@ class Driver:
         self.patience_ns = NS_PER_S
         self._waits: dict[str, tuple[Entry, int]] = {}
         """Vehicle -> the entry which waits for others, and since when nothing has changed."""
-        self._rolling: set[str] = set()
-        """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
-        measured."""
 
     def begin(self, vehicles: Mapping[str, Vehicle], seconds: float) -> None:
         """Gives each of these so much time. Those which come to no end of a stretch in it have used it then."""
@@ -95,18 +92,14 @@ class Driver:
         while left_s > 0.0:
             if motion.at_rest:
                 if stopped(vehicle.id):
-                    self._rolling.discard(vehicle.id)
                     return 0.0
                 path = self._holdings.path(vehicle.id)
                 waits = len(path) < 2 or not self._passable(path[0], path[1])
                 # With dynamics of its own a vehicle could not stop at the border.
                 if waits or not (self._dynamics is None or self._holdings.may_enter(vehicle.id, path[1])):
-                    self._rolling.discard(vehicle.id)
                     return 0.0
-                motion.set_out(path[1], self._passes(vehicle, path[1]))
-                # A vehicle with dynamics of its own has its full pace between two cells before and behind.
-                freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
-                if self._measures and freely:
+                motion.set_out(path[1], vehicle.route.point(path[1], self._cols))
+                if self._measures:
                     motion.row[DRIVEN_S] = 0.0
             before = motion.cell
             had_s, head, measured_s = left_s, motion.head, motion.row.item(DRIVEN_S)
@@ -122,18 +115,16 @@ class Driver:
                     return left_s  # in this tick another of ours may leave yet
             else:
                 path = self._holdings.open(vehicle.id)[: self._holdings.keeps + 1]
-                passes = partial(self._passes, vehicle)
+                passes = partial(vehicle.route.point, cols=self._cols)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
                     measured_s = math.nan
             if self._measures:
                 measured_s += had_s - left_s if before == head or not self._pulled else 0.0
-                if motion.at_rest:
-                    self._rolling.add(vehicle.id)
-                    if not math.isnan(measured_s):
-                        self.driven.append((head, measured_s / (length_m * climbing)))
-                else:
+                if not motion.at_rest:
                     motion.row[DRIVEN_S] = measured_s
+                elif not math.isnan(measured_s):
+                    self.driven.append((head, measured_s / (length_m * climbing)))
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
@@ -142,10 +133,6 @@ class Driver:
                 # Even with no time left it has to look before it drives on.
                 return left_s
         return 0.0
-
-    def _passes(self, vehicle: Vehicle, cell: int) -> Point | None:
-        """Returns the point where a vehicle passes one of its next cells; None is the middle."""
-        return vehicle.route.point(cell, self._cols) if self._pulled else None
 
     def _climbing(self, motion: Motion) -> float:
         return 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)

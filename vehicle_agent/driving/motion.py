@@ -227,8 +227,6 @@ def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point
     corner."""
     if rows and cols:
         return shared
-    if rows:
-        share = (shared[0] - begin[0]) / (end[0] - begin[0])
-        return shared[0], begin[1] + share * (end[1] - begin[1])
-    share = (shared[1] - begin[1]) / (end[1] - begin[1])
-    return begin[0] + share * (end[0] - begin[0]), shared[1]
+    across = 0 if rows else 1
+    share = (shared[across] - begin[across]) / (end[across] - begin[across])
+    return begin[0] + share * (end[0] - begin[0]), begin[1] + share * (end[1] - begin[1])

@@ -24,14 +24,6 @@ _CONNECT_S = 10.0
 """Longest wait for the scheduler, as long as a process of a swarm waits for a router by default
 (`network.connect_timeout_s`)."""
 _SETTINGS: dict[str, Any] = {
-    # A profiler, clocks that tick 50 times a second in each of five event loops, and watches on memory and the
-    # interpreter take it from the simulation: together 7 % of a core with two workers, without them 1 %.
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.tick.interval": "10s",
-    "distributed.admin.tick.limit": "60s",
-    "distributed.admin.system-monitor.interval": "10s",
-    "distributed.admin.system-monitor.gil.enabled": False,
-    "distributed.scheduler.active-memory-manager.start": False,
     "distributed.scheduler.allowed-failures": MOST_DEATHS,
     # A worker has the trial that it runs and no other: one that waits there would be blamed for a death, too.
     "distributed.scheduler.worker-saturation": 1.0,

@@ -134,7 +134,7 @@ def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     assert trial.scenario is not None
     simulation = Simulation(msgspec.structs.replace(trial.scenario, seed=trial.seed, seconds=trial.seconds))
     try:
-        report = run_to_end(simulation).report
+        report = run_to_end(simulation)
     except SwarmError:
         raise
     except Exception as error:

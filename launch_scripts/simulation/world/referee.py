@@ -114,10 +114,6 @@ class Stay:
     first_seq: int
 
     @property
-    def name(self) -> str:
-        return self.vehicle
-
-    @property
     def key(self) -> str:
         """The key of the reports, below the namespace."""
         return FLEET.below({"region": str(self.region), "author": self.author})
@@ -130,7 +126,8 @@ def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
     def said(each: Stay | Cover) -> str:
         begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
         reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
-        return f"{each.name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
+        name = each.vehicle if isinstance(each, Stay) else f"obstacle {each.obstacle}"
+        return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
 
     return f": {' and '.join(map(said, evidence))}"
 
@@ -267,10 +264,6 @@ class Cover:
     end_ns: int
     seq: int
     first_seq: int
-
-    @property
-    def name(self) -> str:
-        return f"obstacle {self.obstacle}"
 
     @property
     def key(self) -> str:

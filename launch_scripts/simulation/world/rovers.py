@@ -68,8 +68,7 @@ class Rovers:
         self._time_scale = scenario.time_scale
         """Factor of the last tick; 0 while the run is paused."""
         self._ticked_ns: int | None = None
-        self.all = [self._begin(id, each, scenario.seed) for each in scenario.rovers for id in ids_of(each)]
-        self._by_id = {rover.id: rover for rover in self.all}
+        self.all = {id: self._begin(id, each, scenario.seed) for each in scenario.rovers for id in ids_of(each)}
 
     def _begin(self, id: str, config: RoverConfig, seed: int) -> Rover:
         chance = random.Random(f"{seed}/rover/{id}")
@@ -79,7 +78,7 @@ class Rovers:
 
     def note_obstacle(self, obstacle: Obstacle) -> None:
         """Takes in where the process that leads has moved a rover: one that takes over goes on from there."""
-        rover = self._by_id.get(obstacle.id)
+        rover = self.all.get(obstacle.id)
         if rover is not None and self._passable(obstacle.x_m, obstacle.y_m):
             rover.x_m, rover.y_m = obstacle.x_m, obstacle.y_m
             rover.seq = max(rover.seq, obstacle.seq)
@@ -90,7 +89,7 @@ class Rovers:
         passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
         self._ticked_ns = now_ns
         said = []
-        for rover in self.all:
+        for rover in self.all.values():
             if time_scale > 0.0:
                 self._move(rover, min(passed_s, _LONGEST_TICK_S))
             speed = self._speed(rover) if self._goes(rover) else 0.0

@@ -208,9 +208,6 @@ class Walk(Protocol):
 class Still:
     """Stays where it is."""
 
-    def __init__(self, world: WalkWorld) -> None:
-        pass
-
     def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
         return None
 
@@ -281,11 +278,11 @@ class Flee:
 
 
 WALKS: Mapping[str, Callable[[WalkWorld], Walk]] = {
-    "still": Still,
+    "still": lambda world: Still(),
     "random": Wander,
     "waypoints": Waypoints,
     "evade": Flee,
-    "external": Still,
+    "external": lambda world: Still(),
 }
 """The built-in walks. The motion of an external target belongs to another process."""
 

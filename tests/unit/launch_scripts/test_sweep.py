@@ -140,7 +140,7 @@ def test_a_trial_is_the_simulation_of_its_seed_and_every_number_of_its_report(tm
     [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
     trial = case.trials[1]
     result = run_trial(trial)
-    report = simulate(case.given, 1, 3.0).report
+    report = simulate(case.given, 1, 3.0)
     assert result.key == trial.key
     assert result.figures["marks"] == report["marks"]
     assert result.figures["by_group.all.distance_m"] == report["by_group"]["all"]["distance_m"]

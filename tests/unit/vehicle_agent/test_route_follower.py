@@ -110,14 +110,6 @@ def test_a_diagonal_step_is_longer_and_heads_south_east() -> None:
     assert motion.heading_rad == pytest.approx(0.75 * math.pi)
 
 
-def test_a_vehicle_that_has_left_its_cell_does_not_turn_back() -> None:
-    motion = Motion(GRID, 11)
-    motion.set_out(12)
-    motion.advance(0.5, 0.1)
-    motion.turn_back()
-    assert motion.cell == motion.head == 12
-
-
 def test_nobody_sets_out_for_a_cell_that_is_no_neighbour() -> None:
     with pytest.raises(ValueError, match="no step"):
         Motion(GRID, 19).set_out(20)
