@@ -7,7 +7,7 @@ import math
 import numpy as np
 from support.scripted_planner import COLS, GRID, World
 
-from planner_service.planner import GOOD_GAP, MOST_ROUTES, Answer
+from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
 from planner_service.planner_actions import Refusal
 from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
@@ -119,6 +119,16 @@ def test_a_route_that_only_says_what_the_vehicle_knows_is_not_pushed(ready: Worl
         ready.mark(GRID.cell(0, 29))
         ready.mark(GRID.cell(0, 28))
         assert ready.tick() == []
+
+
+def test_who_is_silent_for_five_seconds_is_dropped(ready: World) -> None:
+    ready.ask(0, vehicles=["v"])
+    asked_ns = ready.now_ns
+    while ready.now_ns < asked_ns + FOLLOWER_LEASE_NS:
+        ready.tick()
+        assert len(ready.planner.followers) == 1
+    ready.tick()
+    assert len(ready.planner.followers) == 0
 
 
 def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_asking(world: World) -> None:
