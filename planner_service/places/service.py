@@ -339,8 +339,9 @@ class PlacesService(PlanningProcess):
         event.end()
         self.counters.count("place_routes", len(question.found))
         for vehicle, route in zip(request.vehicles, routes, strict=False):
-            push_ns = now_ns + self._push_ns
-            trees.followers.given(vehicle, route, request.max_cells, now_ns, push_ns, request.to)
+            if _asker(vehicle) == event.asker:  # no other asker may have it pushed routes
+                push_ns = now_ns + self._push_ns
+                trees.followers.given(vehicle, route, request.max_cells, now_ns, push_ns, request.to)
 
     def _drop(self, question: _Question, reason: str) -> None:
         """Leaves a question without an answer. Vehicles which did not ask are pushed a route later."""
@@ -377,7 +378,7 @@ class PlacesService(PlanningProcess):
                 self._wait(_Question(None, self._job, PlaceRouteRequest(to=0, vehicle_class=name), now_ns))
             for (goal, max_cells), batch in trees.followers.due(now_ns).items():
                 for id, follower in batch:
-                    asker = asker_of("agent", agent_of(id))
+                    asker = _asker(id)
                     if goal is not None and asker not in self._foreign:
                         request = PlaceRouteRequest(
                             to=goal, cells=[follower.cell], vehicles=[id], max_cells=max_cells, vehicle_class=name
@@ -408,3 +409,9 @@ class PlacesService(PlanningProcess):
         return order.subject is not None or (
             not (pending and self._going_on) and self._sync.holds(order.author, order.sets, self._now_ns)
         )
+
+
+def _asker(vehicle: str) -> str:
+    """The name under which the agent of a vehicle asks, or a rover, which is its own agent."""
+    agent = agent_of(vehicle)
+    return asker_of("rover" if agent == vehicle else "agent", agent)

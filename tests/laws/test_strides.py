@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from itertools import pairwise
 from typing import Any
 
@@ -124,37 +123,6 @@ def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: di
         assert all(step in legal for step in pairwise(way))
         label = labels[max(doublings[a], doublings[b])]
         assert set(label[way]) <= {label[cells[a]], label[cells[b]]}
-
-
-@given(st.integers(0, 2**31), st.sampled_from(RULES))
-@settings(max_examples=8, deadline=None)
-def test_at_the_least_stride_a_links_way_is_the_cheapest_through_one_step(seed: int, rules: dict) -> None:
-    ground = Ground(seed, rules)
-    centre, doublings, *_ = ground.network.arrays
-    cells = unpadded(ground.costs, centre.astype(np.int64))
-    label, pace = ground.labels(2), ground.pace.reshape(-1).astype(float)
-    inside: dict[int, list[tuple[int, float]]] = {}
-    for u, v, cost in ground.steps:
-        if label[u] == label[v]:
-            inside.setdefault(v, []).append((u, cost))
-    to_centre: dict[int, float] = {}
-    for cell in cells[doublings == 1].tolist():
-        heap = [(0.0, cell)]
-        while heap:
-            at, here = heapq.heappop(heap)
-            if at < to_centre.get(here, np.inf):
-                to_centre[here] = at
-                for there, cost in inside.get(here, ()):
-                    heapq.heappush(heap, (at + cost, there))
-    best: dict[frozenset[int], float] = {}
-    for v, u, cost in ground.steps:
-        if u < v and label[u] != label[v]:  # a link's step leads from the first cell on the map to the other
-            pair = frozenset((int(label[u]), int(label[v])))
-            best[pair] = min(best.get(pair, np.inf), to_centre[u] + to_centre[v] + cost + pace[v])
-    price = ground.network.arrays[4]
-    for a, b, link in _links(ground.network):
-        if doublings[a] == doublings[b] == 1:
-            assert price[link] == pytest.approx(best[frozenset(label[cells[[a, b]]].tolist())], rel=1e-5)
 
 
 def test_a_closed_wall_stays_closed_and_a_passage_of_one_cell_open_at_every_stride() -> None:

@@ -12,7 +12,9 @@ from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, ro
 from support.swarm_model import SwarmModel
 
 import planner_service.places.service as places
-from planner_service.places.service import PlacesService
+from planner_service.places.service import PlacesService, _ClassTrees
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
@@ -163,6 +165,51 @@ def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
     world.tell({"a0-00": (1, 400), "a1-00": (2, 400)}, "red.a0.1")
     world.run(2.0)
     assert {each.vehicle for each in world.pushed} == {"a0-00"}
+
+
+def test_who_asks_for_the_vehicles_of_others_has_them_pushed_nothing_and_a_rover_does_not_come_first() -> None:
+    world = PlacesWorld(flat())
+    writer, to = world.writer("all.a0.1"), GRID.cell(20, 40)
+    for vehicle, asker in (("a0-00", "agent.a0"), ("a0-01", "rover.r1"), ("r1", "rover.r1"), ("r2", "rover.r1")):
+        world.answer(to, GRID.cell(20, 2), vehicles=[vehicle], asker=asker)
+    askers: list[str] = []
+    wait = world.service._wait
+    world.service._wait = lambda question: (askers.append(question.asker), wait(question))[1]  # type: ignore[method-assign]
+    writer.sync.publish(writer.replica.write([GRID.cell(20, 20)], MarkKind.LETHAL, 0.0, world.now_ns))
+    world.run(2.0)
+    assert sorted(each.vehicle for each in world.pushed) == ["a0-00", "r1"]
+    assert sorted(each for each in askers if each != "all") == ["agent.a0", "rover.r1"]
+
+
+def test_the_worker_alone_touches_trees_and_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy of a large tree takes longer than an answer may wait."""
+    world = PlacesWorld(rough(3))
+    at_work: list[bool] = []
+    touched: list[tuple[str, bool]] = []
+    work = _ClassTrees.work
+
+    def working(self: _ClassTrees, *given: Any) -> Any:
+        at_work.append(True)
+        try:
+            return work(self, *given)
+        finally:
+            at_work.pop()
+
+    monkeypatch.setattr(_ClassTrees, "work", working)
+    for kind, name in ((CostGrid, "load"), (CostGrid, "apply"), (PartialGrowth, "cut"), (PartialGrowth, "begin")):
+        method = getattr(kind, name)
+
+        def watched(*given: Any, name: str = name, method: Any = method) -> Any:
+            touched.append((name, bool(at_work)))
+            return method(*given)
+
+        monkeypatch.setattr(kind, name, watched)
+    writer = world.writer("all.a0.1")
+    for turn in range(4):
+        world.answer(GRID.cell(20, 2 + turn), GRID.cell(20, 45))
+        writer.sync.publish(writer.replica.write([GRID.cell(21, 20 + turn)], MarkKind.PACE, 0.5, world.now_ns))
+        world.run(0.5)
+    assert set(touched) == {(name, True) for name in ("load", "apply", "cut", "begin")}
 
 
 def test_a_part_of_a_route_says_what_the_rest_costs() -> None:

@@ -121,30 +121,6 @@ def test_a_route_that_only_says_what_the_vehicle_knows_is_not_pushed(ready: Worl
         assert ready.tick() == []
 
 
-def test_reports_tell_where_a_follower_is_now_and_who_else_follows(ready: World) -> None:
-    ready.ask(GRID.cell(10, 0), vehicles=["v"])
-    ready.chasers(("v", GRID.cell(10, 3)), ("w", GRID.cell(3, 3)))
-    ready.chasers(("x", 5), target="t1")
-    assert ready.planner.followers.cells.tolist() == [GRID.cell(10, 3), GRID.cell(3, 3)]
-    assert ready.planner.status(0).following == 2
-
-
-def test_who_chases_another_target_is_dropped_at_once(ready: World) -> None:
-    ready.ask(0, 1, vehicles=["v", "w"])
-    ready.chasers(("v", 0), ("w", 1))
-    ready.chasers(("w", 1))
-    assert ready.planner.followers.cells.tolist() == [1]
-    ready.chasers()
-    assert len(ready.planner.followers) == 0
-
-
-def test_an_older_report_changes_nothing(ready: World) -> None:
-    ready.chasers(("v", 5), stamp_ns=200)
-    ready.chasers(("v", 4), stamp_ns=100)
-    ready.chasers(stamp_ns=100)
-    assert ready.planner.followers.cells.tolist() == [5]
-
-
 def test_who_is_silent_for_five_seconds_is_dropped(ready: World) -> None:
     ready.ask(0, vehicles=["v"])
     asked_ns = ready.now_ns
