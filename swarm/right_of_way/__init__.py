@@ -3,9 +3,9 @@ restart.
 
 The map is cut into *plots* (`lock_regions`): lock regions. Three agents, or four where certificates prove names,
 are the *members* of a plot. One of them is its *warden*: the leader, by epoch and majority. A *host* is a process
-with vehicles in a plot or at its border. A *life* is one incarnation of a host. The warden keeps an order of *entries*
-for each cell (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry is never
-revoked and never runs out: it is over by the word of its host alone. Only authority is leased.
+with vehicles in a plot or at its border. A *life* is one incarnation of a host. The warden keeps an order of
+*entries* for each cell (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry
+is never revoked and never runs out: it is over by the word of its host alone. Only authority is leased.
 
 This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in
 docs/design/right-of-way.md, and docs/design/external-vehicles.md says how guests come into it. All but
