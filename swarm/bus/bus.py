@@ -270,16 +270,16 @@ def counter_of(error: ProtocolError) -> str:
 
 
 class Bus(Protocol):
-    """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards."""
+    """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards.
+
+    proves_names  certificates prove who sends a message under a key that bears the sender's name
+    """
+
+    proves_names: bool
 
     @property
     def namespace(self) -> str:
         """The first chunk of all keys."""
-        ...
-
-    @property
-    def proves_names(self) -> bool:
-        """True if certificates prove who sends a message under a key that bears the sender's name."""
         ...
 
     @property

@@ -170,8 +170,9 @@ def open_bus(
         if patient:
             wait_for_router(endpoints)
         try:
-            session = zenoh.open(session_config(network, mode))
-            return ZenohBus(session, network.namespace, authenticator, proves_names=network.tls is not None)
+            bus = ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
+            bus.proves_names = network.tls is not None
+            return bus
         except zenoh.ZError as error:
             if not patient or any(map(keeps_open, endpoints)):
                 raise _why_not(error, network, mode) from error
@@ -196,16 +197,9 @@ class ZenohBus:
     Zenoh's, goes to `threading.excepthook`, by which `Process` ends.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        namespace: str,
-        authenticator: Authenticator | None = None,
-        *,
-        proves_names: bool = False,
-    ) -> None:
+    def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
         self._session = session
-        self._proves_names = proves_names
+        self.proves_names = False
         self._namespace = namespace
         self.intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
@@ -226,10 +220,6 @@ class ZenohBus:
     @property
     def namespace(self) -> str:
         return self._namespace
-
-    @property
-    def proves_names(self) -> bool:
-        return self._proves_names
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -93,15 +93,12 @@ class BoundaryBus:
 
     def __init__(self, bus: Bus, crossing: Crossing) -> None:
         self._bus = bus
+        self.proves_names = bus.proves_names
         self._crossing = crossing
 
     @property
     def namespace(self) -> str:
         return self._bus.namespace
-
-    @property
-    def proves_names(self) -> bool:
-        return self._bus.proves_names
 
     @property
     def counts(self) -> Mapping[str, int]:

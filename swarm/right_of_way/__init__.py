@@ -1,11 +1,11 @@
 """Right of way: no two vehicles are in one cell, even if messages are lost, late or repeated and processes stop or
 restart.
 
-The map is cut into *shards* (`lock_regions`): lock regions. Three agents are the *members* of a shard, and one of
-them is its *leader*, by epoch and majority. A *host* is a process with vehicles in a shard or at its
-border. A *generation* is one incarnation of a host. The leader keeps an order of *entries* for each cell
-(`entries`): the vehicle of an entry enters the cell once all before it are over. An entry is never revoked and
-never runs out: it is over by the word of its host alone. Only authority is leased.
+The map is cut into *shards* (`lock_regions`): lock regions. Three agents, or four where certificates prove names,
+are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
+vehicles in a shard or at its border. A *generation* is one incarnation of a host. The leader keeps an order of
+*entries* for each cell (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry
+is never revoked and never runs out: it is over by the word of its host alone. Only authority is leased.
 
 This package is the side of hosts. Members and leaders are in `vehicle_agent/traffic`; the proof is in
 docs/design/right-of-way.md, and docs/design/external-vehicles.md says how external vehicles come into it. All but
@@ -19,13 +19,16 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 2. Tell each shard that concerns it everything about its vehicles there, whenever that is news and once a heartbeat.
    Entries that it omits are over.
 3. Enter a cell only by an entry that a `Granted` for this generation, newer than all that it knows of the shard,
-   adds to the path of the vehicle, and only once all entries before it are over. Never go back to an older table of
-   a shard, not even after the vehicles have left it.
+   adds to the path of the vehicle, and only once all entries before it are over. Take no entry that an older table
+   could have granted. Never go back to an older table of a shard, not even after the vehicles have left it. Where
+   certificates prove names, act on a `Granted` once a majority of members has the same on file.
 4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
    table lists it no more. Never use such an entry again.
 5. Give back entries that wait for others which do not go on.
 6. Stop once a table names a greater generation of this host, and say so where the vehicles are simulated ones.
-7. Speak to the leader, and to all members where no leader was heard for half a second.
+7. Speak to the leader, and to all members where no leader was heard for half a second, or certificates prove
+   names.
+8. Say `Left` to a member that asks about entries which the host does not hold, and never take them.
 
 Duties of a leader:
 
@@ -46,7 +49,9 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
                 with those before it, and which other hosts follow. A host takes the entries that continue the path
                 of the vehicle, and passes over the others, which gives them back. `pushed` asks a vehicle to make
                 way into another shard; `occupied` are the cells of others around.
-`Left`          Host to host: these entries are over.
+`Word`          Member to host, where certificates prove names: a digest of what its file grants to the host, and
+                entries of which it lacks the host's statement.
+`Left`          Host to host, or to a member that asked: these entries are over.
 `Claim`         Member to members, where no leader was heard for 0.6 s, longer where round trips are: who answers
                 with its table promises to store nothing of a lower epoch. Two promises make a leader, which goes on
                 from the newest table of the two.

@@ -4,12 +4,14 @@ starts."""
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 from support.simulated import cells
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import CROWDS, crowd, seeded
+from swarm.config.scenario import TlsConfig
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService
 
@@ -24,6 +26,16 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     plan = random_plan(scenario, 1, SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
+    assert LawBook(simulation).run(SECONDS) == []
+    assert simulation.report(SECONDS)["captures"] > 5
+
+
+@pytest.mark.seeds(1)
+def test_a_crowd_with_certificates_and_every_fault_flows(seed):
+    scenario, terrain = crowd("open", seed, vehicles=48, per_agent=8, side=20)
+    tls = TlsConfig(ca="ca.pem", certificate="certs", key="certs")
+    scenario = replace(scenario, network=replace(scenario.network, tls=tls))
+    simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS), terrain=terrain)
     assert LawBook(simulation).run(SECONDS) == []
     assert simulation.report(SECONDS)["captures"] > 5
 

@@ -1,7 +1,8 @@
 """Right of way for those who decide it: the members and leaders of shards, and where vehicles would go next.
 
-The map is cut into shards (`swarm.right_of_way.lock_regions`). Each shard has three members, which are agents; one
-of them is its leader. The host's part is in `swarm.right_of_way`; docs/design/right-of-way.md has the proof. Here:
+The map is cut into shards (`swarm.right_of_way.lock_regions`). Each shard has three members, which are agents, or
+four where certificates prove names; one is its leader. The host's part is in `swarm.right_of_way`;
+docs/design/right-of-way.md has the proof. Here:
 
 1. A host tells the leader where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
    around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.
@@ -11,6 +12,8 @@ of them is its leader. The host's part is in `swarm.right_of_way`; docs/design/r
    (`Stored`). With the leader's own file one is a majority: then hosts receive the grants of the table.
 4. A leader that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store
    no table of a lower one (Paxos). The new leader begins with the newest table that a majority knows.
+   Where certificates prove names, hosts count the members themselves, and a member judges each table before it
+   stores it (`witness`): then one member may lie.
 5. Promises and stored tables are on file before any message states them. No clock decides anything but when to
    claim.
 

@@ -9,6 +9,7 @@ from support.shard_tables import (
     MEMBERS,
     SHARDS,
     S,
+    entries,
     granted_of,
     hear,
     holdings_of,
@@ -50,14 +51,14 @@ def test_a_host_takes_what_follows_its_path() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
     assert list(holdings.path("a0-00")) == [9]
-    hear(holdings, table_of(1, 2, a0=[9, 10, 20]))
+    hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 20)]))
     assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
 
 
 def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
-    hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
+    hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 11)]))
     holdings.give_back("a0-00")
     (told,) = holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S)
     said = told.standing
@@ -65,7 +66,7 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
         holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + HEARTBEAT_NS - 1) == []
     )
     assert (said.vehicles[0].holds, said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
-    hear(holdings, table_of(1, 3, a0=[9, 10, 11]))  # it has not heard that yet
+    hear(holdings, table_of(1, 3, a0=[9, *entries(1, 2, 10, 11)]))  # it has not heard that yet
     assert list(holdings.path("a0-00")) == [9]
     hear(holdings, table_of(1, 4, a0=[9, (10, 1, 4)]))
     assert list(holdings.path("a0-00")) == [9, 10]
