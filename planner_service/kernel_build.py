@@ -36,6 +36,7 @@ from planner_service.kernels import (
     queue_dial,
     queue_directed,
     queue_heap,
+    queue_wide,
     repair,
     route_walk,
     stride_growth,
@@ -52,9 +53,9 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    queue_directed.grow_directed_by_buckets,
-    StepKernel(queue_dial.grow_by_buckets, None),
+    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
     parents.point_to_parents,
+    StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,

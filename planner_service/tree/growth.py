@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import queue_dial
+from planner_service.kernels import queue_dial, queue_wide
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import NONE, RULE_FOUR, RULE_OCTILE, SQRT2, TOO_FINE, PaddedGrid, step_offsets
@@ -24,9 +24,8 @@ from swarm.grid import Window
 if TYPE_CHECKING:
     from planner_service.tree.cost_grid import CostGrid
 
-MOST_BUCKETS = 1 << 12
-"""Buckets are as narrow as the cheapest step. Beyond this number, buckets of several levels take less time than to
-pass many empty ones."""
+MOST_BUCKETS = 1 << 8
+"""Buckets are as narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
 NARROW = 0.98
 """Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 FINE = float(1 << 20)
@@ -58,11 +57,13 @@ def grow_tree(
     cell_cost, _, stride, _, _ = padded
     size, lowest = cell_cost.size, bounds[0]
     scratch_of = {} if kept is None else kept
-    if climbs is None:
-        reach = _grow_alike(padded, bounds, root, cost, scratch_of)
-    else:
+    if climbs is not None:
         grow_directed_costs(padded, climbs, bounds, root, cost, scratch_of)
+        if parent is None:
+            return math.inf
         reach = CostRange(cost).highest
+    else:
+        reach = _grow_alike(padded, bounds, root, cost, scratch_of)
     if parent is None:
         return reach
     point_to_parents(padded, climbs, cost, root, (0, 0, size // stride - 2, stride - 2), parent)
@@ -85,20 +86,10 @@ def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kep
         last = queue_dial.grow_whole(padded, cost, root, (width, count), kept[size, count])
         if last != TOO_FINE:
             return (last + 1) * width
-    grow_directed_costs(padded, _level_climbs(padded), bounds, root, cost, kept)
-    return CostRange(cost).highest
-
-
-def _level_climbs(padded: PaddedGrid) -> Climbs:
-    """The climbs of a map where entering a cell costs the same from everywhere."""
-    prices = np.array((1.0, _diagonal(padded[3])), np.float32)
-    begins = (np.arange(8) % 2).astype(np.int32)
-    return np.zeros(padded[0].size, np.float32), prices, np.zeros(2, np.float32), begins, *_rows(padded[2])
-
-
-def _diagonal(rule: int) -> np.float32:
-    """The length of a diagonal step in straight ones; inf where there is none."""
-    return {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
+    if (size, 0) not in kept:
+        kept.clear()
+        kept[size, 0] = queue_wide.make_scratch(size, rule)
+    return float(queue_wide.grow_by_wide_buckets(padded, cost, root, width, kept[size, 0]))
 
 
 def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
@@ -214,8 +205,9 @@ def padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
     grid = climb.grid
     height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
     height[1:-1, 1:-1] = climb.elevation_m
+    diagonal = {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
     tables = climb.table[: 8 if climb.windy else 2] / np.float32(climb.lowest)
-    tables[1::2] *= _diagonal(rule)
+    tables[1::2] *= diagonal
     begins = (np.arange(8) % len(tables) * tables.shape[1]).astype(np.int32)
     per_metre = np.array(climb.per_metre, np.float32)
     climbs = height.reshape(-1), tables.reshape(-1), per_metre, begins, *_rows(grid.cols + 2)

@@ -13,8 +13,12 @@ from planner_service.kernels.crops import stays_exact, walk_by_costs
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import MOST_BUCKETS, NARROW
+from planner_service.tree.growth import NARROW
 from shared_map.array_files import Floats
+
+MOST_BUCKETS = 1 << 12
+"""A growth that stops has narrow buckets up to this ratio of cell costs, beyond it none: to pass many empty ones
+costs less than to grow a whole map."""
 
 
 class CutTree(NamedTuple):

@@ -14,7 +14,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.tree import growth
+from planner_service.kernels import queue_dial, queue_wide
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -47,18 +47,21 @@ def test_the_smallest_grids_equal_dijkstra(shape: tuple[int, int], rules: dict) 
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_both_kinds_of_buckets_give_the_same_costs_to_the_last_bit(
-    rules: dict, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
     rng = np.random.default_rng(4)
     for ratio in (1.0, 50.0, 2000.0):
         pace = random_pace(rng, 260, 259, ratio, 0.2)
-        target, costs = int(np.flatnonzero(np.isfinite(pace))[0]), []
-        for buckets in (growth.MOST_BUCKETS, 0):
-            monkeypatch.setattr(growth, "MOST_BUCKETS", buckets)
-            costs.append(grown(pace, target, rules).cost)
-        np.testing.assert_array_equal(*costs)
-        monkeypatch.undo()
+        target = int(np.flatnonzero(np.isfinite(pace))[0])
+        ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
+        ground.load(pace)
+        root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
+        narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
+        scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
+        assert queue_dial.grow_whole(ground.padded, narrow, root, (width, 4096), scratch) > 0
+        room = queue_wide.make_scratch(ground.size, ground.rule)
+        reach = queue_wide.grow_by_wide_buckets(ground.padded, wide, root, width, room)
+        np.testing.assert_array_equal(wide, narrow)
+        assert reach >= wide[np.isfinite(wide)].max()
 
 
 @pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e20])

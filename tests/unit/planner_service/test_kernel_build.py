@@ -53,11 +53,12 @@ def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(
     needed = needed_kernels(given)
     terrain = build_terrain(given)
     climbs = {GROUND: terrain.climb, **{k: v.climb for k, v in class_terrains(given, terrain).items()}}
+    growths = {False: "grow_by_buckets", True: "grow_directed_by_buckets"}
     mends = {False: "mend", True: "mend_directed"}
     pulled = {False: "pull_routes", True: "pull_routes_directed"}
     first, later = set(map(name_of, needed.first)), set(map(name_of, needed.later))
-    assert ("grow_by_buckets" in first) == (climbs[GROUND] is None)
-    assert "grow_directed_by_buckets" in first, "costs of any ratio need it, too"
+    assert first & set(growths.values()) == {growths[climbs[GROUND] is not None]}
+    assert (first | later) & set(growths.values()) == {growths[climb is not None] for climb in climbs.values()}
     assert later & set(mends.values()) == {mends[climb is not None] for climb in climbs.values()}
     straight = {name: climb for name, climb in climbs.items() if pulls(given.planner, climb)}
     assert (first | later) & set(pulled.values()) == {pulled[climb is not None] for climb in straight.values()}
