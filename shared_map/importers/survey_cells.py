@@ -82,7 +82,7 @@ class _Resampling:
         return _Resampling(self.step, self.first + cells * self.step, self.kernel)
 
     def at(self, count: int) -> _Doubles:
-        """Where each cell of a line lies."""
+        """The place of each cell of a line."""
         return self.first - 0.5 + self.step * (np.arange(count, dtype=np.float64) + 0.5)
 
 
@@ -127,7 +127,7 @@ def _on_steps(heights_m: Floats) -> Floats:
 
 
 def _resampling_of(heights_m: Floats) -> _Resampling | None:
-    """How the columns of a file were resampled finer; None if they were not."""
+    """The filter which made the columns of a file finer; None if there was none."""
     count, width = heights_m.shape
     if min(count, width) < _TRIED_CELLS:
         return None
