@@ -51,15 +51,7 @@ _NOISY = 0.28
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
 _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
-_SCALES = {2: 2.6, 3: 3.6, 4: 2.6, 6: 3.6}
-"""Every n-th cell -> by what factor second differences at n cells must exceed those at half of that (rounded down)
-for the file to be resampled from cells so coarse. On a surface that a filter made they grow by up to 4 from one
-cell to two, on surveyed ground by 2.3 to 2.8 (three real models)."""
-_FOUND, _SHORE_RISE = 0.8, 0.02
-"""Share of a lake that was found at a finer scale; and of the rise of its shore, within two cells of the survey,
-that a filter may leave on the water."""
 _MUCH_WATER = 0.05
-_LEAST_SIDE, _SOME_ROWS = 16, 256
 _ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
 """Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
 

@@ -23,8 +23,8 @@ _RUNS_AT_ONCE = 1 << 18
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
 _COUNTS = ("edge", "differ", "beside", "below", "lower", "terrace", "steep")
 _SHORE_CELLS, _UNDER, _OVER, _RIPPLED = 3, 0.25, 0.015, 0.1
-"""Foot of a shore that a filter leaves on its water: cells within this distance, higher than it by less than this share
-of the rise there, or lower by less than a quarter, if a tenth of the cells beside a patch is so. Without a filter,
+"""Foot of a shore that a filter leaves on its water: cells within this distance, higher than it by less than this
+share of the rise there, or lower by less than a quarter, if a tenth of the cells beside a patch is so. Unfiltered
 cells next to water rise by up to a third of what they do within three: one in twenty is so low."""
 
 Labels = NDArray[np.int32]

@@ -41,11 +41,10 @@ _MAYBE, _SURE = 0.7, 0.1
 """The error of a filter that fits, as a share of the error of the same one moved by half a surveyed cell. Exact
 sums leave none; a file in whole metres leaves its rounding."""
 _ALIKE = 3.0
-_LEVEL_M, _LEVEL_MORE = 0.002, 1.2
-_STEPS_M = (1.0, 0.5, 0.25, 0.1, 0.01)
-"""Usual roundings of surveys: recovered heights that lie on one are rounded to it."""
-_AT_ONCE, _EDGE = 256, _REACH + 2
-_ON_STEP, _MOSTLY = 0.1, 0.95
+_LEVEL_M = 0.002
+_SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
+_AT_ONCE = 256
+"""Columns that are solved together: their sums take some megabytes."""
 
 
 def _linear(t: _Doubles) -> _Doubles:
@@ -106,24 +105,17 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
         found, at = _resampling_of(heights_m), np.arange(len(heights_m))
         if found is not None:
             at = np.rint(found.at(len(heights_m))).astype(np.intp)
-            heights_m = _recovered(np.ascontiguousarray(heights_m), found)
-        of_line.append(at - at[0])
+            heights_m = _recovered(heights_m, found)
+            at = np.clip(at - at[0] - _REACH, 0, len(heights_m) - 1)
+        of_line.append(at)
         heights_m = heights_m.T
     rows, cols = of_line
     if heights_m.shape == elevation_m.shape:
         return elevation_m, rows, cols
-    heights_m = np.ascontiguousarray(_on_steps(heights_m))
+    heights_m = np.ascontiguousarray(heights_m)
     if void.any():
         heights_m[rows[:, None].repeat(len(cols), 1)[void], cols[None].repeat(len(rows), 0)[void]] = np.nan
     return heights_m, rows, cols
-
-
-def _on_steps(heights_m: Floats) -> Floats:
-    for step_m in _STEPS_M:
-        rounded_m: Floats = np.rint(heights_m / np.float32(step_m)) * np.float32(step_m)
-        if (np.abs(heights_m - rounded_m) < _ON_STEP * step_m).mean() > _MOSTLY:
-            return rounded_m
-    return heights_m
 
 
 def _resampling_of(heights_m: Floats) -> _Resampling | None:
@@ -161,8 +153,7 @@ def _flattest(lines: _Doubles, found: _Resampling) -> _Resampling:
     fit = [each for each, error in zip(same, errors, strict=True) if error <= _ALIKE * min(errors)]
     some = lines.astype(np.float32)
     level = [int((np.abs(np.diff(_recovered(some, each), axis=0)) < _LEVEL_M).sum()) for each in fit]
-    most = int(np.argmax(level))
-    return fit[most] if level[most] > _LEVEL_MORE * level[0] else fit[0]
+    return fit[int(np.argmax(level))]
 
 
 def _factors(heights_m: Floats) -> list[float]:
@@ -248,21 +239,17 @@ def _solve(sums: Any, heights_m: _Doubles) -> _Doubles:
 
 
 def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
-    """The survey in the direction of columns: cells in which some cell of the file lies."""
-    at = np.rint(by.at(len(heights_m)))
-    many = int(at[-1] - at[0]) + 1
-    nearest = ((at[0] + np.arange(many) + 0.5 - by.first) / by.step - 0.5).round()
-    recovered: Floats = heights_m[np.clip(nearest, 0, len(heights_m) - 1).astype(np.intp)]
-    # At the border of its file a filter has fewer cells to weigh: the outer ones stay as the file has them.
+    """The survey in the direction of columns, without `_REACH` cells at either end.
+
+    At the border of its file a filter has fewer cells to weigh.
+    """
     outer = round(_REACH / by.step)
+    at = np.rint(by.at(len(heights_m))[[0, -1]]).astype(np.intp)
     sums = _Sums(len(heights_m) - 2 * outer, by.moved(outer))
-    begin = int(at[0]) + _EDGE - sums.first
-    middle_m = float(heights_m.mean())
-    for n in range(0, heights_m.shape[1], _AT_ONCE):
-        some = heights_m[outer : len(heights_m) - outer, n : n + _AT_ONCE].astype(np.float64) - middle_m
-        solved = sums.solved(some)[begin : begin + many - 2 * _EDGE]
-        recovered[_EDGE : many - _EDGE, n : n + _AT_ONCE] = solved + middle_m
-    return recovered
+    inner = slice(at[0] + _REACH - sums.first, at[1] + 1 - _REACH - sums.first)
+    middle_m = np.float64(heights_m.mean())
+    parts = [heights_m[outer:-outer, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
+    return np.hstack([(sums.solved(part - middle_m)[inner] + middle_m).astype(np.float32) for part in parts])
 
 
 class _Sums:
@@ -286,9 +273,14 @@ class _Sums:
         from scipy.linalg import solveh_banded
 
         width, groups = 2 * _REACH, len(self._starts)
-        banded = np.zeros((width, groups + width - 1))
-        banded[0] = 1e-9
-        right = np.zeros((groups + width - 1, heights_m.shape[1]))
+        many = groups + width - 1
+        banded = np.zeros((width, many))
+        # Cells beyond the border, with hardly a weight, go on as the others do.
+        for one, other in ((0, 1), (0, 2), (1, 2)):
+            banded[other - one, one : one + many - 2] += _SMOOTH * _BEND[one] * _BEND[other]
+        for one in range(3):
+            banded[0, one : one + many - 2] += _SMOOTH * _BEND[one] ** 2
+        right = np.zeros((many, heights_m.shape[1]))
         for one in range(width):
             weight = self._weights[:, one, None]
             products = np.add.reduceat(weight * self._weights[:, one:], self._starts)

@@ -86,7 +86,7 @@ def resampled(heights_m: np.ndarray, factor: float, how: str) -> np.ndarray:
 
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
-FINER = (("bilinear", (1.5, 2.0, 3.0)), ("cubic", (1.2, 2.0, 4.0)), ("lanczos", (1.5, 3.0, 4.0)))
+FINER = (("bilinear", (1.5, 2.0)), ("cubic", (1.2, 4.0)), ("lanczos", (2.0, 3.0)))
 
 
 def real(name: str) -> np.ndarray:
@@ -135,9 +135,8 @@ def test_a_survey_is_recovered_from_a_file_that_was_made_finer(how: str) -> None
     heights_m = MODELS["lakes, decimetres"]().heights_m
     for factor in (1.3, 2.7):
         recovered, row, col = surveyed(resampled(heights_m, factor, how))
-        assert recovered.shape == heights_m.shape
-        np.testing.assert_allclose(recovered[8:-8, 8:-8], heights_m[8:-8, 8:-8], atol=0.01)
-        assert (row[-1], col[-1]) == (383, 383)
+        np.testing.assert_allclose(recovered, heights_m[3:-3, 3:-3], atol=0.01)
+        assert (row[-1], col[-1]) == (377, 377)
     assert surveyed(heights_m)[0] is heights_m
 
 
