@@ -74,7 +74,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
 
     A file may have been resampled finer than its survey. Its shores then have ripples and slopes that no survey
-    has, so patches are looked for at every scale up to that of its information.
+    has, so patches are looked for in the cells of the survey.
 
     Parameters
     ----------
@@ -86,7 +86,6 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     LevelGround
         Of patches that a rounding of heights does not explain.
     """
-
     with np.errstate(invalid="ignore"):
         known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
     if not known.all():

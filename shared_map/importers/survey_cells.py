@@ -23,12 +23,14 @@ Kernel = Callable[[_Doubles], _Doubles]
 _REACH = 3
 """Surveyed cells on either side that a filter weighs: a Lanczos filter three, the others fewer."""
 _LEAST_FACTOR, _MOST_FACTOR = 1.05, 8.0
+"""Files of finer cells are rare, and a file as fine as its survey is its own."""
 _ORDERS = (4, 5)
 """Orders of differences in which a period is looked for. One of even order does not see a file made twice as fine,
 whose cells mirror one another; one of odd order does not see it half a cell further."""
 _SMOOTHED = 17
 """Cells over which the roughness of ground is levelled, so that only what alternates within them is left."""
 _SLOWEST = 0.1
+"""Periods of more than ten cells are those of the ground."""
 _PEAKS, _PEAK_APART, _PEAK = 4, 3, 4.0
 """The highest peaks of a spectrum that are tried; how far apart they are, in steps; by what multiple of the median
 they exceed it."""
@@ -37,12 +39,16 @@ _LINES = 16
 _TRIED_CELLS, _LONGEST = 40, 1000
 """Surveyed cells of the first try. The longer a line, the more exact is the factor; a thousand cells suffice."""
 _PHASES = 8
+"""A filter that is off by a sixteenth of a surveyed cell still fits better than others."""
 _MAYBE, _SURE = 0.7, 0.1
 """The error of a filter that fits, as a share of the error of the same one moved by half a surveyed cell. Exact
 sums leave none; a file in whole metres leaves its rounding."""
 _ALIKE = 3.0
+"""Errors of rounding differ by less than this factor."""
 _LEVEL_M = 0.002
+"""Recovered heights of still water differ by less."""
 _SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
+"""Weight of bends of the survey: it moves heights by less than a millimetre where the sums determine them."""
 _AT_ONCE = 256
 """Columns that are solved together: their sums take some megabytes."""
 

@@ -135,7 +135,7 @@ def test_a_survey_is_recovered_from_a_file_that_was_made_finer(how: str) -> None
     heights_m = MODELS["lakes, decimetres"]().heights_m
     for factor in (1.3, 2.7):
         recovered, row, col = surveyed(resampled(heights_m, factor, how))
-        np.testing.assert_allclose(recovered, heights_m[3:-3, 3:-3], atol=0.01)
+        np.testing.assert_allclose(recovered, heights_m[3:-3, 3:-3], atol=0.05)
         assert (row[-1], col[-1]) == (377, 377)
     assert surveyed(heights_m)[0] is heights_m
 
