@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.level_patches import Patches, level_patches
+from shared_map.importers.survey_cells import surveyed
 from shared_map.terrain.row_bands import bands
 from swarm.config.ground import TerrainConfig
 
@@ -43,9 +43,6 @@ _LEAST_STEEP = 0.1
 """Share of a lake's shore that must rise by more than one rounding from a cell to the next."""
 _SEA_M = 0.5
 """Level ground at the border so near to zero is the sea, however gentle the coast is."""
-_LEAST_RIPPLES, _RING_CELLS, _SUNK_M = 0.1, 3, 2.0
-"""A cubic filter undershoots at a shore. If this share of it is such a ripple, cells lower than the lake, down to
-this depth, belong to the lake as well, within this distance."""
 _BLOCK_CELLS = 4
 _ROUGH_M, _BLOCK_SAME_M, _BLOCK_STILL_M, _LEAST_BLOCKS = 0.3, 0.06, 0.1, 6
 _AROUND_BLOCKS = 5
@@ -54,15 +51,7 @@ _NOISY = 0.28
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
 _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
-_SCALES = {2: 2.6, 3: 3.6, 4: 2.6, 6: 3.6}
-"""Every n-th cell -> by what factor second differences at n cells must exceed those at half of that (rounded down)
-for the file to be resampled from cells so coarse. On a surface that a filter made they grow by up to 4 from one
-cell to two, on surveyed ground by 2.3 to 2.8 (three real models)."""
-_FOUND, _SHORE_RISE = 0.8, 0.02
-"""Share of a lake that was found at a finer scale; and of the rise of its shore, within two cells of the survey,
-that a filter may leave on the water."""
 _MUCH_WATER = 0.05
-_LEAST_SIDE, _SOME_ROWS = 16, 256
 _ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
 """Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
 
@@ -85,7 +74,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
 
     A file may have been resampled finer than its survey. Its shores then have ripples and slopes that no survey
-    has, so patches are looked for at every scale up to that of its information.
+    has, so patches are looked for in the cells of the survey.
 
     Parameters
     ----------
@@ -97,75 +86,41 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     LevelGround
         Of patches that a rounding of heights does not explain.
     """
-    from scipy import ndimage
-
     with np.errstate(invalid="ignore"):
         known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
     if not known.all():
         elevation_m = np.where(known, elevation_m, np.float32(np.nan))
-    rows, cols = elevation_m.shape
-    bend_m = cache(partial(_bend_m, elevation_m))
-    scales = [
-        every
-        for every, smooth in _SCALES.items()
-        if min(rows, cols) >= every * _LEAST_SIDE and bend_m(every) > smooth * bend_m(every // 2)
-    ]
-    mask, patches, level = _at_one_scale(np.ascontiguousarray(elevation_m), bool(scales))
-    for every in scales:
-        first = (every - 1) // 2  # a cell stands for those around it
-        picked_m = np.ascontiguousarray(elevation_m[first::every, first::every])
-        coarse, at_scale, _ = _at_one_scale(picked_m, True)
-        if sum(cells for _, cells in at_scale) * every**2 > sum(cells for _, cells in patches):
-            patches = [(height_m, cells * every**2) for height_m, cells in at_scale]
-        wide_m = np.where(coarse, picked_m, np.float32(np.nan)).repeat(every, axis=0).repeat(every, axis=1)
-        wide_m = np.pad(wide_m, (0, every), constant_values=np.nan)[:rows, :cols]
-        # A lake which a finer scale has missed is added as it is, of others what the filter left at their shore.
-        lakes, many = ndimage.label(wide := ~np.isnan(wide_m))
-        had = np.bincount(lakes[mask], minlength=many + 1)
-        mask |= (had < _FOUND * np.bincount(lakes.reshape(-1)))[lakes] & wide
-        rise_m = ndimage.maximum_filter(np.nan_to_num(elevation_m), 2 * every + 1) - wide_m
-        with np.errstate(invalid="ignore"):
-            mask |= elevation_m - wide_m <= _SHORE_RISE * rise_m
-    patches.sort(key=lambda patch: -patch[1])
+    heights_m, row, col = surveyed(elevation_m)
+    mask, patches, level = _at_one_scale(np.ascontiguousarray(heights_m))
+    finer = elevation_m.size / heights_m.size
+    if finer > 1:
+        mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
+    patches = sorted(((height_m, round(cells * finer)) for height_m, cells in patches), key=lambda patch: -patch[1])
     return LevelGround(mask, tuple(patches), float(np.count_nonzero(level & ~mask) / elevation_m.size))
 
 
-def _bend_m(elevation_m: Floats, cells: int) -> float:
-    """Mean second difference of heights at a distance, of some rows and columns, where they differ."""
-    bends = []
-    for heights in (elevation_m, elevation_m.T):
-        some = heights[:: max(heights.shape[0] // _SOME_ROWS, 1)].astype(np.float64)
-        bend = np.abs(some[:, 2 * cells :] - 2 * some[:, cells:-cells] + some[:, : -2 * cells])
-        bend = bend[bend > 0]
-        bends.append(float(bend.mean()) if bend.size else 0.0)
-    return sum(bends)
-
-
-def _at_one_scale(elevation_m: Floats, is_resampled: bool) -> tuple[Bools, list[tuple[float, int]], Bools]:
+def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], Bools]:
     """Returns (mask of water, (height in m, cells) of each patch of it, mask of large level patches)."""
     step_m = _step_m(elevation_m)
-    found = _level_with(elevation_m, step_m, is_resampled)
+    found = _level_with(elevation_m, step_m)
     rounded_m = _rounded_m(found)
     if rounded_m > step_m:
         step_m = rounded_m
-        found = _level_with(elevation_m, step_m, is_resampled)
+        found = _level_with(elevation_m, step_m)
     water, unsure = _judged(found, _STILL_M)
     mask: Bools = water[found.labels]
     large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
     large[0] = False
-    rippled = water & (found.ripple > _LEAST_RIPPLES * found.differ)
-    if rippled.any():
-        _add_ripples(elevation_m, found, rippled, mask)
     patches = [(float(found.height_m[n]), int(found.cells[n])) for n in np.flatnonzero(water).tolist()]
     if step_m < _ROUGH_M / _BLOCK_CELLS:
         patches += _rough_water(elevation_m, mask)
     return mask, patches, large[found.labels]
 
 
-def _level_with(elevation_m: Floats, step_m: float, is_resampled: bool) -> Patches:
+def _level_with(elevation_m: Floats, step_m: float) -> Patches:
     """The level patches of heights that are rounded to `step_m`."""
     least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
-    return level_patches(elevation_m, _SAME_M, least, step_m, is_resampled=is_resampled)
+    return level_patches(elevation_m, _SAME_M, least, step_m)
 
 
 def _rounded_m(found: Patches) -> float:
@@ -241,16 +196,6 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     with np.errstate(invalid="ignore"):
         mask |= off_m <= rough_m[of_cell]
     return [(float(height_m[n]), int(taken[n])) for n in np.flatnonzero(water).tolist()]
-
-
-def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bools) -> None:
-    """Adds to a mask of lakes what lies lower right beside them."""
-    from scipy import ndimage
-
-    lakes = np.where(rippled[found.labels], found.labels, 0)
-    above_m = elevation_m - found.height_m[ndimage.maximum_filter(lakes, 2 * _RING_CELLS + 1)]
-    with np.errstate(invalid="ignore"):
-        mask |= (above_m <= _SAME_M) & (above_m >= -_SUNK_M)
 
 
 def looked_at(

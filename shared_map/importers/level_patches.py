@@ -21,9 +21,11 @@ Among means of blocks a chain of equal ones is a contour line."""
 _RUNS_AT_ONCE = 1 << 18
 """Runs of a model in whole metres may be as many as a third of its cells."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
-_COUNTS = ("edge", "differ", "beside", "below", "lower", "ripple", "terrace", "steep")
-_RIPPLE_CELLS, _RIPPLE = 3, 4.0
-"""A cubic filter undershoots beside a rise by less than a quarter of it, and leaves no more than these cells."""
+_COUNTS = ("edge", "differ", "beside", "below", "lower", "terrace", "steep")
+_SHORE_CELLS, _UNDER, _OVER, _RIPPLED = 3, 0.25, 0.015, 0.1
+"""Foot of a shore that a filter leaves on its water: cells within this distance, higher than it by less than this
+share of the rise there, or lower by less than a quarter, if a tenth of the cells beside a patch is so. Unfiltered
+cells next to water rise by up to a third of what they do within three: one in twenty is so low."""
 
 Labels = NDArray[np.int32]
 Counts = NDArray[np.int64]
@@ -42,8 +44,7 @@ class Patches:
     differ    of these, those with another height beyond: the visible part of its shore
     beside    of these, those with another patch beyond that is at least a quarter as large
     below     of these, those with such a patch beyond that is lower
-    lower     of `differ`, those with a lower height beyond that is no such patch, and no ripple
-    ripple    of `differ`, those with a lower height beyond that a filter left at a shore
+    lower     of `differ`, those with a lower height beyond that is no such patch
     terrace   of `beside`, those with a patch beyond that is one rounding away
     steep     of `differ`, those with a height beyond that is more than one rounding away
     border    bool (count + 1,): whether it reaches the border of the model
@@ -58,7 +59,6 @@ class Patches:
     beside: Counts
     below: Counts
     lower: Counts
-    ripple: Counts
     terrace: Counts
     steep: Counts
     border: NDArray[np.bool_]
@@ -70,8 +70,6 @@ def level_patches(
     least_cells: int,
     step_m: float,
     shore_m: Floats | None = None,
-    *,
-    is_resampled: bool = False,
 ) -> Patches:
     """The patches of a height model.
 
@@ -88,13 +86,10 @@ def level_patches(
     shore_m : float32 (rows, cols), m, optional
         Heights also of cells that can be no part of a patch and are NaN in `elevation_m`. They are means, so that
         no filter has left ripples at shores.
-    is_resampled : bool
-        The filter which made its cells has also made a shore's steps smaller: the next cells count as well.
     """
-    ripples = shore_m is None
-    shore_m = elevation_m if shore_m is None else shore_m
-    labels, cells = _labelled(
-        elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE if ripples else _LEAST_ALIKE_MEANS
+    means = shore_m is not None
+    labels, cells = labelled(
+        elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE_MEANS if means else _LEAST_ALIKE
     )
     many = len(cells)
     from scipy import ndimage
@@ -110,14 +105,19 @@ def level_patches(
         total_m2 += np.bincount(of_cell, above_m**2, many)
     variance = total_m2 / np.maximum(cells, 1) - (total_m / np.maximum(cells, 1)) ** 2
     spread_m = np.sqrt(12 * np.maximum(variance, 0)).astype(np.float32)
-    if not ripples:
+    if means:
         each = np.arange(many)
         spread_m = ndimage.maximum(elevation_m, labels, each) - ndimage.minimum(elevation_m, labels, each)
+    if shore_m is None:
+        shore_m = elevation_m
+        _grow(elevation_m, labels, first)
+        cells = np.bincount(labels.reshape(-1), minlength=many)
+        cells[0] = 0
     border = np.zeros(many, np.bool_)
     for line in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         border[line] = True
     border[0] = False
-    sides = _sides(shore_m, labels, cells, same_m, step_m, ripples, is_resampled)
+    sides = _sides(shore_m, labels, cells, same_m, step_m)
     return Patches(labels, first, spread_m, cells, border=border, **sides)
 
 
@@ -127,8 +127,6 @@ def _sides(
     cells: Counts,
     same_m: float,
     step_m: float,
-    ripples: bool,
-    is_resampled: bool,
 ) -> dict[str, Counts]:
     """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
     height, width = elevation_m.shape
@@ -143,34 +141,44 @@ def _sides(
         row, col = row + top, col + left
         height_m = elevation_m[row, col]
         above_m = elevation_m[row + down, col + right] - height_m
-        far_row = np.clip(row + _RIPPLE_CELLS * down, 0, height - 1)
-        far_col = np.clip(col + _RIPPLE_CELLS * right, 0, width - 1)
-        far_m = elevation_m[far_row, far_col] - height_m
         with np.errstate(invalid="ignore"):
             differs = np.abs(above_m) > 2 * same_m
             near = np.abs(above_m) <= 1.5 * step_m
             low = differs & (above_m < 0)
-            ripple = (far_m > -_RIPPLE * above_m) & ripples
-            if is_resampled:
-                low |= differs & ~ripple & (far_m < -1.5 * max(step_m, 0.1))
         beside = differs & (beyond > 0) & (4 * cells[beyond] >= cells[patch])
-        land = low & ~beside
         kinds = {
             "edge": np.ones_like(low),
             "differ": differs,
             "beside": beside,
             "below": beside & low,
-            "lower": land & ~ripple,
-            "ripple": land & ripple,
+            "lower": low & ~beside,
             "terrace": beside & near,
-            "steep": differs & (~near | is_resampled & (np.abs(far_m) > 1.5 * step_m)),
+            "steep": differs & ~near,
         }
         for name, there in kinds.items():
             total[name] += np.bincount(patch[there], minlength=len(cells))
     return total
 
 
-def _labelled(elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int) -> tuple[Labels, Counts]:
+def _grow(elevation_m: Floats, labels: Labels, height_m: Floats) -> None:
+    """Adds to each patch the cells beside it that a filter has put there, at the foot of a shore."""
+    from scipy import ndimage
+
+    side = 2 * _SHORE_CELLS + 1
+    near = ndimage.maximum_filter(labels, side)
+    row, col = np.nonzero((near > 0) & (labels == 0))
+    near = near[row, col]
+    rise_m = ndimage.maximum_filter(np.nan_to_num(elevation_m, nan=-np.inf), side)[row, col] - height_m[near]
+    above_m = elevation_m[row, col] - height_m[near]
+    low = (above_m < 0) & (above_m >= -_UNDER * rise_m)
+    rippled = np.bincount(near[low], minlength=len(height_m)) > _RIPPLED * np.bincount(
+        near, minlength=len(height_m)
+    )
+    taken = (low & rippled[near]) | ((above_m >= 0) & (above_m <= _OVER * rise_m))
+    labels[row[taken], col[taken]] = near[taken]
+
+
+def labelled(elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int) -> tuple[Labels, Counts]:
     """(labels, cells of each patch), numbered as they come from the north-west."""
     starts, ends = _runs(elevation_m, same_m, least_alike)
     if starts.size == 0:

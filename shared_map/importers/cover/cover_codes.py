@@ -149,13 +149,11 @@ def read_cover_table(path: Path) -> CoverTable:
         if not "".join(cells) or cells[0].startswith("#"):
             continue
         what = f"cover codes {path}, line {number}"
-        if not cells[0].isdecimal():
-            if number == 1 and not any(char.isdigit() for char in cells[0]):
-                continue
-            raise TerrainError(f"{what}: {cells[0][:40]!r} is no code; expected a whole number")
-        code = int(cells[0][:12])
-        if code > HIGHEST_CODE:
-            raise TerrainError(f"{what}: code {code} is too large; expected 0 to {HIGHEST_CODE}")
+        if number == 1 and not any(char.isdigit() for char in cells[0]):
+            continue
+        code = int(cells[0][:12]) if cells[0].isdecimal() else -1
+        if not 0 <= code <= HIGHEST_CODE:
+            raise TerrainError(f"{what}: {cells[0][:40]!r} is no code; expected a whole number to {HIGHEST_CODE}")
         if code in grounds:
             raise TerrainError(f"{what}: code {code} comes twice")
         # A comma that parts no cells is that of a number: 7;1,7 is a pace of 1.7.

@@ -177,17 +177,11 @@ def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) 
     there = np.flatnonzero(cells)
     strange = [code for code in there.tolist() if states[code] == 1]
     if strange and not cells[states == 0].any():
-        raise TerrainError(
-            f"{what}: none of its codes on the terrain ({some(strange)}) is in the table, {table.title};"
-            " terrain.cover_codes names another"
-        )
+        found = f"none of its codes on the terrain ({some(strange)}) is in the table, {table.title}"
+        raise TerrainError(f"{what}: {found}; terrain.cover_codes names another")
     most = sorted((code for code in there.tolist() if states[code] == 0), key=lambda code: -cells[code])
-    listed = [
-        f"{code} {table.grounds[code].name} {cells[code] / total:.1%} ({table.grounds[code].shown})".replace(
-            "  ", " "
-        )
-        for code in most[:_TOLD_CODES]
-    ]
+    names = {code: f"{code} {table.grounds[code].name}".strip() for code in most[:_TOLD_CODES]}
+    listed = [f"{name} {cells[at] / total:.1%} ({table.grounds[at].shown})" for at, name in names.items()]
     more = f" and {len(most) - _TOLD_CODES} more" if len(most) > _TOLD_CODES else ""
     yield f"land cover: {table.title}, {meaning.how}: {', '.join(listed) or 'none of its codes'}{more}"
     if strange:
@@ -200,10 +194,7 @@ def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) 
         )
     empty = cells[states == 2].sum() / total
     if empty:
-        yield (
-            f"land cover: no data on {empty:.1%} of the terrain, where photo and heights say what it is, else open"
-            " ground"
-        )
+        yield f"land cover: no data on {empty:.1%} of the terrain, where photo and heights say what it is"
 
 
 # --- what its values mean ---------------------------------------------------------------------------------------

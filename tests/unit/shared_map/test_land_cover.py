@@ -176,7 +176,7 @@ def test_a_pace_is_read_as_it_is_written_whatever_parts_the_cells(tmp_path: Path
         ("1", "line 1: '' is no ground"),
         ("1O,forest\n2,rock", "line 1: '1O' is no code"),
         ("code,class\nx,rock", "line 2: 'x' is no code"),
-        ("70000,rock", "code 70000 is too large"),
+        ("70000,rock", "'70000' is no code; expected a whole number to 65533"),
         ("code,class\n", "has no line of code and class"),
     ],
 )

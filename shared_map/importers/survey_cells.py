@@ -1,0 +1,310 @@
+"""The cells of a survey, recovered from a file that was resampled finer: water is level there, and nowhere else.
+
+A filter that makes cells finer gives each as a weighted sum of surveyed ones. The filter, its factor and its origin
+are visible: bends are larger where it passes from one surveyed cell to the next. The sums are then solved for the
+surveyed heights, which are exact but for the rounding of the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.array_files import Floats
+
+_Doubles = NDArray[np.float64]
+Kernel = Callable[[_Doubles], _Doubles]
+
+_REACH = 3
+"""Surveyed cells on either side that a filter weighs: a Lanczos filter three, the others fewer."""
+_LEAST_FACTOR, _MOST_FACTOR = 1.05, 8.0
+"""Files of finer cells are rare, and a file as fine as its survey is its own."""
+_ORDERS = (4, 5)
+"""Orders of differences in which a period is looked for. One of even order does not see a file made twice as fine,
+whose cells mirror one another; one of odd order does not see it half a cell further."""
+_SMOOTHED = 17
+"""Cells over which the roughness of ground is levelled, so that only what alternates within them is left."""
+_SLOWEST = 0.1
+"""Periods of more than ten cells are those of the ground."""
+_PEAKS, _PEAK_APART, _PEAK = 4, 3, 4.0
+"""The highest peaks of a spectrum that are tried; how far apart they are, in steps; by what multiple of the median
+they exceed it."""
+_LINES = 16
+"""Lines of a file that are solved for a try."""
+_TRIED_CELLS, _LONGEST = 40, 1000
+"""Surveyed cells of the first try. The longer a line, the more exact is the factor; a thousand cells suffice."""
+_PHASES = 8
+"""A filter that is off by a sixteenth of a surveyed cell still fits better than others."""
+_MAYBE, _SURE = 0.7, 0.1
+"""The error of a filter that fits, as a share of the error of the same one moved by half a surveyed cell. Exact
+sums leave none; a file in whole metres leaves its rounding."""
+_ALIKE = 3.0
+"""Errors of rounding differ by less than this factor."""
+_LEVEL_M = 0.002
+"""Recovered heights of still water differ by less."""
+_SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
+"""Weight of bends of the survey: it moves heights by less than a millimetre where the sums determine them."""
+_AT_ONCE = 256
+"""Columns that are solved together: their sums take some megabytes."""
+
+
+def _linear(t: _Doubles) -> _Doubles:
+    return np.asarray(np.maximum(1 - np.abs(t), 0))
+
+
+def _cubic(t: _Doubles) -> _Doubles:
+    t = np.abs(t)
+    return np.where(t <= 1, 1.5 * t**3 - 2.5 * t**2 + 1, np.where(t < 2, -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2, 0))
+
+
+def _lanczos(t: _Doubles) -> _Doubles:
+    return np.asarray(np.where(np.abs(t) < _REACH, np.sinc(t) * np.sinc(t / _REACH), 0))
+
+
+def _spline(t: _Doubles) -> _Doubles:
+    t = np.abs(t)
+    return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.where(t < 2, (2 - t) ** 3 / 6, 0))
+
+
+KERNELS: tuple[Kernel, ...] = (_cubic, _lanczos, _linear, _spline)
+
+
+@dataclass(frozen=True)
+class _Resampling:
+    """Cell n of a line lies at first + (n + 0.5) * step - 0.5 among the cells of the survey."""
+
+    step: float
+    first: float
+    kernel: Kernel
+
+    def moved(self, cells: float) -> _Resampling:
+        """The same, seen from another cell of the line."""
+        return _Resampling(self.step, self.first + cells * self.step, self.kernel)
+
+    def at(self, count: int) -> _Doubles:
+        """The place of each cell of a line."""
+        return self.first - 0.5 + self.step * (np.arange(count, dtype=np.float64) + 0.5)
+
+
+def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+    """Returns (heights of the survey's cells, the row of it that each row lies in, the same of columns).
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        NaN is a void. If it was not resampled finer by a filter, it is its own survey.
+    """
+    void = np.isnan(elevation_m)
+    heights_m: Floats = elevation_m
+    if void.any() and not void.all():
+        from scipy import ndimage
+
+        nearest = ndimage.distance_transform_edt(void, return_distances=False, return_indices=True)
+        heights_m = elevation_m[tuple(nearest)]
+    of_line = []
+    for _ in range(2):
+        found, at = _resampling_of(heights_m), np.arange(len(heights_m))
+        if found is not None:
+            at = np.rint(found.at(len(heights_m))).astype(np.intp)
+            heights_m = _recovered(heights_m, found)
+            at = np.clip(at - at[0] - _REACH, 0, len(heights_m) - 1)
+        of_line.append(at)
+        heights_m = heights_m.T
+    rows, cols = of_line
+    if heights_m.shape == elevation_m.shape:
+        return elevation_m, rows, cols
+    heights_m = np.ascontiguousarray(heights_m)
+    if void.any():
+        heights_m[rows[:, None].repeat(len(cols), 1)[void], cols[None].repeat(len(rows), 0)[void]] = np.nan
+    return heights_m, rows, cols
+
+
+def _resampling_of(heights_m: Floats) -> _Resampling | None:
+    """The filter which made the columns of a file finer; None if there was none."""
+    count, width = heights_m.shape
+    if min(count, width) < _TRIED_CELLS:
+        return None
+    if np.isnan(heights_m[0, 0]):  # no cell has a height
+        return None
+    lines = heights_m[:, np.linspace(0, width - 1, _LINES + 2).astype(int)[1:-1]].astype(np.float64)
+    for factor in _factors(heights_m):
+        cells = min(count, int(_TRIED_CELLS * factor))
+        start = (count - cells) // 2
+        some = lines[start : start + cells]
+        tried = [
+            [_Resampling(1 / factor, phase / _PHASES, kernel) for phase in range(_PHASES)] for kernel in KERNELS
+        ]
+        errors = np.array([[_error(some, each) for each in row] for row in tried])
+        kernel, phase = np.unravel_index(errors.argmin(), errors.shape)
+        if errors[kernel, phase] > _MAYBE * np.median(errors[kernel]):
+            continue
+        found = _refined(lines, tried[kernel][phase], start, cells)
+        if found is not None:
+            return _flattest(lines, found)
+    return None
+
+
+def _flattest(lines: _Doubles, found: _Resampling) -> _Resampling:
+    """The resampling with which most surveyed cells are as high as the next, of those that fit alike.
+
+    A file which is made twice as fine fits the linear filter and the cubic one alike.
+    """
+    same = [_Resampling(found.step, found.first, kernel) for kernel in KERNELS]
+    errors = [_error(lines, each) for each in same]
+    fit = [each for each, error in zip(same, errors, strict=True) if error <= _ALIKE * min(errors)]
+    some = lines.astype(np.float32)
+    level = [int((np.abs(np.diff(_recovered(some, each), axis=0)) < _LEVEL_M).sum()) for each in fit]
+    return fit[int(np.argmax(level))]
+
+
+def _factors(heights_m: Floats) -> list[float]:
+    """The factors by which a file may have been made finer, the largest first."""
+    peaks: Any = 0
+    size = 1 << math.ceil(math.log2(4 * len(heights_m)))
+    some = heights_m[:, :: max(heights_m.shape[1] // _LONGEST, 1)].astype(np.float64)
+    for order in _ORDERS:
+        bends = np.abs(np.diff(some, order, axis=0)).mean(axis=1)
+        if not bends.any():
+            return []
+        bends = np.log(np.maximum(bends, bends.mean() / 100))
+        bends -= np.convolve(np.pad(bends, _SMOOTHED // 2, "edge"), np.ones(_SMOOTHED) / _SMOOTHED, "valid")
+        peaks = peaks + np.abs(np.fft.rfft(bends * np.hanning(len(bends)), size))
+    per_cell = np.arange(len(peaks)) / size
+    peaks[per_cell < _SLOWEST] = 0
+    usual = np.median(peaks[peaks > 0])
+    found = {2.0}
+    apart = _PEAK_APART * 4
+    for _ in range(_PEAKS):
+        n = int(peaks.argmax())
+        if peaks[n] < _PEAK * usual:
+            break
+        found |= {times / often for often in (per_cell[n], 1 - per_cell[n]) for times in (1, 2, 3)}
+        peaks[max(n - apart, 0) : n + apart + 1] = 0
+    return sorted((each for each in found if _LEAST_FACTOR <= each <= _MOST_FACTOR), reverse=True)
+
+
+def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Resampling | None:
+    """The resampling of whole lines, from that of a part; None if it does not fit."""
+    from scipy.optimize import minimize
+
+    count, kernel = len(lines), found.kernel
+    while True:
+        some, middle = lines[start : start + cells], found.moved(cells / 2)
+
+        def error(step_first: _Doubles, some: _Doubles = some, cells: int = cells) -> float:
+            tried = _Resampling(float(step_first[0]), float(step_first[1]), kernel)
+            return math.log(_error(some, tried.moved(-cells / 2)) + 1e-9)
+
+        tries = middle.step + np.array([0, 0.2 / cells, 0]), middle.first + np.array([0, 0, 0.06])
+        options: Any = {"initial_simplex": np.column_stack(tries), "maxfev": 50, "xatol": 1e-7}
+        step, first = minimize(
+            error, np.array([middle.step, middle.first]), method="Nelder-Mead", options=options
+        ).x
+        found = _Resampling(float(step), float(first), kernel).moved(-cells / 2)
+        if cells >= min(count, _LONGEST):
+            break
+        wider = min(count, 3 * cells)
+        begin = min(max(start - (wider - cells) // 2, 0), count - wider)
+        found, start, cells = found.moved(begin - start), begin, wider
+    half = _Resampling(found.step, found.first + 0.5, kernel)
+    if found.step * _LEAST_FACTOR > 1 or _error(some, found) > _SURE * _error(some, half):
+        return None
+    return found.moved(-start)
+
+
+def _sums(count: int, by: _Resampling) -> Any:
+    """Sparse (count, cells of the survey): weights of each cell of a line. The first is `_REACH` - 1 before that in
+    which the line begins."""
+    from scipy import sparse
+
+    at = by.at(count)
+    near = np.floor(at).astype(np.intp)[:, None] + np.arange(1 - _REACH, _REACH + 1)
+    weights = by.kernel(at[:, None] - near)
+    weights /= weights.sum(axis=1, keepdims=True)
+    row = np.repeat(np.arange(count), near.shape[1])
+    return sparse.csr_array((weights.reshape(-1), (row, (near - near[0, 0]).reshape(-1))))
+
+
+def _solve(sums: Any, heights_m: _Doubles) -> _Doubles:
+    """The heights of the survey, by least squares."""
+    from scipy.linalg import solveh_banded
+
+    squares = (sums.T @ sums).tocsr()
+    many = squares.shape[0]
+    banded = np.zeros((2 * _REACH, many))
+    for off in range(2 * _REACH):
+        banded[off, : many - off] = squares.diagonal(off)
+    banded[0] += 1e-9
+    solved: _Doubles = solveh_banded(banded, sums.T @ heights_m, lower=True)
+    return solved
+
+
+def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
+    """The survey in the direction of columns, without `_REACH` cells at either end.
+
+    At the border of its file a filter has fewer cells to weigh.
+    """
+    outer = round(_REACH / by.step)
+    at = np.rint(by.at(len(heights_m))[[0, -1]]).astype(np.intp)
+    sums = _Sums(len(heights_m) - 2 * outer, by.moved(outer))
+    inner = slice(at[0] + _REACH - sums.first, at[1] + 1 - _REACH - sums.first)
+    middle_m = np.float64(heights_m.mean())
+    parts = [heights_m[outer:-outer, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
+    return np.hstack([(sums.solved(part - middle_m)[inner] + middle_m).astype(np.float32) for part in parts])
+
+
+class _Sums:
+    """The weighted sums which a filter makes of the cells of a survey.
+
+    first  the number of the first surveyed cell that has a weight
+    """
+
+    def __init__(self, count: int, by: _Resampling) -> None:
+        at = by.at(count)
+        cell = np.floor(at).astype(np.intp)
+        near = cell[:, None] + np.arange(1 - _REACH, _REACH + 1)
+        weights = by.kernel(at[:, None] - near)
+        self._weights = weights / weights.sum(axis=1, keepdims=True)
+        self.first = int(near[0, 0])
+        self._near = near - self.first
+        self._starts = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+
+    def solved(self, heights_m: _Doubles) -> _Doubles:
+        """The heights of the survey, (cells, lines), by least squares."""
+        from scipy.linalg import solveh_banded
+
+        width, groups = 2 * _REACH, len(self._starts)
+        many = groups + width - 1
+        banded = np.zeros((width, many))
+        # Cells beyond the border, with hardly a weight, go on as the others do.
+        for one, other in ((0, 1), (0, 2), (1, 2)):
+            banded[other - one, one : one + many - 2] += _SMOOTH * _BEND[one] * _BEND[other]
+        for one in range(3):
+            banded[0, one : one + many - 2] += _SMOOTH * _BEND[one] ** 2
+        right = np.zeros((many, heights_m.shape[1]))
+        for one in range(width):
+            weight = self._weights[:, one, None]
+            products = np.add.reduceat(weight * self._weights[:, one:], self._starts)
+            banded[: width - one, one : one + groups] += products.T
+            right[one : one + groups] += np.add.reduceat(weight * heights_m, self._starts)
+        solved: _Doubles = solveh_banded(banded, right, lower=True, check_finite=False)
+        return solved
+
+    def summed(self, survey_m: _Doubles) -> _Doubles:
+        """The heights which the filter makes of those of a survey."""
+        return np.asarray(sum(self._weights[:, n, None] * survey_m[self._near[:, n]] for n in range(2 * _REACH)))
+
+
+def _error(lines: _Doubles, by: _Resampling) -> float:
+    """Mean difference of lines from what a filter makes of the survey that fits best."""
+    if not by.step < 1:
+        return math.inf
+    sums = _Sums(len(lines), by)
+    lines = lines - lines.mean(axis=0)
+    edge = round(_REACH / by.step)
+    return float(np.abs(lines - sums.summed(sums.solved(lines)))[edge:-edge].mean())
