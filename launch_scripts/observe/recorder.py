@@ -36,7 +36,7 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
 _POINTS = 120
-"""Instants in a report: a plot of it is some 300 pixels wide."""
+"""Instants in a report: a shard of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000
@@ -253,7 +253,7 @@ _TOTALS = (
 """Counts that are reported, summed over all processes."""
 DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
 """Histograms that are reported whole."""
-TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "obstacle_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 

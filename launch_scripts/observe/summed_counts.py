@@ -27,37 +27,39 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
     return sum(told) if told else None
 
 
-_MOST_LIVES = 1 << 13
+_MOST_GENERATIONS = 1 << 13
 """Lives of processes that are counted: names may be made up by strangers."""
 
 
 class Counts:
-    """The newest counts of every process, and of its earlier lives only what no later one carries on: an hour of
-    kills takes no more memory than a minute."""
+    """The newest counts of every process, and of its earlier generations only what no later one carries on: an hour
+    of kills takes no more memory than a minute."""
 
     def __init__(self) -> None:
-        self._lives: dict[tuple[str, str], dict[int, Stats]] = {}
+        self._generations: dict[tuple[str, str], dict[int, Stats]] = {}
         """(role, id) -> incarnation -> what it has said last."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
-        """(role, id) -> begin and end of the longest time without counts in one life, if that was long."""
+        """(role, id) -> begin and end of the longest time without counts in one generation, if that was long."""
 
     def count(self, stats: Stats) -> None:
         """Takes in what a process says."""
         of = (stats.role, stats.id)
-        lives = self._lives.get(of, {})
-        known = lives.get(stats.incarnation)
+        generations = self._generations.get(of, {})
+        known = generations.get(stats.incarnation)
         if known is None:
-            if any(_carries(each, stats.incarnation) for each in lives.values()):
+            if any(_carries(each, stats.incarnation) for each in generations.values()):
                 return
-            if sum(map(len, self._lives.values())) >= _MOST_LIVES:
+            if sum(map(len, self._generations.values())) >= _MOST_GENERATIONS:
                 return
-            self._lives[of] = lives = {life: each for life, each in lives.items() if not _carries(stats, life)}
+            self._generations[of] = generations = {
+                generation: each for generation, each in generations.items() if not _carries(stats, generation)
+            }
         elif stats.stamp_ns < known.stamp_ns:
             return
-        lives[stats.incarnation] = stats
-        self._newest[of] = lives[max(lives)]
+        generations[stats.incarnation] = stats
+        self._newest[of] = generations[max(generations)]
         began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
         if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
             self.silences[of] = (known.stamp_ns, stats.stamp_ns)
@@ -71,7 +73,7 @@ class Counts:
         return dict(sorted(self._newest.items()))
 
     def _summed(self) -> Iterator[Stats]:
-        return (stats for lives in self._lives.values() for stats in lives.values())
+        return (stats for generations in self._generations.values() for stats in generations.values())
 
     def total(self, name: str) -> int | None:
         """A count, summed over processes and incarnations; None if no process has published it."""
@@ -108,7 +110,7 @@ class Counts:
 
 
 def _carries(stats: Stats, incarnation: int) -> bool:
-    """Returns True if a life counts on where an earlier one ended."""
+    """Returns True if a generation counts on where an earlier one ended."""
     return 0 < stats.since <= incarnation < stats.incarnation
 
 

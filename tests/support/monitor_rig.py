@@ -25,7 +25,15 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet
 
 _TOPICS = (
-    *(topics.BELIEVED, topics.BODY, topics.FLEET, topics.FOLLOWED, topics.GOAL_STATES, topics.MARKS, topics.NOTE),
+    *(
+        topics.BELIEVED,
+        topics.OBSTACLE,
+        topics.FLEET,
+        topics.FOLLOWED,
+        topics.GOAL_STATES,
+        topics.MARKS,
+        topics.NOTE,
+    ),
     *(topics.POSE, topics.SIGHTED, topics.STATS, topics.STATUS),
 )
 SILENT = MonitorConfig(live=False)

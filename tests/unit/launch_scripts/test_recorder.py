@@ -32,7 +32,7 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
-from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
+from swarm.wire.messages.processes import Alarm, Heartbeat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
@@ -132,7 +132,7 @@ def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_n
     assert report["restarts"] == 3
 
 
-def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
+def test_a_generation_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
     """A recorder of all incarnations has the same sums as a recorder of the last only."""
     first = stats("agent", "a0", 1, 2.0, {"marks": 7})
     second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
@@ -141,7 +141,7 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     hear(recorder, first, second)
     hear(late, second)
     assert recorder.report()["marks"] == late.report()["marks"] == 9
-    hear(recorder, other)  # one that was started by hand knows of no other life
+    hear(recorder, other)  # one that was started by hand knows of no other generation
     assert recorder.report()["marks"] == 109
 
 
@@ -150,13 +150,13 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
     latest = LatestState(plan_of(scenario(), 0), GRID)
 
     def live(from_s: int, until_s: int) -> int:
-        lives = [
+        generations = [
             msgspec.structs.replace(stats("agent", "a0", 2 + n, n, {"marks": n}, x=[n + 1.0]), since=2)
             for n in range(from_s, until_s)
         ]
-        for n, life in zip(range(from_s, until_s), lives, strict=True):
-            late = random.Random(n).choice(lives[: n - from_s + 1])
-            for message in (life, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+        for n, generation in zip(range(from_s, until_s), generations, strict=True):
+            late = random.Random(n).choice(generations[: n - from_s + 1])
+            for message in (generation, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
                 latest.heard(message, n * NS_PER_S)
             latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
             latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
@@ -172,7 +172,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observe = "launch_scripts.observe"
-    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_LIVES",
+    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_GENERATIONS",
                   "process_load._MOST"):  # fmt: skip
         monkeypatch.setattr(f"{observe}.{limit}", 10)
     latest = LatestState(plan_of(scenario(), 0), GRID)
@@ -182,7 +182,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
         for message in (
             stats("agent", name, at_s=at_s), status(name, 1.0), pose(name, 1.0, 1.0, at_s + 1),
             fleet(f"{name}.1", {f"{name}-00": (1.0, 1.0)}, at_s), set_of(f"{name}.1", 0, at_s + 1, {}),
-            Beat(role="planner", id=name, incarnation=1, ready=True, leads=True),
+            Heartbeat(role="planner", id=name, incarnation=1, ready=True, leads=True),
             GoalStates(agent=name, stamp_ns=1, states=[goal]),
         ):  # fmt: skip
             latest.heard(message, at_s * NS_PER_S)
@@ -290,8 +290,8 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     def titles() -> list[str]:
         return [line.title for line in recorder.summary(0).targets]
 
-    def beat(id: str, leads: bool) -> Beat:
-        return Beat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
+    def heartbeat(id: str, leads: bool) -> Heartbeat:
+        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
     begun = Recorder(standing_by, GRID, 1)
@@ -299,12 +299,12 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     assert begun.summary(31 * NS_PER_S).targets[0].title == "t0 (planner down)"
     for id in ("t0", "t0.r1", "t1"):
         recorder.alive(Peer("planner", id, 1), True, 0)
-    hear(recorder, beat("t0", True), beat("t0.r1", False), beat("t1", True))
+    hear(recorder, heartbeat("t0", True), heartbeat("t0.r1", False), heartbeat("t1", True))
     assert titles() == ["t0", "t1"]
     recorder.alive(Peer("planner", "t0", 1), False, 0)
-    hear(recorder, beat("t0.r1", True))
+    hear(recorder, heartbeat("t0.r1", True))
     assert titles() == ["t0 (standby 1)", "t1"]
-    hear(recorder, beat("t0.r1", False), beat("t0", True))
+    hear(recorder, heartbeat("t0.r1", False), heartbeat("t0", True))
     assert titles() == ["t0", "t1"]
 
 
