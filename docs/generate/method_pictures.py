@@ -25,7 +25,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from docs.generate.printed import Pace, Place, lattice_route, printed_costs, printed_range
-from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED, STYLE
+from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
 from planner_service.strategy import ROWS, STAGES, Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
@@ -338,7 +338,7 @@ def draw_named(pictures: Mapping[str, Callable[[], Figure]]) -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(pictures)}; all if none")
     for name in parser.parse_args().names or pictures:
         raw = io.BytesIO()
-        with mpl.rc_context(STYLE):
+        with mpl.rc_context(fname=Path(__file__).parents[2] / "launch_scripts/report/pictures.mplstyle"):
             pictures[name]().savefig(raw, format="png", dpi=100, metadata={"Software": None})
         image = Image.open(raw).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         image.save(IMAGES / f"{name}.png", optimize=True)

@@ -1,4 +1,4 @@
-"""The look of pictures and of the live view: colours, matplotlib's settings, shade of the relief, round lengths."""
+"""The look of pictures and of the live view: colours, shade of the relief, round lengths."""
 
 from __future__ import annotations
 
@@ -47,32 +47,6 @@ def rgb(colour: str) -> tuple[int, int, int]:
     """`#rrggbb` as numbers from 0 to 255."""
     red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
     return red, green, blue
-
-
-STYLE: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 5,
-    "axes.edgecolor": "#9aa3ad",
-    "axes.linewidth": 0.8,
-    "axes.labelcolor": FAINT,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e6e9ec",
-    "grid.linewidth": 0.8,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "text.color": INK,
-    "axes.titlecolor": INK,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
-"""Settings of matplotlib, for `with mpl.rc_context(STYLE)`."""
 
 
 def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[np.float32]:

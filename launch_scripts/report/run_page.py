@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
-from launch_scripts.observe.palette import STYLE, colours_of_groups
+from launch_scripts.observe.palette import colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
@@ -34,7 +34,7 @@ from launch_scripts.report.run_picture import (
     headline,
     size_km,
 )
-from launch_scripts.report.run_plots import PLOTS, draw_plot
+from launch_scripts.report.run_plots import PLOTS, STYLE, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text
@@ -173,7 +173,7 @@ def _svg(
 ) -> Markup:
     """Returns the drawing of `draw` on axes at a place of a figure, as an SVG element as wide as its place. Its
     text is text, and the page says in which font."""
-    with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run", "text.parse_math": False}):
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=size_in)
         axes = figure.add_axes(place)
         draw(axes)

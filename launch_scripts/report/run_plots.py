@@ -28,6 +28,8 @@ from swarm.files import replacing
 
 Report = Mapping[str, Any]
 Values = NDArray[np.float64]
+STYLE = Path(__file__).with_name("pictures.mplstyle")
+"""Settings of matplotlib for all pictures."""
 _TITLE_PT = 10.5
 _LEAST_PERCENT, _MOST_PERCENT = 0.01, 100.0
 """Gaps are shown between these, on a logarithmic scale."""
@@ -203,7 +205,7 @@ def saved(path: Path | io.BytesIO, size_in: tuple[float, float], dpi: int = 120,
 
     look  as `Figure` takes it
     """
-    with mpl.rc_context({**palette.STYLE, "text.parse_math": False}):  # names may hold a $
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=size_in, dpi=dpi, facecolor="white", **look)
         FigureCanvasAgg(figure)
         yield figure
