@@ -17,13 +17,14 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
    word. First ask all agents (`KnownRequest`), until enough members of every plot have replied that one of them
    has its newest usable table.
 2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
-   Entries that it omits are over.
+   Entries that it omits are over. To have driven on is no news while enough is ahead and none waits behind.
 3. Enter a cell only by an entry that a `Granted` for this life, newer than all that it knows of the plot, adds to
    the path of the vehicle, and only once all entries before it are over. Never go back to an older table of a plot,
    not even after the vehicles have left it.
 4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
    table lists it no more. Never use such an entry again.
-5. Give back entries that wait for others which do not go on.
+5. Give back entries that wait for others which do not go on, and those further ahead than a vehicle keeps once
+   another waits behind them.
 6. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
 7. Speak to the warden, and to all members where no warden was heard for half a second.
 
@@ -31,7 +32,8 @@ Duties of a warden:
 
 1. Add an entry at the end of a cell's order only, and one to a cell and table. Remove it only by a statement of its
    host that knows the table which added it and omits it, or by proof that its life has ended.
-2. Put a vehicle only behind one that goes on, and never so that it would wait for itself.
+2. Put a vehicle only behind one that goes on or will give back, and never so that it would wait for itself. Grant
+   cells further ahead than a vehicle keeps only where no other is near.
 3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
 
 Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
@@ -43,7 +45,7 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
 `Table`         Warden to members: the entries of one plot. Its stamp is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable.
 `Granted`       Warden to host: what a usable table says of the vehicles of one host, under its stamp, each entry
-                with those before it, and which other hosts follow. A host takes the entries that continue the path
+                with those before it, and which hosts follow. A host takes the entries that continue the path
                 of the vehicle, and passes over the others, which gives them back. `pushed` asks a vehicle to make
                 way into another plot; `occupied` are the cells of others around.
 `Left`          Host to host: these entries are over.
