@@ -130,7 +130,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sense_range_m       radius within which the simulated sensor sees the true ground
     capture_range_m     a target this near is captured
     route_cells         steps of a route asked for at a time; 0 is the whole route
-    reserve_cells       cells ahead of itself that a vehicle may be granted
+    reserve_cells       cells ahead of itself that a vehicle keeps even if others wait for them
     reassign_s          how often a vehicle asks which target is the cheapest
     sensor              truth: sees the true ground within `sense_range_m`; or a plug-in
     sensor_options      what a plug-in for `sensor` takes

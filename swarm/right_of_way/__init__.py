@@ -17,14 +17,15 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
    word. First ask all agents (`KnownRequest`), until enough members of every shard have replied that one of them
    has its newest usable table.
 2. Tell each shard that concerns it everything about its vehicles there, whenever that is news and once a heartbeat.
-   Entries that it omits are over.
+   Entries that it omits are over. To have driven on is no news while enough is ahead and none waits behind.
 3. Enter a cell only by an entry that a `Granted` for this generation, newer than all that it knows of the shard,
    adds to the path of the vehicle, and only once all entries before it are over. Take no entry that an older table
    could have granted. Never go back to an older table of a shard, not even after the vehicles have left it. Where
    certificates prove names, act on a `Granted` once a majority of members has the same on file.
 4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
    table lists it no more. Never use such an entry again.
-5. Give back entries that wait for others which do not go on.
+5. Give back entries that wait for others which do not go on, and those further ahead than a vehicle keeps once
+   another waits behind them.
 6. Stop once a table names a greater generation of this host, and say so where the vehicles are simulated ones.
 7. Speak to the leader, and to all members where no leader was heard for half a second, or certificates prove
    names.
@@ -34,7 +35,8 @@ Duties of a leader:
 
 1. Add an entry at the end of a cell's order only, and one to a cell and table. Remove it only by a statement of its
    host that knows the table which added it and omits it, or by proof that its generation has ended.
-2. Put a vehicle only behind one that goes on, and never so that it would wait for itself.
+2. Put a vehicle only behind one that goes on or will give back, and never so that it would wait for itself. Grant
+   cells further ahead than a vehicle keeps only where no other is near.
 3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
 
 Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
@@ -46,7 +48,7 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
 `Table`         Leader to members: the entries of one shard. Its stamp is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable.
 `Granted`       Leader to host: what a usable table says of the vehicles of one host, under its stamp, each entry
-                with those before it, and which other hosts follow. A host takes the entries that continue the path
+                with those before it, and which hosts follow. A host takes the entries that continue the path
                 of the vehicle, and passes over the others, which gives them back. `pushed` asks a vehicle to make
                 way into another shard; `occupied` are the cells of others around.
 `Word`          Member to host, where certificates prove names: a digest of what its file grants to the host, and

@@ -88,7 +88,8 @@ def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_v
     simulation.run_until(13)
     back = {id: cell for id, cell in cells(simulation).items() if id.startswith("a1")}
     assert back.keys() == stood.keys()
-    assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 8
+    # On one of the cells that had been granted, of which there are 16 ahead at most.
+    assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 16
     simulation.run_until(20)
     assert laws.collisions == []
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import io
-from collections.abc import Iterator
+from typing import Any
 
 import msgspec
 import pytest
@@ -17,7 +17,7 @@ from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
-from swarm.wire.messages.traffic import Entry, Granted, Number, Table
+from swarm.wire.messages.traffic import Entry, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
@@ -112,7 +112,7 @@ def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, list[E
 
 @WORLDS
 def test_leaders_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name, seed, monkeypatch):
-    plan, granted, compared, told = Leader._plan, Leader.granted, 0, 0
+    plan, content_of, compared, told = Leader._plan, Leader._content_of, 0, 0
 
     def plan_twice(leader: Leader, now_ns: int) -> None:
         nonlocal compared
@@ -127,15 +127,16 @@ def test_leaders_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name,
         assert leader._pushed == twin._pushed
         compared += 1
 
-    def granted_twice(leader: Leader, table: Table, now_ns: int) -> Iterator[Granted]:
+    def content_twice(leader: Leader, table: Table) -> dict[str, Any]:
         nonlocal told
-        for said in granted(leader, table, now_ns):
-            assert (said.grants, said.occupied) == told_anew(leader, table, said.host)
+        contents = content_of(leader, table)
+        for host, content in contents.items():
+            assert (content[0], content[3]) == told_anew(leader, table, host)
             told += 1
-            yield said
+        return contents
 
     monkeypatch.setattr(Leader, "_plan", plan_twice)
-    monkeypatch.setattr(Leader, "granted", granted_twice)
+    monkeypatch.setattr(Leader, "_content_of", content_twice)
     simulation_of(name, seed).run_until(SECONDS)
     assert compared > 20
     assert told > 50
