@@ -63,13 +63,13 @@ class _View:
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> its entries in the table in use
     followed  other host -> entries of ours behind which its vehicles wait, by the same table
-    asked    member -> entries that it lacks our word about
+    asked    member -> entries that it lacks our word about, until it is sent
     left     other host -> those of these that are over, as we told it last, and when
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet    the first standing from which on we want nothing here; None while we do
-    words    member -> its last word, where names are proven; a grant is its warden's word. An older one that comes
-             late does no harm: no entry is taken that a used table could have granted
+    words    member -> (epoch, digest) of its last word, where names are proven; a grant is its warden's word. An
+             older one that comes late does no harm: no entry is taken that a used table could have granted
     pending  warden -> its last grant, until a majority has the same on file, and its digest
     told     the last statement about our vehicles, and its time
     same     whether the next statement is known to be the same
@@ -85,7 +85,7 @@ class _View:
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
-    words: dict[str, Word] = field(default_factory=dict)
+    words: dict[str, tuple[int, int]] = field(default_factory=dict)
     pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
@@ -291,33 +291,26 @@ class Holdings:
         if not self._plots.proven:
             return self._take(view, granted)
         part = part_of(granted.life, granted.grants)
+        view.words[granted.agent] = granted.epoch, part
         view.pending[granted.agent] = granted, part
-        word = Word(
-            plot=granted.plot,
-            host=self._agent,
-            agent=granted.agent,
-            epoch=granted.epoch,
-            seq=granted.seq,
-            part=part,
-        )
-        return self.hear_word(word)
+        return self._take_agreed(view)
 
     def hear_word(self, word: Word) -> list[str]:
-        """A member has something on file for us: use the grants that a majority has. Returns the vehicles that have
-        found their place."""
+        """A member has something on file for us. Returns the vehicles that have found their place."""
         if word.agent not in self._plots.members(word.plot):
             return []
+        view = self._views.setdefault(word.plot, _View())
+        view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.plot])
-        view = self._views.get(word.plot)
-        if view is None:
-            return []
-        view.words[word.agent] = word
-        view.asked[word.agent] = word.lacks
+            view.asked[word.agent] = word.lacks
+        return self._take_agreed(view)
+
+    def _take_agreed(self, view: _View) -> list[str]:
+        """Acts on the grants that a majority has on file."""
         placed: list[str] = []
         for warden, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
-            same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
-            if same >= self._plots.majority:
+            if list(view.words.values()).count((granted.epoch, part)) >= self._plots.majority:
                 del view.pending[warden]
                 placed += self._take(view, granted)
         return placed
@@ -404,8 +397,8 @@ class Holdings:
             over = self._entries.over.get(plot, set())
             said = {host: [number for number in of if number in over] for host, of in view.followed.items()}
             for member, lacks in view.asked.items():
-                if lacks:
-                    said[member] = [*said.get(member, ()), *self._entries.disclaim(plot, lacks)]
+                said[member] = [*said.get(member, ()), *self._entries.disclaim(plot, lacks)]
+            view.asked.clear()
             for host, left in said.items():
                 told, told_ns = view.left.get(host, (None, 0))
                 if left and (left != told or not 0 <= now_ns - told_ns < BEAT_NS):

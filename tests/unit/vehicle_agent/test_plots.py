@@ -61,6 +61,7 @@ def test_cells_are_adjacent_if_one_step_leads_from_one_to_the_other() -> None:
 def test_plots_of_one_region_need_no_quorum_and_larger_ones_all_agents_but_two() -> None:
     assert Plots(GRID, FIVE).has_quorum([])
     assert [Plots(GRID, FIVE[:n]).majority for n in (1, 2, 3, 5)] == [1, 1, 2, 2]
+    assert [Plots(GRID, FIVE[:n], proven=True).majority for n in (1, 2, 3, 4, 5)] == [1, 1, 2, 3, 3]
     assert [Plots(GRID, FIVE, WIDE).has_quorum(FIVE[:n]) for n in range(6)] == 3 * [False] + 3 * [True]
 
 
