@@ -63,7 +63,6 @@ class _View:
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> its entries in the table in use
     followed  other host -> entries of ours behind which its vehicles wait, by the same table
-    asked    member -> entries that it lacks our word about, until it is sent
     left     other host -> those of these that are over, as we told it last, and when
     pushed   vehicle -> the age with which it is to make way into another plot
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
@@ -80,7 +79,6 @@ class _View:
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
-    asked: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
@@ -303,7 +301,8 @@ class Holdings:
         view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.plot])
-            view.asked[word.agent] = word.lacks
+            self._entries.disclaim(word.plot, word.lacks)
+            view.same, view.told = False, None
         return self._take_agreed(view)
 
     def _take_agreed(self, view: _View) -> list[str]:
@@ -395,12 +394,9 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for plot, view in self._views.items():
             over = self._entries.over.get(plot, set())
-            said = {host: [number for number in of if number in over] for host, of in view.followed.items()}
-            for member, lacks in view.asked.items():
-                said[member] = [*said.get(member, ()), *self._entries.disclaim(plot, lacks)]
-            view.asked.clear()
-            for host, left in said.items():
+            for host, numbers in view.followed.items():
                 told, told_ns = view.left.get(host, (None, 0))
+                left = [number for number in numbers if number in over]
                 if left and (left != told or not 0 <= now_ns - told_ns < BEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
@@ -447,6 +443,7 @@ class Holdings:
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
+            never=sorted(self._entries.disclaimed.get(plot, ())),
         )
 
     def _listeners(self, plot: int, now_ns: int) -> tuple[str, ...]:

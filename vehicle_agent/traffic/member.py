@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Left, Stamp, Standing, Stored, Table, Word
+from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table, Word
 from vehicle_agent.traffic.warden import Warden
 from vehicle_agent.traffic.witness import Witness
 
@@ -184,10 +184,6 @@ class Member:
             self._witness.hear_standing(standing, now_ns)
         if self.warden is not None:
             self.warden.take_standing(standing, now_ns)
-
-    def hear_left(self, left: Left) -> None:
-        if self._witness is not None:
-            self._witness.hear_left(left)
 
     # --- what members say -----------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import LIVES_KEPT
 from swarm.right_of_way.incarnations import BEAT_NS
-from swarm.wire.messages.traffic import Left, Number, Stamp, Standing, Table, Word
+from swarm.wire.messages.traffic import Number, Stamp, Standing, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.warden import SILENT_NS
 
@@ -37,17 +37,15 @@ class _Host:
 
     spoke_ns  time of the last one
     newest    (life, sequence) of the newest
-    lives     life -> the newest table that it knows, and the entries that it holds
+    lives     life -> the newest table that it knows, the entries that it holds, and those that it never takes
     ended     lives that have ended
-    gone      entries that it said to have left, or never to take
     told      the last word to it, and its time
     """
 
     spoke_ns: int
     newest: Stamp = BEFORE_ALL
-    lives: dict[int, tuple[Stamp, frozenset[Number]]] = field(default_factory=dict)
+    lives: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
-    gone: set[Number] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
 
@@ -59,17 +57,17 @@ class _Host:
         if (standing.life, standing.seq) > self.newest:
             self.newest = standing.life, standing.seq
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
-            self.lives[standing.life] = standing.knows, held
+            self.lives[standing.life] = standing.knows, held, standing.never
             for old in sorted(self.lives)[:-LIVES_KEPT]:
                 del self.lives[old]
 
     def is_over(self, number: Number, life: int) -> bool:
         """Returns True if this host said that an entry of a life of it is over. Life 0 is the run's start, of which
         the entries belong to the first life that a table counts."""
-        if life in self.ended or number in self.gone:
+        if life in self.ended:
             return True
         lives = self.lives.values() if not life else [self.lives[life]] if life in self.lives else ()
-        return any(number[1:] <= knows and number not in held for knows, held in lives)
+        return any((number[1:] <= knows and number not in held) or number in never for knows, held, never in lives)
 
 
 class Witness:
@@ -85,11 +83,6 @@ class Witness:
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
-
-    def hear_left(self, left: Left) -> None:
-        """A host answers what we asked."""
-        if left.agent in self._lacks:
-            self._hosts[left.agent].gone.update(set(left.entries).intersection(self._lacks[left.agent]))
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
@@ -130,7 +123,7 @@ class Witness:
         return any(
             not held.issubset(lists)
             for name, host in self._hosts.items()
-            for knows, held in [host.lives.get(host.newest[0], (BEFORE_ALL, frozenset()))]
+            for _, held, _ in [host.lives.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
             if table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 
