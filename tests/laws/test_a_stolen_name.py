@@ -1,4 +1,4 @@
-"""One agent's name is stolen, and certificates prove names: however it lies, as a member, a warden and a host, no
+"""One agent's name is stolen, and certificates prove names: however it lies, as a member, a leader and a host, no
 two vehicles of others meet; and with each rule taken out, they do.
 
 More histories: `pytest tests/laws/test_a_stolen_name.py -m seeds --seeds 0:2000`.
@@ -15,12 +15,12 @@ from support.thief import ThiefWorld
 from support.traffic_world import Faults, TrafficWorld, random_faults
 
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from vehicle_agent.traffic.witness import Witness
 
 LIES_S = 8.0
 SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))
-"""(agents, vehicles each, side of the map, side of a plot): one plot or four, a quarter of the cells taken."""
+"""(agents, vehicles each, side of the map, side of a shard): one shard or four, a quarter of the cells taken."""
 
 
 def world_of(seed: int) -> ThiefWorld:
@@ -67,35 +67,35 @@ def test_without_a_thief_all_move_although_members_judge_each_table(seed: int) -
 # --- the rules, each taken out ------------------------------------------------------------------------------
 
 
-def hosts_believe_one_warden(patch: pytest.MonkeyPatch) -> None:
+def hosts_believe_one_leader(patch: pytest.MonkeyPatch) -> None:
     hear = Holdings.hear_granted
 
     def gullible(self: Holdings, granted, now_ns):  # type: ignore[no-untyped-def]
-        majority, self._plots.majority = self._plots.majority, 1
+        majority, self._shards.majority = self._shards.majority, 1
         placed = hear(self, granted, now_ns)
-        self._plots.majority = majority
+        self._shards.majority = majority
         return placed
 
     patch.setattr(Holdings, "hear_granted", gullible)
 
 
-def members_store_whatever_a_warden_says(patch: pytest.MonkeyPatch) -> None:
+def members_store_whatever_a_leader_says(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Witness, "accepts", lambda self, old, new: True)
 
 
 def two_of_four_are_enough(patch: pytest.MonkeyPatch) -> None:
-    begin = Plots.__init__
+    begin = Shards.__init__
 
-    def smaller(self: Plots, *what, **named):  # type: ignore[no-untyped-def]
+    def smaller(self: Shards, *what, **named):  # type: ignore[no-untyped-def]
         begin(self, *what, **named)
         self.majority = 2
 
-    patch.setattr(Plots, "__init__", smaller)
+    patch.setattr(Shards, "__init__", smaller)
 
 
 @pytest.mark.parametrize(
     "broken",
-    [hosts_believe_one_warden, members_store_whatever_a_warden_says, two_of_four_are_enough],
+    [hosts_believe_one_leader, members_store_whatever_a_leader_says, two_of_four_are_enough],
     ids=lambda rule: rule.__name__,
 )
 def test_each_rule_is_needed(broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:

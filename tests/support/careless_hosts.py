@@ -15,11 +15,11 @@ def takes_what_an_older_table_added(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
 
     def greedy(
-        self: HostEntries, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]
+        self: HostEntries, shard: int, stamp: Stamp, generation: int, grants: Mapping[str, Sequence[Entry]]
     ) -> set[str]:
-        knows = self.knows.pop(plot, BEFORE_ALL)
-        changed = hear(self, plot, stamp, life, grants) if stamp > knows else set()
-        self.knows[plot] = max(knows, self.knows.get(plot, knows))
+        knows = self.knows.pop(shard, BEFORE_ALL)
+        changed = hear(self, shard, stamp, generation, grants) if stamp > knows else set()
+        self.knows[shard] = max(knows, self.knows.get(shard, knows))
         return changed
 
     patch.setattr(HostEntries, "hear_granted", greedy)

@@ -42,30 +42,30 @@ class Thief(Process):
 
     def tick(self) -> None:
         super().tick()
-        for plot, member in self.rights._members.items():
+        for shard, member in self.rights._members.items():
             if self.chance.random() < 0.5:
-                epochs = range(member.promised + 1, member.promised + 1 + len(self.world.plots.members(plot)))
-                ours = next(epoch for epoch in epochs if self.world.plots.warden(plot, epoch) == self.agent)
+                epochs = range(member.promised + 1, member.promised + 1 + len(self.world.shards.members(shard)))
+                ours = next(epoch for epoch in epochs if self.world.shards.leader(shard, epoch) == self.agent)
                 epoch = ours + self.chance.choice(_EPOCHS) * len(epochs)
                 seq = self.chance.choice((1, 2, 3, 1 << 20))
                 lie = self.stolen_from(replace(member.stored, agent=self.agent, epoch=epoch, seq=seq))
                 self.world.lies += 1
                 self.tell(lie)
                 if self.chance.random() < 0.2:
-                    others = [each for each in self.world.plots.members(plot) if each != self.agent]
-                    super().perform([AskPromises(plot, epoch, tuple(others))])
+                    others = [each for each in self.world.shards.members(shard) if each != self.agent]
+                    super().perform([AskPromises(shard, epoch, tuple(others))])
 
-    def hear_claim(self, plot: int, epoch: int) -> list[Action]:
+    def hear_claim(self, shard: int, epoch: int) -> list[Action]:
         """Votes for all, twice, and for a table of its own."""
-        actions = super().hear_claim(plot, epoch)
+        actions = super().hear_claim(shard, epoch)
         if self.chance.random() < 0.5:
             return actions
-        stored = self.rights._members[plot].stored if plot in self.rights._members else None
+        stored = self.rights._members[shard].stored if shard in self.rights._members else None
         return actions if stored is None else [replace(self.stolen_from(stored), epoch=max(epoch - 4, 1), seq=9)]
 
     def stolen_from(self, table: Table) -> Table:
         """The table, in which a vehicle of one host is given a cell of another."""
-        plots, free = self.world.plots, Orders(table)
+        shards, free = self.world.shards, Orders(table)
         thefts: list[tuple[str, Number]] = []
         for vehicle, path in table.grants.items():
             for cell in self.world.next_to(path[-1][0]):
@@ -88,20 +88,20 @@ class Thief(Process):
             hosts[agent_of(owner)] = hosts[agent_of(owner)][0], 1 << 40
         first = (stolen[0], 0, 0) if how == 0 else (stolen[0], table.epoch, table.seq)  # before it, or after it
         grants[vehicle] = [*grants[vehicle], first]
-        assert plots.of(stolen[0]) == table.plot
+        assert shards.of(stolen[0]) == table.shard
         return replace(table, grants={id: path for id, path in grants.items() if path}, hosts=hosts)
 
     def any_of(self, word: Word) -> list[Number]:
         """Entries of a host that it may not have heard of yet."""
-        grants = self.rights._members[word.plot].stored.grants.items()
+        grants = self.rights._members[word.shard].stored.grants.items()
         return [path[-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
 
     def tell(self, table: Table) -> None:
         """Different members and hosts are told different tables of one number, each with the words that go with
         it."""
-        tables = [table, self.stolen_from(table), self.rights._members[table.plot].stored]
+        tables = [table, self.stolen_from(table), self.rights._members[table.shard].stored]
         tables[2] = replace(tables[2], agent=self.agent, epoch=table.epoch, seq=table.seq)
-        for member in self.world.plots.members(table.plot):
+        for member in self.world.shards.members(table.shard):
             said = self.chance.choice(tables)
             if member != self.agent:
                 self.world.send(self, member, lambda to, said=said: to.hear_table(said))
@@ -113,15 +113,21 @@ class Thief(Process):
 
     def words(self, table: Table, host: str) -> Iterator[Granted | Word]:
         """A grant by a table, sometimes without those before; and the word for it."""
-        grants, life = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
+        grants, generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
         if self.chance.random() < 0.2:
             grants = {id: [replace(entry, after=[]) for entry in entries] for id, entries in grants.items()}
         stamp = {"epoch": table.epoch, "seq": table.seq}
         yield Granted(
-            plot=table.plot, host=host, agent=self.agent, life=life, heard=1 << 30, grants=grants, **stamp
+            shard=table.shard,
+            host=host,
+            agent=self.agent,
+            generation=generation,
+            heard=1 << 30,
+            grants=grants,
+            **stamp,
         )
-        part = part_of(life, grants)
-        yield Word(plot=table.plot, host=host, agent=self.agent, part=part, **stamp)
+        part = part_of(generation, grants)
+        yield Word(shard=table.shard, host=host, agent=self.agent, part=part, **stamp)
 
 
 class ThiefWorld(TrafficWorld):

@@ -12,22 +12,24 @@ from dataclasses import dataclass, field
 from swarm.config.agents import agent_of
 from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
-from swarm.right_of_way.host import LIVES_KEPT
-from swarm.right_of_way.incarnations import BEAT_NS
-from swarm.wire.messages.traffic import Number, Stamp, Standing, Table, Word
+from swarm.right_of_way.host import GENERATIONS_KEPT
+from swarm.right_of_way.incarnations import HEARTBEAT_NS
+from swarm.wire.messages.traffic import HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.warden import SILENT_NS
+from vehicle_agent.traffic.shard_leader import SILENT_NS
 
 _MOST_LACKED = 64
 """Entries that one word asks for; the next asks for more."""
 
 
 def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
-    """Returns number -> its vehicle, and the life of its host; None if a number is there twice."""
+    """Returns number -> its vehicle, and the generation of its host; None if a number is there twice."""
     of = [(agent_of(vehicle), vehicle, numbers) for vehicle, numbers in table.grants.items()]
     each = [(table.hosts.get(host, BEFORE_ALL)[0], vehicle, numbers) for host, vehicle, numbers in of]
-    each += [(fence.life, vehicle, numbers) for fence in table.fences for vehicle, numbers in fence.entries.items()]
-    found = {number: (vehicle, life) for life, vehicle, numbers in each for number in numbers}
+    each += [
+        (fence.generation, vehicle, numbers) for fence in table.fences for vehicle, numbers in fence.entries.items()
+    ]
+    found = {number: (vehicle, generation) for generation, vehicle, numbers in each for number in numbers}
     return found if len(found) == sum(len(numbers) for _, _, numbers in each) else None
 
 
@@ -35,43 +37,52 @@ def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
 class _Host:
     """Statements of one host.
 
-    spoke_ns  time of the last one
-    newest    (life, sequence) of the newest
-    lives     life -> the newest table that it knows, the entries that it holds, and those that it never takes
-    ended     lives that have ended
-    told      the last word to it, and its time
+    spoke_ns     time of the last one
+    newest       (generation, sequence) of the newest
+    generations  generation -> the newest table that it knows, the entries that it holds, and those that it never
+                 takes
+    ended        lives that have ended
+    told         the last word to it, and its time
     """
 
     spoke_ns: int
     newest: Stamp = BEFORE_ALL
-    lives: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
+    generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
 
-    def hear(self, standing: Standing, now_ns: int) -> None:
+    def hear(self, standing: HostState, now_ns: int) -> None:
         self.spoke_ns = now_ns
         self.ended.update(standing.dead)
         if standing.ended:
-            self.ended.add(standing.life)
-        if (standing.life, standing.seq) > self.newest:
-            self.newest = standing.life, standing.seq
+            self.ended.add(standing.generation)
+        if (standing.generation, standing.seq) > self.newest:
+            self.newest = standing.generation, standing.seq
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
-            self.lives[standing.life] = standing.knows, held, standing.never
-            for old in sorted(self.lives)[:-LIVES_KEPT]:
-                del self.lives[old]
+            self.generations[standing.generation] = standing.knows, held, standing.never
+            for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
+                del self.generations[old]
 
-    def is_over(self, number: Number, life: int) -> bool:
-        """Returns True if this host said that an entry of a life of it is over. Life 0 is the run's start, of which
-        the entries belong to the first life that a table counts."""
-        if life in self.ended:
+    def is_over(self, number: Number, generation: int) -> bool:
+        """Returns True if this host said that an entry of a generation of it is over. Generation 0 is the run's
+        start, of which the entries belong to the first generation that a table counts."""
+        if generation in self.ended:
             return True
-        lives = self.lives.values() if not life else [self.lives[life]] if life in self.lives else ()
-        return any((number[1:] <= knows and number not in held) or number in never for knows, held, never in lives)
+        generations = (
+            self.generations.values()
+            if not generation
+            else [self.generations[generation]]
+            if generation in self.generations
+            else ()
+        )
+        return any(
+            (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
+        )
 
 
 class Witness:
-    """Knowledge of one member about a plot."""
+    """Knowledge of one member about a shard."""
 
     def __init__(self, me: str) -> None:
         self._me = me
@@ -81,7 +92,7 @@ class Witness:
         self._lacks: dict[str, list[Number]] = {}
         """Host of which a statement is missed -> entries that it may have left."""
 
-    def hear_standing(self, standing: Standing, now_ns: int) -> None:
+    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
 
     def accepts(self, old: Table, new: Table) -> bool:
@@ -96,18 +107,18 @@ class Witness:
             for host, said in new.hosts.items()
             if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
         }
-        # A vehicle of which all lives have ended before a table counted one begins in its cell again.
+        # A vehicle of which all generations have ended before a table counted one begins in its cell again.
         begins = {(number[0], each[0]): number for number, each in lists.items() if number not in was}
         last: dict[int, Number] = {}
-        for number, (vehicle, life) in was.items():
+        for number, (vehicle, generation) in was.items():
             found, host = lists.get(number), agent_of(vehicle)
-            if found == (vehicle, life) or (found is not None and not life and found[0] == vehicle):
+            if found == (vehicle, generation) or (found is not None and not generation and found[0] == vehicle):
                 last[number[0]] = max(number, last.get(number[0], number))
             elif host not in self._hosts:
                 self._lacks.setdefault(host, []).append(number)
-            elif not life and self._hosts[host].ended and (number[0], vehicle) in begins:
+            elif not generation and self._hosts[host].ended and (number[0], vehicle) in begins:
                 last[number[0]] = max(number, last.get(number[0], number))
-            elif not self._hosts[host].is_over(number, life):
+            elif not self._hosts[host].is_over(number, generation):
                 self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
         ordered = all(
@@ -123,13 +134,13 @@ class Witness:
         return any(
             not held.issubset(lists)
             for name, host in self._hosts.items()
-            for _, held, _ in [host.lives.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
+            for _, held, _ in [host.generations.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
             if table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 
     def words(self, stored: Table, now_ns: int) -> Iterator[Word]:
         """Returns our words to the hosts that have spoken lately, and to those of which a statement is missed, if
-        they are new or a beat old."""
+        they are new or a heartbeat old."""
         if self._of is not stored or self._orders is None:
             self._of, self._orders = stored, Orders(stored)
         for name in self._lacks:
@@ -138,14 +149,14 @@ class Witness:
             lacks = self._lacks.get(name)
             if now_ns - host.spoke_ns > SILENT_NS and lacks is None:
                 continue
-            life, _ = stored.hosts.get(name, BEFORE_ALL)
-            part = part_of(life, self._orders.granted(name))
+            generation, _ = stored.hosts.get(name, BEFORE_ALL)
+            part = part_of(generation, self._orders.granted(name))
             says = stored.epoch, part, lacks
-            if says == host.told and 0 <= now_ns - host.told_ns < BEAT_NS:
+            if says == host.told and 0 <= now_ns - host.told_ns < HEARTBEAT_NS:
                 continue
             host.told, host.told_ns = says, now_ns
             yield Word(
-                plot=stored.plot,
+                shard=stored.shard,
                 host=name,
                 agent=self._me,
                 epoch=stored.epoch,
