@@ -203,7 +203,7 @@ class RightOfWaySync:
         """Takes up what a host or a leader says. Returns the vehicles that have found their places by it."""
         match message:
             case Left():
-                return self.core.hear_left(message)
+                return self.core.host.hear_left(message)
             case Granted() | Word():
                 return self.core.host.hear_granted(message, self._own_time.at(now_ns))
             case HostState():

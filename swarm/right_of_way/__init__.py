@@ -29,7 +29,7 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 6. Stop once a table names a greater generation of this host, and say so where the vehicles are simulated ones.
 7. Speak to the leader, and to all members where no leader was heard for half a second, or certificates prove
    names.
-8. Say `Left` to a member that asks about entries which the host does not hold, and never take them.
+8. Disclaim the entries that a member asks for and the host does not hold, and never take them.
 
 Duties of a leader:
 
@@ -53,7 +53,7 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
                 way into another shard; `occupied` are the cells of others around.
 `Word`          Member to host, where certificates prove names: a digest of what its file grants to the host, and
                 entries of which it lacks the host's statement.
-`Left`          Host to host, or to a member that asked: these entries are over.
+`Left`          Host to host: these entries are over.
 `Claim`         Member to members, where no leader was heard for 0.6 s, longer where round trips are: who answers
                 with its table promises to store nothing of a lower epoch. Two promises make a leader, which goes on
                 from the newest table of the two.

@@ -31,6 +31,8 @@ from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
 
 _MOST_HEARD = 1 << 13
 """Entries of others that are remembered as over; each is told again until a table lists it no more."""
+_MOST_DISCLAIMED = 1 << 10
+"""Entries of a shard: more than tables that lost can have granted to a host."""
 BEFORE_ALL: Stamp = (0, 0)
 
 
@@ -45,7 +47,7 @@ class HostEntries:
     paths       vehicle -> its entries in driving order, its own cell first
     placed      vehicles that are on the first cell of their paths; the others are nowhere
     over        shard -> numbers that this generation has left, given back or passed over, and its table still lists
-    disclaimed  shard -> numbers that no table has granted yet, and that are over by our word to a member
+    disclaimed  shard -> numbers later than `knows` that we never take, by our word to members
     heard       (number, host) of which that host has said that it is over; entries of paths know it
     knows       shard -> the newest table acted on
     """
@@ -174,17 +176,15 @@ class HostEntries:
             found.setdefault(self.shard_of(entry.cell), []).append(entry.number)
         return found
 
-    def disclaim(self, shard: int, numbers: Iterable[Number]) -> list[Number]:
-        """Returns those of some numbers that we do not hold and never take. The entries of the run's start are ours
-        until a table says otherwise."""
-        no_more, knows = self.disclaimed.setdefault(shard, set()), self.knows.get(shard, BEFORE_ALL)
-        no_more.difference_update([number for number in no_more if number[1:] <= knows])
+    def disclaim(self, shard: int, numbers: Iterable[Number]) -> None:
+        """Takes none of these numbers that we do not hold. The entries of the run's start are ours until a table
+        says otherwise."""
+        knows = self.knows.get(shard, BEFORE_ALL)
         held = {entry.number for path in self.paths.values() for entry in path}
-        ours = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
-        new = [number for number in ours if number[1] and number[1:] > knows]
-        if len(no_more) + len(new) <= _MOST_HEARD:
-            no_more.update(new)
-        return [number for number in ours if number in no_more or number[1:] <= knows]
+        kept = {number for number in self.disclaimed.get(shard, ()) if number[1:] > knows}
+        asked = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
+        new = [number for number in asked if number[1] and number[1:] > knows]
+        self.disclaimed[shard] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
 
     def holds(self, shard: int) -> dict[str, list[Number]]:
         """Returns vehicle -> its entries in a shard: all others that its newest table lists are over."""

@@ -65,13 +65,12 @@ class _View:
     heard     the newest host state of ours that the table in use takes into account
     seen      vehicle -> its entries in the table in use
     followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
-    asked     member -> entries that it lacks our word about
     left      other host -> those of these that are over, as we told it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
     others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet     the first host state from which on we want nothing here; None while we do
-    words     member -> its last word, where names are proven; a grant is its leader's word. An older one that comes
-              late does no harm: no entry is taken that a used table could have granted
+    words     member -> (epoch, digest) of its last word, where names are proven; a grant is its leader's word. An
+              older one that comes late does no harm: no entry is taken that a used table could have granted
     pending   leader -> its last grant, until a majority has the same on file, and its digest
     told      the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
@@ -82,12 +81,11 @@ class _View:
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
-    asked: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
-    words: dict[str, Word] = field(default_factory=dict)
+    words: dict[str, tuple[int, int]] = field(default_factory=dict)
     pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
@@ -298,33 +296,27 @@ class Holdings:
         if not self._shards.proven:
             return self._take(view, granted)
         part = part_of(granted.generation, granted.grants)
+        view.words[granted.agent] = granted.epoch, part
         view.pending[granted.agent] = granted, part
-        word = Word(
-            shard=granted.shard,
-            host=self._agent,
-            agent=granted.agent,
-            epoch=granted.epoch,
-            seq=granted.seq,
-            part=part,
-        )
-        return self.hear_word(word)
+        return self._take_agreed(view)
 
     def hear_word(self, word: Word) -> list[str]:
-        """A member has something on file for us: use the grants that a majority has. Returns the vehicles that have
-        found their place."""
+        """A member has something on file for us. Returns the vehicles that have found their place."""
         if word.agent not in self._shards.members(word.shard):
             return []
+        view = self._views.setdefault(word.shard, _View())
+        view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.shard])
-        view = self._views.get(word.shard)
-        if view is None:
-            return []
-        view.words[word.agent] = word
-        view.asked[word.agent] = word.lacks
+            self._entries.disclaim(word.shard, word.lacks)
+            view.same, view.told = False, None
+        return self._take_agreed(view)
+
+    def _take_agreed(self, view: _View) -> list[str]:
+        """Acts on the grants that a majority has on file."""
         placed: list[str] = []
         for leader, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
-            same = sum(each.epoch == granted.epoch and each.part == part for each in view.words.values())
-            if same >= self._shards.majority:
+            if list(view.words.values()).count((granted.epoch, part)) >= self._shards.majority:
                 del view.pending[leader]
                 placed += self._take(view, granted)
         return placed
@@ -416,13 +408,11 @@ class Holdings:
         words: dict[str, list[Number]] = {}
         for shard, view in self._views.items():
             over = self._entries.over.get(shard, set())
-            others = {host: of for host, of in view.followed.items() if host != self._agent}
-            said = {host: [number for number in of if number in over] for host, of in others.items()}
-            for member, lacks in view.asked.items():
-                if lacks:
-                    said[member] = [*said.get(member, ()), *self._entries.disclaim(shard, lacks)]
-            for host, left in said.items():
+            for host, numbers in view.followed.items():
+                if host == self._agent:
+                    continue
                 told, told_ns = view.left.get(host, (None, 0))
+                left = [number for number in numbers if number in over]
                 if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
@@ -476,6 +466,7 @@ class Holdings:
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
+            never=sorted(self._entries.disclaimed.get(shard, ())),
         )
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:

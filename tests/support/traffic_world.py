@@ -157,7 +157,7 @@ class Process:
         self.place(self.rights.host.hear_granted(granted, self.now_ns))
 
     def hear_left(self, left: Left) -> None:
-        self.place(self.rights.hear_left(left))
+        self.place(self.rights.host.hear_left(left))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:

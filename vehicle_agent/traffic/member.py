@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Granted, HostState, Left, Stamp, Stored, Table, Word
+from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table, Word
 from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
 from vehicle_agent.traffic.witness import Witness
 
@@ -182,10 +182,6 @@ class Member:
             self._witness.hear_host_state(standing, now_ns)
         if self.leader is not None:
             self.leader.take_host_state(standing, now_ns)
-
-    def hear_left(self, left: Left) -> None:
-        if self._witness is not None:
-            self._witness.hear_left(left)
 
     # --- what members say -----------------------------------------------------------------------------------
 

@@ -196,12 +196,6 @@ class RightOfWay:
         if member is not None:
             member.hear_host_state(standing, now_ns)
 
-    def hear_left(self, left: Left) -> list[str]:
-        """Returns the vehicles that have found their place."""
-        for member in self._members.values():
-            member.hear_left(left)
-        return self.host.hear_left(left)
-
     def hear_table(self, table: Table, now_ns: int) -> list[Action]:
         member = self._member(table.shard, now_ns)
         return [] if member is None else [*member.hear_table(table, now_ns)]

@@ -14,7 +14,7 @@ from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.incarnations import HEARTBEAT_NS
-from swarm.wire.messages.traffic import HostState, Left, Number, Stamp, Table, Word
+from swarm.wire.messages.traffic import HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import SILENT_NS
 
@@ -39,17 +39,16 @@ class _Host:
 
     spoke_ns     time of the last one
     newest       (generation, sequence) of the newest
-    generations  generation -> the newest table that it knows, and the entries that it holds
+    generations  generation -> the newest table that it knows, the entries that it holds, and those that it never
+                 takes
     ended        lives that have ended
-    gone         entries that it said to have left, or never to take
     told         the last word to it, and its time
     """
 
     spoke_ns: int
     newest: Stamp = BEFORE_ALL
-    generations: dict[int, tuple[Stamp, frozenset[Number]]] = field(default_factory=dict)
+    generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
-    gone: set[Number] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
 
@@ -61,14 +60,14 @@ class _Host:
         if (standing.generation, standing.seq) > self.newest:
             self.newest = standing.generation, standing.seq
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
-            self.generations[standing.generation] = standing.knows, held
+            self.generations[standing.generation] = standing.knows, held, standing.never
             for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
                 del self.generations[old]
 
     def is_over(self, number: Number, generation: int) -> bool:
         """Returns True if this host said that an entry of a generation of it is over. Generation 0 is the run's
         start, of which the entries belong to the first generation that a table counts."""
-        if generation in self.ended or number in self.gone:
+        if generation in self.ended:
             return True
         generations = (
             self.generations.values()
@@ -77,7 +76,9 @@ class _Host:
             if generation in self.generations
             else ()
         )
-        return any(number[1:] <= knows and number not in held for knows, held in generations)
+        return any(
+            (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
+        )
 
 
 class Witness:
@@ -93,11 +94,6 @@ class Witness:
 
     def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
-
-    def hear_left(self, left: Left) -> None:
-        """A host answers what we asked."""
-        if left.agent in self._lacks:
-            self._hosts[left.agent].gone.update(set(left.entries).intersection(self._lacks[left.agent]))
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
@@ -138,7 +134,7 @@ class Witness:
         return any(
             not held.issubset(lists)
             for name, host in self._hosts.items()
-            for knows, held in [host.generations.get(host.newest[0], (BEFORE_ALL, frozenset()))]
+            for _, held, _ in [host.generations.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
             if table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 

@@ -59,6 +59,7 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     dead        numbers of earlier starts of this host that have certainly ended: they had locked the host's file,
                 which this start has locked now
     ended       this start of the host has stopped driving, for good
+    never       entries later than `knows` that this start does not hold, and never takes: members asked for them
     """
 
     shard: Shard
@@ -69,6 +70,7 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     vehicles: Annotated[list[Stand], SMALL]
     dead: Annotated[list[Natural], Meta(max_length=32)] = []
     ended: bool = False
+    never: Annotated[list[Number], SMALL] = []
 
 
 class Entry(msgspec.Struct, frozen=True, array_like=True):
@@ -163,7 +165,7 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     epoch, seq  of the newest table on its file
     part        digest of what the table grants to the host
     asks        the member lacks a statement of the host, without which it stores no later table
-    lacks       entries of the host that such a table omits: the host says `Left` of those that it does not hold
+    lacks       entries of the host that such a table omits: the host disclaims those that it does not hold
     """
 
     shard: Shard

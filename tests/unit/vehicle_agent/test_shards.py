@@ -61,6 +61,7 @@ def test_cells_are_adjacent_if_one_step_leads_from_one_to_the_other() -> None:
 def test_shards_of_one_region_need_no_quorum_and_larger_ones_all_agents_but_two() -> None:
     assert Shards(GRID, FIVE).has_quorum([])
     assert [Shards(GRID, FIVE[:n]).majority for n in (1, 2, 3, 5)] == [1, 1, 2, 2]
+    assert [Shards(GRID, FIVE[:n], proven=True).majority for n in (1, 2, 3, 4, 5)] == [1, 1, 2, 3, 3]
     assert [Shards(GRID, FIVE, WIDE).has_quorum(FIVE[:n]) for n in range(6)] == 3 * [False] + 3 * [True]
 
 
