@@ -230,7 +230,9 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
     assert plan.take_due(9, 119) == [3, 0]
 
 
-def test_a_tile_is_due_when_an_author_dies_or_lives_after_all_or_an_earlier_generation_dropped_something() -> None:
+def test_a_tile_is_due_when_an_author_dies_or_generations_after_all_or_an_earlier_generation_dropped_something() -> (
+    None
+):
     replica = MapReplica(GRID)
     replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
     plan = CompactionPlan(10, 100, set_aside=[2])
