@@ -29,7 +29,7 @@ class SentWorld(AgentWorld):
         super().__init__(text, pace_of(picture))
         self.store = KeeperStore(":memory:")
         self.keeper("k", self.store)
-        self.lives = 0
+        self.generations = 0
         self.start_places()
         self.progress: dict[str, GoalState] = {}
         self.person = self.bus("person")
@@ -39,8 +39,8 @@ class SentWorld(AgentWorld):
         self.until(lambda: len(self.vehicles()) == self.scenario.vehicle_count, within_s=20)
 
     def start_places(self) -> None:
-        self.lives += 1
-        setup = self.setup("places", "all", self.lives)
+        self.generations += 1
+        setup = self.setup("places", "all", self.generations)
         self.start(
             "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
         )
