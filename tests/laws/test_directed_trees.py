@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import slow_twins as naive
-from support.kernel_oracle import find_strides, inner
+from support.kernel_oracle import inner
 from support.planner_play import Play
 from support.planner_strategies import (
     RULES,
@@ -21,6 +21,7 @@ from support.planner_strategies import (
 from support.repaired_tree import FACTORS, Patchwork
 
 from planner_service.kernels.layout import NONE
+from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig

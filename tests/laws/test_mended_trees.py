@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import find_strides, inner
+from support.kernel_oracle import inner
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_climb, random_pace
 
 from planner_service import target_tree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
