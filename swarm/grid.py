@@ -20,10 +20,10 @@ REGION_TILES = 8
 """Side of a region, in tiles. Processes subscribe to positions and marks by region."""
 REGION_CELLS = REGION_TILES * TILE_CELLS
 """Side of a region, in cells."""
-MOST_PLOT_REGIONS = 64
-"""Side of the largest plot of right of way, in regions: that of the largest square grid."""
-MOST_PLOTS = 1 << 21
-"""Numbers of plots are less."""
+MOST_SHARD_REGIONS = 64
+"""Side of the largest shard of right of way, in regions: that of the largest square grid."""
+MOST_SHARDS = 1 << 21
+"""Numbers of shards are less."""
 
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""

@@ -23,11 +23,11 @@ from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
-from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.goals import REASONS, GoalQueues
+from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
@@ -66,7 +66,7 @@ class Agent:
     plan       which vehicles, of which group
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
-    bodies     what they must not drive into, though it speaks no right of way
+    obstacles  what they must not drive into, though it speaks no right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
     group      costs published by the other agents of the group, if the assigner asks for them
@@ -82,7 +82,7 @@ class Agent:
         local_map: LocalMap,
         sensor: Sensor,
         holdings: Holdings,
-        bodies: Bodies | None = None,
+        obstacles: Obstacles | None = None,
         assigner: Assigner | None = None,
         dynamics: PluginDynamics | None = None,
         group: GroupCosts | None = None,
@@ -96,16 +96,16 @@ class Agent:
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
-        self.bodies = bodies or Bodies(local_map.grid)
+        self.obstacles = obstacles or Obstacles(local_map.grid)
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
         climb = local_map.climb
-        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.bodies, climb)
+        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.obstacles, climb)
         near_cells, seed = config.reserve_cells + 2, f"{scenario.seed}/{plan.id}"
         self._wishes = CellRequests(
-            grid, self._steering, holdings, self.bodies, near_cells, self._target_cell, self._in_reach, seed
+            grid, self._steering, holdings, self.obstacles, near_cells, self._target_cell, self._in_reach, seed
         )
         self._pulled = scenario.planner.routes == "pulled"
         self._driver = Driver(
@@ -121,7 +121,7 @@ class Agent:
         """Version of the goals by which the vehicles go."""
         self._look_due_ns = 0
         self._places_planned = False
-        self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
+        self.detours = Detours(grid, pace, self._steering.steps, self.obstacles, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str | None, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
@@ -225,9 +225,9 @@ class Agent:
             self._goals_taken = -1
 
     def is_open(self, cell: int) -> bool:
-        """Returns True if a vehicle may enter the map on a cell: it is not lethal, and no body closes it, as far as
-        all bodies are known."""
-        return not (self.bodies.is_deaf or self._steering.closed(cell))
+        """Returns True if a vehicle may enter the map on a cell: it is not lethal, and no obstacle closes it, as
+        far as all obstacles are known."""
+        return not (self.obstacles.is_deaf or self._steering.closed(cell))
 
     def remove(self, vehicles: Sequence[str]) -> None:
         """These leave the map: their cells are given back."""
@@ -244,7 +244,7 @@ class Agent:
 
     @property
     def shut_in(self) -> Set[str]:
-        """Vehicles which bodies keep from driving anywhere."""
+        """Vehicles which obstacles keep from driving anywhere."""
         return self._steering.shut_in & self.vehicles.keys()
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
@@ -264,7 +264,7 @@ class Agent:
 
     @property
     def wishes(self) -> Mapping[str, Wish]:
-        """Requests to wardens for each vehicle, as of the last `decide`."""
+        """Requests to leaders for each vehicle, as of the last `decide`."""
         return self._wishes.of
 
     @property
@@ -277,7 +277,7 @@ class Agent:
     def begin_drive(self, now_ns: int) -> None:
         """Gives every vehicle the time that has passed since it was last driven."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
-        if self.bodies.is_deaf:
+        if self.obstacles.is_deaf:
             elapsed_s = 0.0
         self._driven_ns = now_ns
         self._driver.begin(self.vehicles, min(elapsed_s, _LONGEST_STEP_S) * self._time_scale)
@@ -331,10 +331,10 @@ class Agent:
             if look:
                 self._driver.entered[vehicle.cell] = None
 
-    def bodies_moved(self) -> None:
-        """Makes vehicles stop before cells that bodies close, or turn back. Called before they drive: cells granted
-        since the last time may be closed, too."""
-        if self.bodies.any:
+    def obstacles_moved(self) -> None:
+        """Makes vehicles stop before cells that obstacles close, or turn back. Called before they drive: cells
+        granted since the last time may be closed, too."""
+        if self.obstacles.any:
             for vehicle in self.vehicles.values():
                 self._driver.end_path(vehicle)
 
@@ -393,7 +393,7 @@ class Agent:
             self._route_requests[request.request] = request
             actions.append(request)
         if self._unassigned:
-            # A new life learns its vehicles' places one after the other, from several plots.
+            # A new generation learns its vehicles' places one after the other, from several shards.
             self._unassigned = False
             self.assignment.ask_soon(now_ns)
         if self.vehicles and self.assignment.due(now_ns):

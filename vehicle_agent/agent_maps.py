@@ -200,7 +200,7 @@ class ZonesAround:
         """Takes in what changed.
 
         places  the cells that our vehicles hold
-        shut    cells over which no way out leads: bodies stand there, or vehicles have seen that they are lethal
+        shut    cells over which no way out leads: obstacles stand there, or vehicles have seen that they are lethal
         """
         if self._version != self._replica.zones_version:
             self._version = self._replica.zones_version

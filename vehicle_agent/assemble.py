@@ -23,14 +23,14 @@ from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, fli
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS
 from swarm.plugins.find import named_plugin
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import AgentMaps, ZonesAround
 from vehicle_agent.assignment import AssignmentWorld, assigner_of, shares_costs
-from vehicle_agent.bodies import Bodies, TargetBodies
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
+from vehicle_agent.obstacles import Obstacles, TargetObstacles
 from vehicle_agent.placement import Spawning, entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.reports import ChasersReport, FleetReport
@@ -52,13 +52,13 @@ class AgentParts:
     truth  float32 (rows, cols), s/m, the pace at which vehicles of "ground" really drive
     warn   as of `RightOfWaySync`
 
-    author     under which it writes marks and reports
-    flies      True if its vehicles are in the air, where no bodies are
+    author      under which it writes marks and reports
+    flies       True if its vehicles are in the air, where no obstacles are
     near_marks  which tiles of the map concern the vehicles
-    untracked  the targets of which only vehicles tell
-    costs      what the group's agents tell each other; None if the assigner does not ask for it
-    spawning   lets the vehicles of an added agent enter; None for an agent of the scenario
-    faults     faults of plug-ins that are not reported yet
+    untracked   the targets of which only vehicles tell
+    costs       what the group's agents tell each other; None if the assigner does not ask for it
+    spawning    lets the vehicles of an added agent enter; None for an agent of the scenario
+    faults      faults of plug-ins that are not reported yet
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
     """
@@ -100,11 +100,11 @@ class AgentParts:
         spawns = spawn_cells(scenario, grid, grounds)
         layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
-        side = scenario.map.plot_regions * REGION_CELLS
-        plots = Plots(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
+        side = scenario.map.shard_regions * REGION_CELLS
+        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
         tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
         core = RightOfWay(
-            setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns
+            setup.id, shards, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns
         )
         self.act_ns = int(self.maps.local.cell_s(0.0) / scenario.time_scale / _ACTS * NS_PER_S)
         self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn, acts=self.act_ns < tick_ns)
@@ -122,9 +122,9 @@ class AgentParts:
         dynamics = own_dynamics(class_named(scenario, class_name), driven) or dynamics_of(
             named_plugin(scenario, "vehicles.dynamics"), driven, self.faults.append
         )
-        bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
+        obstacles = Obstacles(grid, as_class.cost.vehicle_radius_m)
         self.agent = Agent(
-            plan, as_class, self.maps.local, sensor, core.holdings, bodies, assigner, dynamics, self.costs
+            plan, as_class, self.maps.local, sensor, core.holdings, obstacles, assigner, dynamics, self.costs
         )
         self.spawning: Spawning | None = None
         if setup.added is not None:
@@ -134,7 +134,7 @@ class AgentParts:
         # The targets, and messages to vehicles.
         self.detector = TargetDetector(grid, self.author, group, range_m)
         self.untracked = UntrackedTargets(scenario.untracked, reads)
-        self.target_bodies = TargetBodies(scenario, grid)
+        self.target_obstacles = TargetObstacles(scenario, grid)
         self.fleet = FleetReport(self.author, group, class_name)
         self.chasers = ChasersReport(self.author, class_name)
 

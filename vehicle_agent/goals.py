@@ -1,7 +1,7 @@
 """Goals of an agent's vehicles: the places to which operators sent them, one after the other.
 
 `VehicleGoals.done` is the whole progress of a vehicle. It grows by one when the vehicle is at rest at its place.
-The agent tells it, and keepers store it: a later life of the agent goes on where this one ended. Pure.
+The agent tells it, and keepers store it: a later generation of the agent goes on where this one ended. Pure.
 
 A place that many vehicles share is reached within the fewest steps that give each vehicle a cell. Else all but one
 would push for ever.
@@ -78,7 +78,7 @@ class GoalQueues:
         self._arrivals: dict[int, frozenset[int]] = {}
 
     def look_again(self) -> None:
-        """The ground, bodies or shared places may have changed."""
+        """The ground, obstacles or shared places may have changed."""
         self._arrivals.clear()
 
     def cell(self, vehicle: str) -> int | None:

@@ -10,7 +10,7 @@ from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
-from swarm.runtime.health import LIFE_BEFORE
+from swarm.runtime.health import GENERATION_BEFORE
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import tick_phase
 from swarm.runtime.role import RoleSetup
@@ -27,7 +27,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
     if setup.takes_over and setup.health is not None:
-        setup.health.starts(LIFE_BEFORE)
+        setup.health.starts(GENERATION_BEFORE)
     store: PromiseStore = (
         PromiseStore(secrets.randbits(60))
         if setup.run_dir is None

@@ -1,7 +1,7 @@
 """Start cells of vehicles: those of the scenario all together, those of an added agent one by one.
 
 Every process computes the same cells for the vehicles of the scenario, so that all differ. An added agent asks
-wardens for a first cell of each of its vehicles (docs/design/external-vehicles.md).
+leaders for a first cell of each of its vehicles (docs/design/external-vehicles.md).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def entry_cells(added: AddedAgent, grid: GridSpec, homes: NDArray[np.bool_], see
 
 def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Each cell's index on the Morton curve (Z-order). Cells that follow each other on it are near each other, so
-    the vehicles of one agent start in few plots, and it has few neighbours."""
+    the vehicles of one agent start in few shards, and it has few neighbours."""
     rows, cols = np.divmod(cells, grid.cols)
     place = np.zeros(len(cells), np.int64)
     for bit in range(max(grid.rows, grid.cols).bit_length()):
@@ -131,7 +131,8 @@ def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bo
 
 
 _FOUND_NS = NS_PER_S
-"""A new life waits so long for its vehicles of an earlier one to be found in the tables, before others enter."""
+"""A new generation waits so long for its vehicles of an earlier one to be found in the tables, before others
+enter."""
 _ANOTHER_CELL_NS = NS_PER_S
 """A cell that is not granted for so long is taken: the next one is tried."""
 
@@ -141,7 +142,7 @@ class Spawning:
 
     vehicles  all of the agent
     cells     where they may, the best first
-    is_open   whether a cell may be entered now: no body and no zone closes it
+    is_open   whether a cell may be entered now: no obstacle and no zone closes it
     """
 
     def __init__(
@@ -151,9 +152,9 @@ class Spawning:
         self._cells = deque(cells)
         self._holdings = holdings
         self._is_open = is_open
-        self._life = 0
+        self._generation = 0
         self._since_ns = 0
-        """Since when the life has been informed of what earlier ones held."""
+        """Since when the generation has been informed of what earlier ones held."""
         self._asked: dict[str, tuple[int, int]] = {}
         """Vehicle -> the cell that was asked for last, and when."""
 
@@ -163,8 +164,8 @@ class Spawning:
         self._waiting = [vehicle for vehicle in self._waiting if vehicle not in gone]
 
     def may_stand(self, vehicle: str, cell: int) -> bool:
-        """Returns True if a vehicle that has found its place may take it. One of an earlier life stands there
-        already; one that would enter has a body there that came while the cell was asked for, and goes
+        """Returns True if a vehicle that has found its place may take it. One of an earlier generation stands there
+        already; one that would enter has an obstacle there that came while the cell was asked for, and goes
         elsewhere."""
         asked_cell, _ = self._asked.get(vehicle, (None, 0))
         return cell != asked_cell or self._is_open(cell)
@@ -175,12 +176,12 @@ class Spawning:
         return not self._waiting
 
     def tick(self, informed: bool, now_ns: int) -> None:
-        """Asks for cells. `informed`: whether those could answer who know what earlier lives held."""
+        """Asks for cells. `informed`: whether those could answer who know what earlier generations held."""
         holdings = self._holdings
-        if not holdings.life or holdings.replaced:
+        if not holdings.generation or holdings.replaced:
             return
-        if holdings.life != self._life or not informed:
-            self._life, self._since_ns = holdings.life, now_ns
+        if holdings.generation != self._generation or not informed:
+            self._generation, self._since_ns = holdings.generation, now_ns
             self._asked.clear()
         if now_ns - self._since_ns < _FOUND_NS:
             return

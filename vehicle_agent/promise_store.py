@@ -20,7 +20,7 @@ _SIZE_BYTES = 1 << 18
 
 
 class _Record(msgspec.Struct, array_like=True):
-    """One line of the file: either the agent's own record, or what it promised and stored of a plot."""
+    """One line of the file: either the agent's own record, or what it promised and stored of a shard."""
 
     own: OwnRecord | None = None
     promised: int = 0
@@ -41,7 +41,7 @@ class PromiseStore:
     """Records of an agent, here in memory only: they survive a simulated process, not this one.
 
     own    of the agent itself
-    saved  plot -> (promised epoch, stored table)
+    saved  shard -> (promised epoch, stored table)
     """
 
     def __init__(self, disk: int) -> None:
@@ -61,7 +61,7 @@ class PromiseStore:
         self.own = own
 
     def save(self, promised: int, table: Table) -> None:
-        self.saved[table.plot] = (promised, table)
+        self.saved[table.shard] = (promised, table)
 
     def sync(self) -> None:
         """Returns once all that was saved is on the disk. Until then nothing may be said that rests on it."""
@@ -88,7 +88,7 @@ class FilePromiseStore(PromiseStore):
                 if record.own is not None:
                     self.own = record.own
                 elif record.table is not None:
-                    self.saved[record.table.plot] = (record.promised, record.table)
+                    self.saved[record.table.shard] = (record.promised, record.table)
         except msgspec.MsgspecError as error:
             self.close()
             raise DamagedError(f"{path}: expected an agent's promises, found other records: {error}") from error

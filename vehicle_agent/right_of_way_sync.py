@@ -16,8 +16,8 @@ from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Left, Standing, Stored, Table
-from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING, STORED, TABLE, Topic
+from swarm.wire.messages.traffic import Claim, Granted, HostState, Known, KnownRequest, Left, Stored, Table
+from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import SLOW_NS, AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -28,7 +28,7 @@ class OwnTime:
 
     A process that comes late to its ticks has not heard the others meanwhile, so it cannot say that they were
     silent; and where one is late, for want of processors, the others are. By wall time, on a machine on which ticks
-    come seconds apart, every lease had expired at each tick: wardens were replaced before they could grant, for
+    come seconds apart, every lease had expired at each tick: leaders were replaced before they could grant, for
     ever. On time it is the time of the wall. Nothing that is safe hangs on it.
 
     period_ns  of ticks
@@ -55,7 +55,7 @@ class OwnTime:
 log = logging.getLogger(__name__)
 
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
-"""A new life waits so long for the others' answers before it begins. What comes later counts as well."""
+"""A new generation waits so long for the others' answers before it begins. What comes later counts as well."""
 _LATE_ANSWERS_S = 10.0
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
@@ -65,7 +65,7 @@ _PROMISE_TIMEOUT_S = 10.0
 _MOST_REFUSALS_TOLD = 100
 """Liars may say as many different things as they like."""
 _MOST_DIGITS = 9
-"""Digits of a plot's number in a key."""
+"""Digits of a shard's number in a key."""
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
@@ -104,14 +104,14 @@ class RightOfWaySync:
         self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
         """Time for the core. When to ask, and when to tell people, goes by the time of the wall."""
         self._asked_ns: int | None = None
-        """Time of the last recovery query of this life."""
+        """Time of the last recovery query of this generation."""
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._unasked = False
         """True if an agent has appeared that has not received our recovery query."""
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
-        """Plot without a warden -> when that is said again."""
+        """Shard without a leader -> when that is said again."""
         self._reserve_due_ns = self._slow_due_ns = 0
         self._told_silent_ns: int | None = None
         """Time when it was last said that our seats are silent; None while they are not."""
@@ -120,10 +120,10 @@ class RightOfWaySync:
         self._bus.watch_alive(self._post, role="agent")
         self._bus.serve(KNOWN, self._post, agent=self._id)
         self._bus.serve(TABLE, self._post, agent=self._id)
-        # Not one by one for each seat: every subscription has a thread of its own, and of a large map's plots few
+        # Not one by one for each seat: every subscription has a thread of its own, and of a large map's shards few
         # agents have hundreds of seats.
         keep = partial(self._bus.subscribe, post=self._post) if self._acts else self._bus.collect
-        keep(STANDING, member=self._id)
+        keep(HOST_STATE, member=self._id)
         self._bus.subscribe(TABLE, self._post, member=self._id)
         self._bus.subscribe(STORED, self._post, member=self._id)
         keep(GRANTED, host=self._id)
@@ -148,7 +148,7 @@ class RightOfWaySync:
             case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
                 core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, own_ns)
             case Replied(message=Known() as known, took_s=took_s):
-                if known.agent in core.plots.agents:
+                if known.agent in core.shards.agents:
                     core.trips.measure(known.agent, int(took_s * NS_PER_S))
                 self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
@@ -165,7 +165,7 @@ class RightOfWaySync:
         return True
 
     def take_granted(self, now_ns: int) -> Iterator[list[str]]:
-        """Takes in what wardens have granted, and other hosts have left, since the last time, before vehicles
+        """Takes in what leaders have granted, and other hosts have left, since the last time, before vehicles
         drive. Yields the vehicles that have found their places by each message; they are to be placed before the
         next."""
         for heard in (*self._bus.collected(LEFT), *self._bus.collected(GRANTED)):
@@ -179,19 +179,19 @@ class RightOfWaySync:
                 return holdings.waits
             case Granted(grants=grants):
                 return any(len(entries) > 1 and len(holdings.path(id)) < 2 for id, entries in grants.items())
-            case Standing(vehicles=stands):
+            case HostState(vehicles=stands):
                 return any(stand.better for stand in stands)
         return False
 
     def hear(self, message: Message, now_ns: int) -> list[str]:
-        """Takes up what a host or a warden says. Returns the vehicles that have found their places by it."""
+        """Takes up what a host or a leader says. Returns the vehicles that have found their places by it."""
         match message:
             case Left():
                 return self.core.host.hear_left(message)
             case Granted():
                 return self.core.host.hear_granted(message, self._own_time.at(now_ns))
-            case Standing():
-                self.core.hear_standing(message, self._own_time.at(now_ns))
+            case HostState():
+                self.core.hear_host_state(message, self._own_time.at(now_ns))
         return []
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
@@ -203,15 +203,15 @@ class RightOfWaySync:
         self._look_after_store(now_ns)
         if waited and asked_ns is not None:
             self._begin()
-        for heard in self._bus.collected(STANDING):
+        for heard in self._bus.collected(HOST_STATE):
             self.hear(heard.message, now_ns)
         self._perform(self.core.tick(wishes, own_ns))
         self._tell_slow(now_ns)
         unled = self.core.host.unled(own_ns)
-        self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
-        for plot, text in unled.items():
-            if now_ns >= self._unled_due_ns[plot]:
-                self._unled_due_ns[plot] = now_ns + _WAITING_AGAIN_NS
+        self._unled_due_ns = {shard: self._unled_due_ns.get(shard, now_ns) for shard in unled}
+        for shard, text in unled.items():
+            if now_ns >= self._unled_due_ns[shard]:
+                self._unled_due_ns[shard] = now_ns + _WAITING_AGAIN_NS
                 self._warn("waiting", text)
 
     def _tell_slow(self, now_ns: int) -> None:
@@ -245,27 +245,29 @@ class RightOfWaySync:
     def _ask_known(self, now_ns: int) -> None:
         """Asks all agents what they know of us, and schedules the next query: each after twice the delay, up to a
         limit."""
-        plots = self.core.plots
-        request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=plots.layer, plot_cells=plots.side)
+        shards = self.core.shards
+        request = KnownRequest(
+            agent=self._id, disk=self._store.own.disk, layer=shards.layer, shard_cells=shards.side
+        )
         self._asked_ns, self._unasked = now_ns, False
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_LATE_ANSWERS_S)
 
     def _begin(self) -> None:
-        """Begins a life if there is none, once those who could be asked had time to answer and the promise file can
-        be written."""
+        """Begins a generation if there is none, once those who could be asked had time to answer and the promise
+        file can be written."""
         self.core.silent = not self._store.ready
-        if self._asked_ns is not None and not self.core.holdings.life and not self.core.silent:
+        if self._asked_ns is not None and not self.core.holdings.generation and not self.core.silent:
             self._perform(self.core.begin(self._chance))
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
         """A claim is answered to the member whose epoch it is, under its own name."""
         if not asked.fields["plot"].isdecimal() or len(asked.fields["plot"]) > _MOST_DIGITS:
             return
-        plot, plots = int(asked.fields["plot"]), self.core.plots
-        if plot in plots.all and asked.fields["member"] == plots.warden(plot, epoch):
-            self._answer(asked, self.core.hear_claim(plot, epoch, own_ns))
+        shard, shards = int(asked.fields["plot"]), self.core.shards
+        if shard in shards.all and asked.fields["member"] == shards.leader(shard, epoch):
+            self._answer(asked, self.core.hear_claim(shard, epoch, own_ns))
 
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
         """Performs the actions that come first, and replies with the last."""
@@ -273,17 +275,17 @@ class RightOfWaySync:
             match action:
                 case Table():
                     member = asked.fields["member"]
-                    asked.answer(replace(action, agent=self._id), plot=action.plot, member=member, agent=self._id)
+                    asked.answer(replace(action, agent=self._id), shard=action.shard, member=member, agent=self._id)
                 case Known():
                     asked.answer(action, agent=self._id)
                 case _:
                     self._perform([action])
 
     def _tell_members(self, topic: Topic, message: Table | Stored) -> None:
-        """Reports the other members of a plot, each by itself."""
-        for member in self.core.plots.members(message.plot):
+        """Reports the other members of a shard, each by itself."""
+        for member in self.core.shards.members(message.shard):
             if member != self._id:
-                self._bus.publish(topic, message, plot=message.plot, member=member, agent=self._id)
+                self._bus.publish(topic, message, shard=message.shard, member=member, agent=self._id)
 
     def _perform(self, actions: Sequence[Action]) -> None:
         """Performs what one event or tick has brought: what is to be on file first, with one sync for all of it."""
@@ -301,20 +303,20 @@ class RightOfWaySync:
                     self._asked_ns, self._unasked = None, True  # at the next tick
                 case Tell(members, standing):
                     for member in members:
-                        self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self._id)
+                        self._bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
                 case Left():
                     self._bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case Granted():
-                    self._bus.publish(GRANTED, action, plot=action.plot, host=action.host, agent=self._id)
+                    self._bus.publish(GRANTED, action, shard=action.shard, host=action.host, agent=self._id)
                 case Table():
                     self._tell_members(TABLE, action)
                 case Stored():
                     self._tell_members(STORED, action)
-                case AskPromises(plot, epoch, members):
+                case AskPromises(shard, epoch, members):
                     for member in members:
-                        tag = f"promise-{plot}-{epoch}"
+                        tag = f"promise-{shard}-{epoch}"
                         claim = Claim(epoch=epoch)
-                        seats: dict[str, str | int] = {"plot": plot, "member": self._id, "agent": member}
+                        seats: dict[str, str | int] = {"plot": shard, "member": self._id, "agent": member}
                         self._bus.ask(TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:

@@ -36,17 +36,17 @@ from swarm.wire.messages.planning import (
     Sighted,
     TargetPose,
 )
-from swarm.wire.messages.traffic import Granted, Left, Standing
-from swarm.wire.messages.vehicles import Body, Followed, Removed, RemoveVehicles, SharedCosts, VehicleState
+from swarm.wire.messages.traffic import Granted, HostState, Left
+from swarm.wire.messages.vehicles import Followed, Obstacle, Removed, RemoveVehicles, SharedCosts, VehicleState
 from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
-    BODY,
     CHASERS,
     COST,
     FLEET,
     FOLLOWED,
     GOAL_STATES,
     LEAVE,
+    OBSTACLE,
     PLACE_ROUTE,
     POSE,
     PUSHED_ROUTE,
@@ -125,10 +125,10 @@ class AgentService:
         self._now_ns = self._acted_ns = self.driven = 0
         self._answer_s = _ANSWER_S
         self._shut_in: set[str] = set()
-        """Vehicles of which it has been said that bodies shut them in."""
+        """Vehicles of which it has been said that obstacles shut them in."""
         self.when_over: Callable[[], None] | None = None
         self._removed: set[str] = set()
-        """Vehicles that an operator has let leave in this life."""
+        """Vehicles that an operator has let leave in this generation."""
         self._member.needs("the shared map", lambda: self._sync.joined)
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places for its vehicles", lambda: self._has_places)
@@ -160,9 +160,9 @@ class AgentService:
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
         bus.collect(POSE)
-        if not self._parts.flies:  # bodies are on the ground
-            bus.collect(BODY)
-        self.agent.bodies.listen_anew(now_ns)
+        if not self._parts.flies:  # obstacles are on the ground
+            bus.collect(OBSTACLE)
+        self.agent.obstacles.listen_anew(now_ns)
         if untracked := self._parts.untracked.targets:
             bus.collect(TRUE_POSE)
             for target in sorted(untracked):
@@ -174,10 +174,10 @@ class AgentService:
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
-            self.agent.bodies.listen_anew(now_ns)
+            self.agent.obstacles.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
-        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | Standing):
+        if isinstance(event, Heard) and isinstance(event.message, Left | Granted | HostState):
             awaited = self._right_of_way.is_awaited(event.message)
             self._place(self._right_of_way.hear(event.message, now_ns))
             if awaited:
@@ -213,7 +213,7 @@ class AgentService:
         acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns
         if acts and not self.agent.holdings.replaced:
             self._acted_ns = now_ns
-            self.agent.bodies_moved()
+            self.agent.obstacles_moved()
             self._drive(now_ns)
             self._perform(self.agent.decide(now_ns))
             self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)
@@ -228,7 +228,7 @@ class AgentService:
     def tick(self, now_ns: int) -> None:
         self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
-        agent.bodies.tick(now_ns)
+        agent.obstacles.tick(now_ns)
         for pose in self._collected(POSE, TargetPose):
             self._on_pose(pose, now_ns)
         for pose in self._collected(TRUE_POSE, TargetPose):
@@ -248,14 +248,14 @@ class AgentService:
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         places = agent.places
-        parts.zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
+        parts.zones.update(places, now_ns, agent.obstacles.standing | agent.seen_lethal)
         agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
         self._set_planners(now_ns)
         agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
         if places:
             self._sync.enter(parts.near_marks.update(places))
-        self._take_bodies(now_ns)
+        self._take_obstacles(now_ns)
         self._drive(now_ns)
         columns = Places(self._replica.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
@@ -364,13 +364,14 @@ class AgentService:
         self._member.warn(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
-        """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
+        """A later generation of this agent drives the vehicles. While it lives, this one keeps its promises
+        only."""
         self.agent.stand_down()
         text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
 
-    # --- targets and bodies ---------------------------------------------------------------------------------
+    # --- targets and obstacles ---------------------------------------------------------------------------------
 
     def _on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """A tracker says where its target is."""
@@ -379,7 +380,7 @@ class AgentService:
         counts = self.agent.hear_pose(pose, now_ns)
         if counts is not None:  # for the simulated sensor of targets it is the truth
             self._detector.set_truth(counts, now_ns)
-            self._take_target_bodies(counts, now_ns)
+            self._take_target_obstacles(counts, now_ns)
 
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         """A vehicle, of ours or of others, has seen a target."""
@@ -387,7 +388,7 @@ class AgentService:
         pose = self._parts.untracked.receive(sighted, now_ns)
         if pose is not None:
             self.agent.see_target(pose, now_ns)
-            self._take_target_bodies(pose, now_ns)
+            self._take_target_obstacles(pose, now_ns)
 
     def _tell_sighted(self, places: Places, now_ns: int) -> None:
         untracked = self._parts.untracked
@@ -401,28 +402,28 @@ class AgentService:
         for sighted in seen:
             self._on_sighted(sighted, now_ns)
 
-    def _take_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
-        for body in () if self._parts.flies else self._parts.target_bodies.bodies_of(pose, now_ns):
-            self.agent.bodies.take_report(body, now_ns)
+    def _take_target_obstacles(self, pose: TargetPose, now_ns: int) -> None:
+        for obstacle in () if self._parts.flies else self._parts.target_obstacles.obstacles_of(pose, now_ns):
+            self.agent.obstacles.take_report(obstacle, now_ns)
 
-    def _take_bodies(self, now_ns: int) -> None:
-        bodies = self.agent.bodies
-        for body in self._collected(BODY, Body):
-            bodies.take_report(body, now_ns)
-            age_ns = now_ns - body.stamp_ns
+    def _take_obstacles(self, now_ns: int) -> None:
+        obstacles = self.agent.obstacles
+        for obstacle in self._collected(OBSTACLE, Obstacle):
+            obstacles.take_report(obstacle, now_ns)
+            age_ns = now_ns - obstacle.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
-                self.counters.observe("body_ms", age_ns / 1e6)
-        self.agent.bodies_moved()
-        self.counters.counts["bodies_refused"] = bodies.refused
+                self.counters.observe("obstacle_ms", age_ns / 1e6)
+        self.agent.obstacles_moved()
+        self.counters.counts["obstacles_refused"] = obstacles.refused
         self.counters.counts["detours"] = self.agent.detours.found
-        for text in bodies.complaints:
+        for text in obstacles.complaints:
             self._warn("body", text)
-        bodies.complaints.clear()
+        obstacles.complaints.clear()
         shut_in = self.agent.shut_in
         for id in sorted(shut_in - self._shut_in):
             cell = self.agent.vehicles[id].cell
             row, col = self._replica.grid.row_col(cell)
-            text = f"{id} waits at row {row}, column {col}: bodies leave no cell to which it can drive"
+            text = f"{id} waits at row {row}, column {col}: obstacles leave no cell to which it can drive"
             self._warn("shut_in", text)
             self._member.alarms.begin("shut-in", id, text, now_ns, cell)
         self._member.alarms.last_of("shut-in", shut_in, now_ns)

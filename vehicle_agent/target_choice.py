@@ -72,7 +72,7 @@ class GroupCosts:
         )
 
     def receive(self, message: SharedCosts, now_ns: int) -> None:
-        """Another agent's word; of two lives of an agent the one that spoke last counts."""
+        """Another agent's word; of two generations of an agent the one that spoke last counts."""
         agent = message.agent
         if agent == self._agent or message.group != self._group:
             return

@@ -29,7 +29,7 @@ from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.places import cell_of
 from swarm.plugins.find import find_plugin
-from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Plots, fitting_regions
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Shards, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 _MOST_STEPS_CELLS = 1 << 21
@@ -185,15 +185,15 @@ def places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | N
     yield from _vehicles(scenario, terrain.grid, grounds)
 
 
-def plots(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
-    """More plots of right of way than the agents have use for."""
+def shards(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
+    """More shards of right of way than the agents have use for."""
     agents = sum(not flies(scenario, plan.group.vehicle_class) for plan in plan_agents(scenario))
     fitting = fitting_regions(grid.rows, grid.cols, agents)
-    if agents >= FEWEST_FOR_MAJORITY and fitting > scenario.map.plot_regions:  # fewer keep plots for themselves
-        many = Plots(grid, (), scenario.map.plot_regions * REGION_CELLS).count
+    if agents >= FEWEST_FOR_MAJORITY and fitting > scenario.map.shard_regions:  # fewer keep shards for themselves
+        many = Shards(grid, (), scenario.map.shard_regions * REGION_CELLS).count
         yield warning(
-            "map.plot_regions",
-            f"{agents} agents share {many} plots of right of way, and speak of each in which vehicles drive"
+            "map.shard_regions",
+            f"{agents} agents share {many} shards of right of way, and speak of each in which vehicles drive"
             f" {scenario.vehicles.tick_hz:g} times a second; set it to {fitting}, for larger ones",
         )
 

@@ -232,8 +232,8 @@ def replay(
 def _lines(row: Replayed) -> Iterator[str]:
     """A row of the table, and what explains it."""
     recorded, outcome = row.recorded, row.outcome
-    name = (recorded.process, recorded.life)
-    who = "{}, life {}".format(*name)
+    name = (recorded.process, recorded.generation)
+    who = "{}, generation {}".format(*name)
     if outcome is None:
         yield _ROW.format(*name, "-", "-", "-", "not replayed")
         yield f"{who}: {row.why}"
@@ -259,7 +259,7 @@ def _fields(row: Replayed) -> dict[str, Any]:
     recorded = row.recorded
     return {
         "process": recorded.process,
-        "life": recorded.life,
+        "life": recorded.generation,
         "incarnation": recorded.head.incarnation,
         "bytes": recorded.path.stat().st_size,
         "same": row.same,

@@ -232,10 +232,18 @@ def run_role(
     if not is_router:
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
-    life = next_incarnation(run_dir, role, id)
+    generation = next_incarnation(run_dir, role, id)
     log.info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(
-        scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
+        scenario,
+        run_id,
+        role,
+        id,
+        incarnation=generation,
+        started_ns=generation,
+        run_dir=run_dir,
+        added=added,
+        health=health,
     )
     load_entry(TABLE[role].entry)(setup, None, **role_options)
 

@@ -275,7 +275,7 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         yield failure("", str(error))
         return
     yield from scenario_check.places(scenario, terrain, truth)
-    yield from scenario_check.plots(scenario, terrain.grid)
+    yield from scenario_check.shards(scenario, terrain.grid)
     if any(each.name not in each.kind.built_in for each in plugins_of(scenario)):
         from launch_scripts.check.plugin_check import not_made
 

@@ -19,7 +19,7 @@ from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place
-from swarm.right_of_way.guest_session import say_gone
+from swarm.right_of_way.external_session import say_gone
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages.orders import Then
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from swarm.bus.bus import Bus
 
 _WITHIN_S = 5.0
-"""Longest wait until cells are free: wardens answer within a lease, which is shorter."""
+"""Longest wait until cells are free: leaders answer within a lease, which is shorter."""
 _AGAIN_S, _ANSWERS_S = 0.2, 1.0
 """Waits between two questions, and for the answer to one. An agent takes several ticks of 0.1 s to give cells back,
 and one that is silent for a second is asked five times within `_WITHIN_S`."""
@@ -156,11 +156,11 @@ def forget(name: str, where: Where) -> None:
     """Release the cells of vehicles of a dead process. Use only if they are gone.
 
     Only a person can know that: a robot whose program has died is still in its cell. Never use it for such a robot.
-    Between machines the command needs the guest's own certificate.
+    Between machines the command needs the external vehicle's own certificate.
 
     swarm order vehicle forget extra
 
-    name  The guest, such as extra or rover7.
+    name  The external vehicle, such as extra or rover7.
     """
     with where.operators_bus() as (bus, found):
         run = found[0]
@@ -177,7 +177,7 @@ def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
         replies, _ = replies_to(bus, LEAVE, RemoveVehicles(vehicles=vehicles), _ANSWERS_S, agent=agent)
         removed = [reply for reply in replies if isinstance(reply, Removed)]
         if said is not None and not removed:
-            return replace(said, held=0)  # an added agent ends once wardens know that its last vehicle has left
+            return replace(said, held=0)  # an added agent ends once leaders know that its last vehicle has left
         if removed:
             said = removed[0]
         if said is not None and not said.held:

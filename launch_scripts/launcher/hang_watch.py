@@ -50,7 +50,7 @@ class Sight(NamedTuple):
 
 @dataclass(slots=True)
 class Stillness:
-    """The sum of the table, of one life of a process."""
+    """The sum of the table, of one generation of a process."""
 
     stamp_ns: int = 0
     """The newest stamp on its board while its loop runs."""

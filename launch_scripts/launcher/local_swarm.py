@@ -78,7 +78,7 @@ class Running:
     process: ForkServerProcess | None = None
     pipe: Connection | None = None
     last_word: ExitReason | None = None
-    """Last message of this life; None while it has none."""
+    """Last message of this generation; None while it has none."""
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
@@ -88,14 +88,14 @@ class Running:
     begins_when: Callable[[], bool] | None = None
     """Condition of its first start; None once it has been started, or without a condition."""
     takes_over: bool = False
-    """True if its first start is beside a life that still runs here."""
+    """True if its first start is beside a generation that still runs here."""
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
-    """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
+    """Memory of a `Board` that its generations write and the launcher reads; None before the first."""
     stillness: Stillness = field(default_factory=Stillness)
     hung_s: float | None = None
-    """Since when this life has been asked to say where it hangs, and to end; None if it has not."""
+    """Since when this generation has been asked to say where it hangs, and to end; None if it has not."""
 
     @property
     def alive(self) -> bool:
@@ -103,7 +103,8 @@ class Running:
 
     @property
     def ended_as_asked(self) -> bool:
-        """True if this life has reported its end: none of its data can be lost any more, however it leaves."""
+        """True if this generation has reported its end: none of its data can be lost any more, however it
+        leaves."""
         word = self.hear_last_word()
         return word is not None and word.exit_code == 0
 
@@ -324,7 +325,7 @@ class LocalSwarm:
         setup = self._setup_of(spec)
         if running.health is None:
             running.health = self._context.RawArray(ctypes.c_char, BOARD_BYTES)
-        running.health[:] = bytes(BOARD_BYTES)  # of the life before
+        running.health[:] = bytes(BOARD_BYTES)  # of the generation before
         reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         first = not restarts
         setup = replace(

@@ -190,7 +190,7 @@ def new_run_id() -> str:
 _HIGHEST = 1 << 61
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
-_LATER_KEYS = (("map", "plot_regions"), ("planner", "places"))
+_LATER_KEYS = (("map", "shard_regions"), ("planner", "places"))
 """Sections and keys that the version before does not know: at their default they change no id, so that parts of
 both versions agree on one."""
 
@@ -264,16 +264,16 @@ def _hex_digest(content: bytes) -> bytes:
 class UpOptions:
     """Options of a run.
 
-    table          the processes to start here, in order of start
-    joins          there is a router elsewhere: none is started here
-    run_id         the run to take part in; if None it is made or found
-    began_s        time.monotonic() at which the command was given
-    metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
+    table            the processes to start here, in order of start
+    joins            there is a router elsewhere: none is started here
+    run_id           the run to take part in; if None it is made or found
+    began_s          time.monotonic() at which the command was given
+    metrics_port     where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
-    log_format     of all logs of this machine
-    record_inputs  of every process, for `swarm runs replay`
-    takes_over     from the launcher that runs this part of the run here
-    stays_watched  goes on beyond the scenario's seconds while a viewer is connected
+    log_format       of all logs of this machine
+    record_inputs    of every process, for `swarm runs replay`
+    takes_over       from the launcher that runs this part of the run here
+    stays_watched    goes on beyond the scenario's seconds while a viewer is connected
     """
 
     scenario: Scenario

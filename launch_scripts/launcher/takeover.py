@@ -19,7 +19,7 @@ from launch_scripts.observe.run_registry import LAUNCHER_LOG, logging_into, open
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.runtime.health import LIFE_BEFORE
+from swarm.runtime.health import GENERATION_BEFORE
 
 log = logging.getLogger(__name__)
 
@@ -96,13 +96,14 @@ class TakeOver:
         self._look_again()
 
     def _look_again(self) -> None:
-        """Updates the process to follow: one that has crashed meanwhile runs in a new life, or comes no more."""
+        """Updates the process to follow: one that has crashed meanwhile runs in a new generation, or comes no
+        more."""
         own = [each.process.pid for each in self._running if each.process is not None]
         self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
 
     def _is_free(self, name: str) -> bool:
-        """Returns True if the exclusive resources of a process are free. The launcher before starts a life that has
-        crashed again until it ends, so the end of a life before that says nothing."""
+        """Returns True if the exclusive resources of a process are free. The launcher before starts a generation
+        that has crashed again until it ends, so the end of a generation before that says nothing."""
         return self._asked and has_ended(self.predecessors.get(name, self._launcher))
 
 
@@ -119,8 +120,8 @@ def _plans(running: Running) -> bool:
 
 def _waits(running: Running) -> bool:
     """Returns True if a process has come as far as the file of its promises, if it is an agent that follows
-    another; or further, if the life before it has crashed."""
-    return not running.takes_over or _lacks(running) in ((LIFE_BEFORE,), ())
+    another; or further, if the generation before it has crashed."""
+    return not running.takes_over or _lacks(running) in ((GENERATION_BEFORE,), ())
 
 
 def _was_ordered(name: str, targets: Collection[str]) -> bool:

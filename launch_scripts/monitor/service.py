@@ -47,12 +47,12 @@ from swarm.runtime.stats import VIEWERS, Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, NOTE, SIGHTED, Topic
+from swarm.wire.topics import BELIEVED, COST, FLEET, FOLLOWED, NOTE, OBSTACLE, SIGHTED, Topic
 
 log = logging.getLogger(__name__)
 
 _READ: dict[Topic, float] = {
-    **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5
+    **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, OBSTACLE: 0.0, BELIEVED: 0.5
 }  # fmt: skip
 """Topics on show, and the interval at which the newest of each key is taken; 0 for each frame. Marks come by way of
 the map's sync."""

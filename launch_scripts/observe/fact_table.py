@@ -131,10 +131,10 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
     Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),
     Fact(
-        "driven_into", "bodies driven into", count,
-        "Vehicles that drove into a body which had said in time where it is; must be 0.",
+        "driven_into", "obstacles driven into", count,
+        "Vehicles that drove into an obstacle which had said in time where it is; must be 0.",
     ),
-    Fact("hit_by_bodies", "vehicles hit by bodies", count, "The bodies' own fault."),
+    Fact("hit_by_obstacles", "vehicles hit by obstacles", count, "The obstacles' own fault."),
     Fact(
         "processes_well", "processes", of_all,
         "Processes that are alive, or ended as asked, of those that the run needs.", of="well",
@@ -196,7 +196,7 @@ LINES: tuple[tuple[str, ...], ...] = (
 """Lines in which the facts of a run are set."""
 IF_ANY = ("learned", "sent")
 """Facts that have a line of their own, where there is anything to say."""
-MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
+MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "payloads_dropped")
 """Facts that are shown only where they are not 0."""
 
 

@@ -29,7 +29,7 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
-from swarm.wire.messages.processes import Beat, RunInfo, Stats
+from swarm.wire.messages.processes import Heartbeat, RunInfo, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
@@ -49,7 +49,7 @@ class RunPlan:
     """Expected processes of a complete run.
 
     crew        (role, id) of the processes that it needs: no router, which belongs to no run, and no monitor
-    vehicles    of the scenario; guests come on top
+    vehicles    of the scenario; external vehicles come on top
     started_ns  when the run began; None: with the first that is heard of it
     """
 
@@ -238,7 +238,7 @@ class LatestState(Counts):
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 _remember(self.status, message.target, message)
-            case Beat(leads=leads):
+            case Heartbeat(leads=leads):
                 _remember(self.leads, (message.role, message.id), leads)
                 if leads:
                     job, rank = split_rank(message.id)
@@ -269,8 +269,8 @@ class LatestState(Counts):
         return message
 
     def started(self, peer: Peer) -> None:
-        """Notes a life that the observer itself has started. A token under the same name that is none of these is
-        of another run, as at the port that all have by default."""
+        """Notes a generation that the observer itself has started. A token under the same name that is none of
+        these is of another run, as at the port that all have by default."""
         self._started.setdefault((peer.role, peer.id), set()).add(peer.incarnation)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:

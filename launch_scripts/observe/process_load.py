@@ -45,7 +45,7 @@ class ProcessLoads:
         self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
 
     def on_stats(self, stats: Stats) -> None:
-        """Takes in what a process says; of an earlier life, or older, nothing."""
+        """Takes in what a process says; of an earlier generation, or older, nothing."""
         key = (stats.role, stats.id)
         _, last = self._told.get(key, (None, None))
         if last is None or stats.incarnation > last.incarnation:

@@ -288,7 +288,7 @@ _TOTALS = (
 """Counts that are reported, summed over all processes."""
 DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
 """Histograms that are reported whole."""
-TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "obstacle_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 

@@ -34,7 +34,7 @@ STARTING_S = 30.0
 SERIOUS: Mapping[str, str] = {
     "collision": "collision",  # two vehicles were on one cell at one time
     "lethal-entry": "lethal entry",  # a vehicle entered a cell that is lethal in truth
-    "body-collision": "hit a body",  # a vehicle and a body that reports its place met
+    "obstacle-collision": "hit an obstacle",  # a vehicle and an obstacle that reports its place met
     "down": "down",  # a process that the run needs is gone; its launcher starts it again: see its log if it stays
     "silent": "silent",  # a process is there and has told nothing for 4 s: it hangs or is cut off
     "keeper-behind": "keeper behind",  # marks wait to be stored, as on a full disk
@@ -45,7 +45,7 @@ KINDS: Mapping[str, str] = {
     "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
     "target-lethal": "target on lethal ground",  # no route leads to it
     "goal-blocked": "cannot reach its place",  # it was sent there by an order; it asks again every 3 s
-    "shut-in": "vehicle shut in",  # bodies leave it no cell to which it can drive
+    "shut-in": "vehicle shut in",  # obstacles leave it no cell to which it can drive
     "behind": "behind",  # a process skips ticks: the machine is too slow for it
     "restarted": "restarted",  # a process was started again after it had ended
 }
@@ -191,8 +191,8 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
             continue
         leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
-        lives = "is gone" if latest.knows(role, id) else "has not come up"
-        yield _of_process("down", role, id, f"{lives}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
+        generations = "is gone" if latest.knows(role, id) else "has not come up"
+        yield _of_process("down", role, id, f"{generations}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:

@@ -73,7 +73,7 @@ class RunState:
     learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
                     whose prior does not stand
     goals           progress of the vehicles that were sent to places
-    beside          processes that are alive and not needed: routers, monitors, agents of guests
+    beside          processes that are alive and not needed: routers, monitors, agents of external vehicles
     messages_per_s  that all processes send now
     """
 
@@ -88,7 +88,7 @@ class RunState:
     collisions: int | None
     lethal_entries: int | None
     driven_into: int | None
-    hit_by_bodies: int | None
+    hit_by_obstacles: int | None
     reroute_requests: int | None
     routes_served: int | None
     marks: int | None
@@ -133,7 +133,7 @@ def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int
 
 
 _TOTALS = (
-    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_bodies", "reroute_requests", "routes_served",
+    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests", "routes_served",
     "marks", "payloads_dropped",
 )  # fmt: skip
 """Fields of a `RunState` which are counts of that name, summed over all processes."""

@@ -27,7 +27,7 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
     return sum(told) if told else None
 
 
-_MOST_LIVES = 1 << 13
+_MOST_GENERATIONS = 1 << 13
 """Lives of processes that are counted: names may be made up by strangers."""
 
 
@@ -41,13 +41,13 @@ class Counts:
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
-        """(role, id) -> begin and end of the longest time without counts in one life, if that was long."""
+        """(role, id) -> begin and end of the longest time without counts in one generation, if that was long."""
 
     def count(self, stats: Stats) -> None:
         """Takes in what a process says."""
         key = (stats.role, stats.id, stats.incarnation)
         known = self._stats.get(key)
-        if known is None and len(self._stats) >= _MOST_LIVES:
+        if known is None and len(self._stats) >= _MOST_GENERATIONS:
             return
         if known is None or stats.stamp_ns >= known.stamp_ns:
             self._stats[key] = stats
@@ -69,7 +69,7 @@ class Counts:
         return dict(sorted(self._newest.items()))
 
     def _summed(self) -> list[Stats]:
-        """Returns the summed counts: of lives whose counts a later one carries on only the later."""
+        """Returns the summed counts: of generations whose counts a later one carries on only the later."""
         if self._counting is None:
             self._counting = []
             before: dict[tuple[str, str], int] = {}

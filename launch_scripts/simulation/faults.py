@@ -64,7 +64,8 @@ class Hang:
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """Sets the clock of a process's machine. Seen by its next life: a process reads the clock at its start."""
+    """Sets the clock of a process's machine. Seen by its next generation: a process reads the clock at its
+    start."""
 
     at_s: float
     node: str
@@ -73,7 +74,7 @@ class ClockStep:
 
 @dataclass(frozen=True, slots=True)
 class Twin:
-    """Starts a second life of an agent on another machine, while the first may live."""
+    """Starts a second generation of an agent on another machine, while the first may live."""
 
     at_s: float
     node: str
@@ -129,7 +130,7 @@ class FaultPlan:
             "one_way_cuts": sum(cut.one_way for cut in self.partitions),
             "hangs": len(self.hangs),
             "clock_steps": len(self.clock_steps),
-            "second_lives": len(self.twins),
+            "second_generations": len(self.twins),
         }
 
 
@@ -237,8 +238,8 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     and steps; second lives of agents; messages lost, late, repeated and out of order. A seed may leave any of them
     out, so that a failure shows what it needs.
 
-    Agents with at most one other in their layer, on the ground or in the air, have no second life elsewhere: a plot
-    of theirs has one member, and it is unknown which of its files is the first.
+    Agents with at most one other in their layer, on the ground or in the air, have no second generation elsewhere:
+    a shard of theirs has one member, and it is unknown which of its files is the first.
     """
     chance = random.Random(f"faults/{seed}")
     names = sorted(spec.name for spec in processes_of(scenario, SIMULATED_ROLES))
@@ -257,7 +258,7 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
     crashes = [Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(names)) for _ in range(chance.randrange(7))]
     for _ in range(chance.randrange(3)):
         hangs.append(Hang(*span(chance.choice((0.3, 1.5, 4.0))), chance.choice(names)))
-    # With fewer than three agents no plot has a majority without the one that is cut off.
+    # With fewer than three agents no shard has a majority without the one that is cut off.
     if len(agents) >= 3 and chance.random() < 0.3:
         name = chance.choice(agents)
         from_s, until_s = span(4.0)

@@ -3,7 +3,7 @@
 `LawBook` watches a simulation from its beginning, runs it to its end and says which of these broke:
 
     no collision, no lethal entry     by where vehicles truly are, at every tick of their agents
-    bodies are avoided                no vehicle enters a cell that a body had closed in time
+    obstacles are avoided                no vehicle enters a cell that an obstacle had closed in time
     acknowledged marks stay           what a keeper said it had committed is on its disk
     no wait without a reason          of ten seconds while everything works
     vehicles are routed again         within five seconds of the last fault
@@ -35,10 +35,10 @@ from swarm.config.vehicle_classes import flies
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest
-from swarm.wire.messages.vehicles import Body, VehicleState
-from swarm.wire.topics import BODY, DIGEST
-from vehicle_agent.bodies import capsule_of
+from swarm.wire.messages.vehicles import Obstacle, VehicleState
+from swarm.wire.topics import DIGEST, OBSTACLE
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.obstacles import capsule_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.service import AgentService
 
@@ -89,19 +89,19 @@ def missing(has: Sets, wanted: Sets) -> list[tuple[str, int]]:
 
 
 @dataclass(eq=False)
-class _Life:
-    """Inputs and actions of one life of an agent.
+class _Generation:
+    """Inputs and actions of one generation of an agent.
 
-    reports    (body, incarnation) -> the newest report that was delivered to it, and when
+    reports    (obstacle, incarnation) -> the newest report that was delivered to it, and when
     ticked_ns  its last tick; None before the first
     placed     its vehicles: the place in which it finds one first is no step
     """
 
-    reports: dict[tuple[str, int], tuple[Body, int]] = field(default_factory=dict)
+    reports: dict[tuple[str, int], tuple[Obstacle, int]] = field(default_factory=dict)
     ticked_ns: int | None = None
     placed: set[str] = field(default_factory=set)
 
-    def take(self, report: Body, now_ns: int) -> None:
+    def take(self, report: Obstacle, now_ns: int) -> None:
         known, heard_ns = self.reports.get((report.id, report.incarnation), (None, 0))
         if known is None or report.seq > known.seq or now_ns - heard_ns >= known.lease_s * NS_PER_S:
             self.reports[report.id, report.incarnation] = report, now_ns
@@ -117,8 +117,8 @@ class LawBook:
     acknowledged  the newest of each set that a keeper ever said it had committed
     longest_s     the longest time on one cell, less the time to drive across it, of a vehicle that has somewhere to
                   go. A second counts if every process works: one that is dead, hung or cut off may hold the cell
-                  ahead, or be the planner or warden that is waited for. Messages that are lost are no reason;
-                  bodies that leave a vehicle no step are one
+                  ahead, or be the planner or leader that is waited for. Messages that are lost are no reason;
+                  obstacles that leave a vehicle no step are one
     longest       when that wait was last seen, vehicle and cell
     whole_s       when all processes worked for the first time since the quiet began; None until then
     routed_s      vehicle -> when it first had a route after that, to its target or to where it searches for it, or
@@ -147,7 +147,7 @@ class LawBook:
         """Vehicle -> cell, of those that no process has placed yet."""
         self._cells: dict[str, dict[str, int]] = {}
         """Node -> vehicle -> cell. A vehicle stays where it is when its process dies, until that starts again."""
-        self._lives: dict[str, _Life] = {}
+        self._generations: dict[str, _Generation] = {}
         self._waited: dict[str, tuple[int, float]] = {}
         """Vehicle -> its cell, and the seconds that count since it came there."""
         simulation.after_boot.append(self._booted)
@@ -159,15 +159,17 @@ class LawBook:
     # --- while it runs --------------------------------------------------------------------------------------
 
     def _booted(self, node: Node) -> None:
-        self._cells.pop(node.name, None)  # simulated vehicles are nowhere until the new life has places for them
-        self._lives[node.name] = _Life()
+        self._cells.pop(
+            node.name, None
+        )  # simulated vehicles are nowhere until the new generation has places for them
+        self._generations[node.name] = _Generation()
 
     def _delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
         if self._trace is not None:
             self._trace(now_ns, source, destination, topic, payload)
-        if topic == BODY.name and destination.startswith("agent-"):
+        if topic == OBSTACLE.name and destination.startswith("agent-"):
             with contextlib.suppress(ProtocolError):  # an invalid report closes nothing
-                self._lives.setdefault(destination, _Life()).take(decode(payload, Body), now_ns)
+                self._generations.setdefault(destination, _Generation()).take(decode(payload, Obstacle), now_ns)
 
     def _take_digest(self, event: Event) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Digest) and event.message.role == "keeper":
@@ -182,18 +184,21 @@ class LawBook:
         if not isinstance(node.service, AgentService):
             return
         agent, now_ns = node.service.agent, simulation.scheduler.clock.now_ns()
-        life, cells = self._lives.setdefault(node.name, _Life()), self._cells.setdefault(node.name, {})
-        ticked_ns = now_ns if life.ticked_ns is None else life.ticked_ns
-        life.ticked_ns = now_ns
+        generation, cells = (
+            self._generations.setdefault(node.name, _Generation()),
+            self._cells.setdefault(node.name, {}),
+        )
+        ticked_ns = now_ns if generation.ticked_ns is None else generation.ticked_ns
+        generation.ticked_ns = now_ns
         truth = self._truths[agent.plan.group.vehicle_class]
         for id, vehicle in agent.vehicles.items():
             if cells.get(id) != vehicle.cell:
                 if not math.isfinite(truth[vehicle.cell]):
                     text = f"lethal entry at {now_s:.2f} s: {id} on cell {vehicle.cell}"
                     self.lethal.append(BrokenLaw("no lethal entry", text, now_s))
-                if id in life.placed:
-                    self.driven_into += self._bodies_entered(life, vehicle, ticked_ns)
-            life.placed.add(id)
+                if id in generation.placed:
+                    self.driven_into += self._obstacles_entered(generation, vehicle, ticked_ns)
+            generation.placed.add(id)
             cells[id] = vehicle.cell
             self._unmoved.pop(id, None)
             if self.whole_s is not None and vehicle.state in _ROUTED:
@@ -202,19 +207,19 @@ class LawBook:
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
             self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
         if agent.holdings.replaced:
-            cells.clear()  # the younger life drives them
+            cells.clear()  # the younger generation drives them
         self._collide()
 
-    def _bodies_entered(self, life: _Life, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
-        """The bodies onto which a vehicle has driven since the last tick of its agent."""
+    def _obstacles_entered(self, generation: _Generation, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
+        """The obstacles onto which a vehicle has driven since the last tick of its agent."""
         now_ns, now_s = self.simulation.scheduler.clock.now_ns(), self.simulation.now_s
         grid, middle = self.simulation.terrain.grid, self.simulation.terrain.grid.centre_m(vehicle.cell)
-        for body, at_ns in life.reports.values():
-            lasts = at_ns <= ticked_ns and now_ns < at_ns + body.lease_s * NS_PER_S
-            near = math.dist(middle, (body.x_m, body.y_m)) <= body.radius_m + grid.resolution_m
-            if lasts and near and vehicle.cell in capsule_of(body, grid, 0.0).cells(grid):
-                text = f"driven into body {body.id} at {now_s:.2f} s: {vehicle.id} on cell {vehicle.cell}"
-                yield BrokenLaw("bodies are avoided", text, now_s)
+        for obstacle, at_ns in generation.reports.values():
+            lasts = at_ns <= ticked_ns and now_ns < at_ns + obstacle.lease_s * NS_PER_S
+            near = math.dist(middle, (obstacle.x_m, obstacle.y_m)) <= obstacle.radius_m + grid.resolution_m
+            if lasts and near and vehicle.cell in capsule_of(obstacle, grid, 0.0).cells(grid):
+                text = f"driven into obstacle {obstacle.id} at {now_s:.2f} s: {vehicle.id} on cell {vehicle.cell}"
+                yield BrokenLaw("obstacles are avoided", text, now_s)
 
     def _wait(self, vehicle: Vehicle, to_go: bool, counts_s: float, across_s: float) -> None:
         cell, waited_s = self._waited.get(vehicle.id, (-1, 0.0))

@@ -93,7 +93,7 @@ def built(
 class Node:
     """One process, and the place where it is started again.
 
-    name      in the network; a second life of an agent on another machine has a name of its own
+    name      in the network; a second generation of an agent on another machine has a name of its own
     skew_ns   by how much the machine's clock is wrong; a process reads it once, at its start
     """
 
@@ -113,7 +113,7 @@ class Node:
         self._shell: Service | None = None
         """The service, or what records its calls."""
         self._recording: Recording | None = None
-        """Recording of this life."""
+        """Recording of this generation."""
         self.bus: MemoryBus | None = None
         self.store: KeeperStore | None = None
         self.promises: PromiseStore | None = None
@@ -127,7 +127,7 @@ class Node:
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
         self._phase_ns = phase_ns % self._tick_ns
         self._offset_ns = skew_ns
-        self._life = 0
+        self._generation = 0
         self._waiting: list[Event] | None = None
         """Events since the process hangs; None if it does not."""
         self._worker: InlineWorker | None = None
@@ -150,7 +150,7 @@ class Node:
         self._offset_ns = self.skew_ns
         self._waiting = None
         # Lives are counted as by the launcher: a restart is the later one even if the clock was set back meanwhile.
-        self._life = max(self.now_ns(), self._life + 1)
+        self._generation = max(self.now_ns(), self._generation + 1)
         namespace = simulation.scenario.network.namespace
         bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
         worker = self._worker = InlineWorker(simulation.scheduler)
@@ -164,7 +164,7 @@ class Node:
             run_id=simulation.run_id,
             role=self.spec.role,
             id=self.spec.id,
-            incarnation=self._life,
+            incarnation=self._generation,
             started_ns=EPOCH_NS,
             added=self.added,
             restarts=self.crashes,
@@ -176,7 +176,7 @@ class Node:
         if self.spec.role == "keeper":
             self.store = self.store or KeeperStore(":memory:")
         if self.spec.role == "agent":
-            self.promises = self.promises or PromiseStore(self._phase_ns + self._life)
+            self.promises = self.promises or PromiseStore(self._phase_ns + self._generation)
         self.service = built(
             setup,
             simulation.terrain,
@@ -270,7 +270,7 @@ class Node:
             self._shell.stop(self.now_ns())
 
     def end_recording(self, *, ended: bool = True) -> None:
-        """Nothing of this life is recorded any more. `ended`: the process has ended in order."""
+        """Nothing of this generation is recorded any more. `ended`: the process has ended in order."""
         if self._recording is not None:
             self._recording.close(ended=ended)
             self._recording = None

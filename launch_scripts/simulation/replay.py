@@ -65,13 +65,13 @@ class _Costs:
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """One life of a process, in a file.
+    """One generation of a process, in a file.
 
-    life  which of its lives it is, from 1
+    generation  which of its generations it is, from 1
     """
 
     path: Path
-    life: int
+    generation: int
     head: Head
 
     @property
@@ -113,11 +113,11 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
         roles = (*SIMULATED_ROLES, head.role)  # one that this build does not know is last
         return roles.index(head.role), len(head.id), head.id, head.incarnation  # t2 before t10
 
-    lives: Counter[tuple[str, str]] = Counter()
+    generations: Counter[tuple[str, str]] = Counter()
     recorded: list[Recorded] = []
     for head, path in sorted(found, key=order):
-        lives[head.role, head.id] += 1
-        recorded.append(Recorded(path=path, life=lives[head.role, head.id], head=head))
+        generations[head.role, head.id] += 1
+        recorded.append(Recorded(path=path, generation=generations[head.role, head.id], head=head))
     some = [each for each in recorded if process in (None, each.process)]
     if not some:
         there = ", ".join(dict.fromkeys(each.process for each in recorded))

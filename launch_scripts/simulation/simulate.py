@@ -189,7 +189,8 @@ class Simulation:
         return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
 
     def twin(self, name: str) -> None:
-        """Starts a second life of an agent now, on another machine: with another file, and a clock of its own."""
+        """Starts a second generation of an agent now, on another machine: with another file, and a clock of its
+        own."""
         first = self.nodes[name]
         others = sum(node.spec == first.spec for node in self.nodes.values())
         self.node(first.spec, -first.skew_ns, f"{name}.{others + 1}").boot()

@@ -27,7 +27,7 @@ from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
-    from swarm.right_of_way.guest_session import GuestSession
+    from swarm.right_of_way.external_session import ExternalSession
     from swarm.runtime.inbox import Inbox
 
 _ASK_S = 1.0
@@ -58,7 +58,7 @@ class Swarm:
         """Opens a bus whose words count in right of way."""
         self._trust = trust
         """Makes orders of the session count."""
-        self._guests: list[GuestSession] = []
+        self._externals: list[ExternalSession] = []
 
     def __enter__(self) -> Swarm:
         return self
@@ -119,40 +119,40 @@ class Swarm:
     ) -> Vehicle:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
-        id        letters, digits, '_' and '.'; not of any other vehicle
-        group     whose it is
-        radius_m  around its place, which others keep clear
-        lease_s   others avoid its last place for so long after they hear nothing more
-        right_of_way  it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Needs the user
-                      of the swarm, or with certificates the name `rover.GROUP.ID`. The state for its next
-                      generation is kept in the file of this path; if True, in a file of this user for each run and
-                      id
+        id             letters, digits, '_' and '.'; not of any other vehicle
+        group          whose it is
+        radius_m       around its place, which others keep clear
+        lease_s        others avoid its last place for so long after they hear nothing more
+        right_of_way   it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Needs the user
+                       of the swarm, or with certificates the name `rover.GROUP.ID`. The state for its next
+                       generation is kept in the file of this path; if True, in a file of this user for each run and
+                       id
         vehicle_class  whose routes it asks for: one of the scenario's classes of vehicles
         """
         vehicle = Vehicle(self._session, id, group, radius_m, lease_s, vehicle_class)
         if right_of_way:
             file = None if right_of_way is True else Path(right_of_way)
             try:
-                vehicle.give_way(self._guest(id, file))
+                vehicle.give_way(self._external(id, file))
             except BaseException:
                 vehicle.leave()
                 raise
         return vehicle
 
-    def _guest(self, id: str, file: Path | None) -> GuestSession:
+    def _external(self, id: str, file: Path | None) -> ExternalSession:
         """Raises StoreError if another program has the file."""
-        from swarm.right_of_way.guest_session import GuestSession
-        from swarm.right_of_way.incarnations import LifeFile
+        from swarm.right_of_way.external_session import ExternalSession
+        from swarm.right_of_way.incarnations import GenerationFile
         from swarm.runtime.run_secret import state_folder
 
-        lives = LifeFile(file or state_folder() / "vehicles" / self.run_id / id)
+        generations = GenerationFile(file or state_folder() / "vehicles" / self.run_id / id)
         try:
-            guest = GuestSession(id, self.frame.grid, self._open_trusted(), lives)
+            external = ExternalSession(id, self.frame.grid, self._open_trusted(), generations)
         except BaseException:
-            lives.close()
+            generations.close()
             raise
-        self._guests.append(guest)
-        return guest
+        self._externals.append(external)
+        return external
 
     def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
         """A target of the scenario that this program tracks: its walk there is `external`.
@@ -210,8 +210,8 @@ class Swarm:
 
     def close(self) -> None:
         """Takes away all vehicles and targets of this program, and leave. May be repeated."""
-        for guest in self._guests:
-            guest.close()
+        for external in self._externals:
+            external.close()
         self._stop()
         self._session.close()
 
@@ -227,11 +227,11 @@ def connect(
 ) -> Swarm:
     """Connect to a running swarm and learn its terrain.
 
-    endpoint   of a router; beyond this machine `tls/HOST:PORT`, with the three files
-    namespace  the scenario's `network.namespace`
-    ca         certificate of the swarm's authority, PEM
+    endpoint          of a router; beyond this machine `tls/HOST:PORT`, with the three files
+    namespace         the scenario's `network.namespace`
+    ca                certificate of the swarm's authority, PEM
     certificate, key  of this program, whose name says what it may do: rover.GROUP.ID, tracker.TARGET, operator.NAME
-    timeout_s  how long to wait for a router, and for a process that belongs to a run
+    timeout_s         how long to wait for a router, and for a process that belongs to a run
 
     Raises ConfigError on an invalid argument, BusError if no process replies.
     """

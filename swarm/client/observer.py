@@ -13,15 +13,15 @@ from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, Followed, VehicleState
-from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, Obstacle, VehicleState
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, OBSTACLE, POSE
 
 CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
 """A fleet that was silent for so long is shown no more. Agents tell at each tick, and at once when they leave."""
 EVERY_S = 0.2
 """Time between two readings of positions if a program does not say: five a second are smooth to an eye."""
-_HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
+_HEARD = (FLEET, OBSTACLE, POSE, FOLLOWED, NOTE, MARKS)
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
 """Sets of marks that are held: a quarter of what a replica may hold (docs/design/map-merge-law.md)."""
@@ -85,7 +85,7 @@ class Observer:
         self._on_note: list[Callable[[Note], None]] = []
         self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
         """(author, region) -> its newest message, and when it came."""
-        self._bodies: dict[str, tuple[Body, int]] = {}
+        self._obstacles: dict[str, tuple[Obstacle, int]] = {}
         self._trackings = Trackings(session.frame.grid)
         self._targets: dict[str, None] = {}
         """Ids of targets that were heard of, in order."""
@@ -116,10 +116,16 @@ class Observer:
             for fleet, heard_ns in self._fleets.values():
                 if now_ns - heard_ns < _SILENCE_NS:
                     seen |= {each.id: each for each in _in_fleet(fleet, self._session.frame.grid)}
-            for body, heard_ns in self._bodies.values():
-                if now_ns - heard_ns < body.lease_s * NS_PER_S:
-                    seen[body.id] = SeenVehicle(
-                        body.id, body.group, body.x_m, body.y_m, body.heading_rad, "outside", None
+            for obstacle, heard_ns in self._obstacles.values():
+                if now_ns - heard_ns < obstacle.lease_s * NS_PER_S:
+                    seen[obstacle.id] = SeenVehicle(
+                        obstacle.id,
+                        obstacle.group,
+                        obstacle.x_m,
+                        obstacle.y_m,
+                        obstacle.heading_rad,
+                        "outside",
+                        None,
                     )
             return seen
 
@@ -186,8 +192,8 @@ class Observer:
         match event:
             case Heard(message=Fleet() as fleet):
                 self._fleets[fleet.author, fleet.region] = fleet, now_ns
-            case Heard(message=Body() as body):
-                self._bodies[body.id] = body, now_ns
+            case Heard(message=Obstacle() as obstacle):
+                self._obstacles[obstacle.id] = obstacle, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
                 if self._trackings.counted(pose, now_ns) is not None:
                     self._targets[pose.target] = None

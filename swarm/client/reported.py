@@ -18,7 +18,7 @@ R = TypeVar("R", bound="Reported")
 class Reported:
     """One thing under an id of its own. Use it in a `with`, or `leave`.
 
-    incarnation  when it joined, in ns: tells it from an earlier life under the same id
+    incarnation  when it joined, in ns: tells it from an earlier generation under the same id
     """
 
     def __init__(self, session: Session, topic: Topic, kind: str, id: str, lease_s: float, repeat_ns: int) -> None:

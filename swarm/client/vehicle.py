@@ -17,11 +17,11 @@ from swarm.config.agents import agent_of
 from swarm.errors import ConfigError
 from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
-from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE
+from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
+from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PUSHED_ROUTE
 
 if TYPE_CHECKING:
-    from swarm.right_of_way.guest_session import GuestSession
+    from swarm.right_of_way.external_session import ExternalSession
 
 _REPEAT_NS = NS_PER_S // 2
 """Time between two reports of a vehicle that stands. A new agent listens for a second before it drives."""
@@ -38,12 +38,12 @@ _NEAR_END_CELLS = 16
 class Vehicle(Reported):
     """One vehicle. Made by `Swarm.vehicle`; use it in a `with`, or `leave` at the end.
 
-    id           of the vehicle; no other process may report one of the same id
-    group        whose it is: who reads its marks
-    radius_m     around its place, which others keep clear
-    lease_s      others avoid its last place for so long after they hear nothing more
+    id             of the vehicle; no other process may report one of the same id
+    group          whose it is: who reads its marks
+    radius_m       around its place, which others keep clear
+    lease_s        others avoid its last place for so long after they hear nothing more
     vehicle_class  whose routes it asks for
-    incarnation  when it joined, in ns: tells it from an earlier life under the same id
+    incarnation    when it joined, in ns: tells it from an earlier generation under the same id
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Vehicle(Reported):
         self.group = group
         self.radius_m = session.number("radius_m", radius_m, 0, MOST_RADIUS_M)
         self.vehicle_class = vehicle_class
-        lease_s = session.number("lease_s", lease_s, 0, LONGEST_BODY_LEASE_S, more=True)
-        super().__init__(session, BODY, "vehicle", id, lease_s, _REPEAT_NS)
+        lease_s = session.number("lease_s", lease_s, 0, LONGEST_OBSTACLE_LEASE_S, more=True)
+        super().__init__(session, OBSTACLE, "vehicle", id, lease_s, _REPEAT_NS)
         self._target: str | None = None
         self._route: Route | None = None
         self._ask_due_ns = 0
@@ -71,7 +71,7 @@ class Vehicle(Reported):
         self._on_route: list[Callable[[Route], None]] = []
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
         self._digest_due_ns = 0
-        self._way: GuestSession | None = None
+        self._way: ExternalSession | None = None
         self._join()
 
     # --- place --------------------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class Vehicle(Reported):
 
     # --- right of way -------------------------------------------------------------------------------------------
 
-    def give_way(self, way: GuestSession) -> None:
+    def give_way(self, way: ExternalSession) -> None:
         """Makes it reserve cells from now on. Called once, before the first `at`."""
         self._way = way
 
@@ -139,7 +139,7 @@ class Vehicle(Reported):
         unless it was made with `right_of_way`."""
         return self._has_way().may_enter(cell, timeout_s)
 
-    def _has_way(self) -> GuestSession:
+    def _has_way(self) -> ExternalSession:
         if self._way is None:
             raise ConfigError(
                 f"vehicle {self.id} has no right of way: make it with swarm.vehicle({self.id!r}, right_of_way=True)"
@@ -297,8 +297,10 @@ class Vehicle(Reported):
 
     def on_event(self, event: Event, now_ns: int) -> None:
         match event:
-            case Heard(message=Body() as body) if body.id == self.id and body.incarnation != self.incarnation:
-                self._on_double(body)
+            case Heard(message=Obstacle() as obstacle) if (
+                obstacle.id == self.id and obstacle.incarnation != self.incarnation
+            ):
+                self._on_double(obstacle)
             case Heard(message=PushedRoute() as pushed) if (
                 pushed.vehicle == self.id and pushed.target == self._target
             ):
@@ -312,7 +314,7 @@ class Vehicle(Reported):
             case LinkChanged(up=True):
                 self._repeat_due_ns = self._ask_due_ns = self._digest_due_ns = 0
 
-    def _on_double(self, other: Body) -> None:
+    def _on_double(self, other: Obstacle) -> None:
         if other.lease_s == 0:
             return
         who = (

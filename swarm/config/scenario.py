@@ -35,7 +35,7 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
-from swarm.grid import MOST_PLOT_REGIONS
+from swarm.grid import MOST_SHARD_REGIONS
 
 UNTIL_STOPPED_S = 1e9
 """A run whose `seconds` are as many ends when it is stopped."""
@@ -44,19 +44,20 @@ UNTIL_STOPPED_S = 1e9
 class TargetConfig(Section, frozen=True, kw_only=True):
     """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.
 
-    name           id of the target, or what the ids begin with
-    count          how many targets
-    walk           still; random: a new heading now and then; waypoints: to random places by the cheapest way;
-                   evade: away from the nearest vehicles; external: another process publishes its pose; or a plug-in
-    walk_options   what a plug-in for `walk` takes
-    speed_m_per_s  its speed on level open ground, elsewhere slower or faster as vehicles are
-    tracker        always: its pose is published all the time; sighted: only vehicles which see it tell where it is,
-                   and planners use the last sighting
-    caught         jump: a captured target goes on from another place; stay: it goes on from where it is
-    start          [row, col], or a place: "46.81,9.85" (latitude, longitude), "xy:X,Y" in metres of the map; a
-                   random passable cell if not given
-    body_radius_m  vehicles keep out of the cells within this distance of it, and of those that it drives to (m); if
-                   not given, they may share its cell
+    name               id of the target, or what the ids begin with
+    count              how many targets
+    walk               still; random: a new heading now and then; waypoints: to random places by the cheapest way;
+                       evade: away from the nearest vehicles; external: another process publishes its pose; or a
+                       plug-in
+    walk_options       what a plug-in for `walk` takes
+    speed_m_per_s      its speed on level open ground, elsewhere slower or faster as vehicles are
+    tracker            always: its pose is published all the time; sighted: only vehicles which see it tell where it
+                       is, and planners use the last sighting
+    caught             jump: a captured target goes on from another place; stay: it goes on from where it is
+    start              [row, col], or a place: "46.81,9.85" (latitude, longitude), "xy:X,Y" in metres of the map; a
+                       random passable cell if not given
+    obstacle_radius_m  vehicles keep out of the cells within this distance of it, and of those that it drives to
+                       (m); if not given, they may share its cell
     """
 
     name: Name = "t"
@@ -67,7 +68,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     tracker: Literal["always", "sighted"] = "always"
     caught: Literal["jump", "stay"] = "jump"
     start: tuple[int, int] | PlaceText | None = None
-    body_radius_m: Annotated[float, Meta(ge=0, le=100)] | None = None
+    obstacle_radius_m: Annotated[float, Meta(ge=0, le=100)] | None = None
 
     @property
     def is_simulated(self) -> bool:
@@ -206,8 +207,9 @@ class MapConfig(Section, frozen=True, kw_only=True):
     interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
-    plot_regions        side of a plot of right of way, in regions of 256 x 256 cells. Agents speak of every plot in
-                        every tick: few agents on a large map want larger ones. The same for all processes of a run
+    shard_regions       side of a shard of right of way, in regions of 256 x 256 cells. Agents speak of every shard
+                        in every tick: few agents on a large map want larger ones. The same for all processes of a
+                        run
     digest_s            every replica publishes this often which sets it holds
     author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
@@ -219,7 +221,7 @@ class MapConfig(Section, frozen=True, kw_only=True):
 
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
-    plot_regions: Annotated[int, Meta(ge=1, le=MOST_PLOT_REGIONS)] = 1
+    shard_regions: Annotated[int, Meta(ge=1, le=MOST_SHARD_REGIONS)] = 1
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0

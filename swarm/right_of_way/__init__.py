@@ -1,62 +1,62 @@
 """Right of way: no two vehicles are in one cell, even if messages are lost, late or repeated and processes stop or
 restart.
 
-The map is cut into *plots* (`lock_regions`): lock regions. Three agents are the *members* of a plot, and one of
-them is its *warden*: the leader, by epoch and majority. A *host* is a process with vehicles in a plot or at its
-border. A *life* is one incarnation of a host. The warden keeps an order of *entries* for each cell (`entries`): the
-vehicle of an entry enters the cell once all before it are over. An entry is never revoked and never runs out: it is
-over by the word of its host alone. Only authority is leased.
+The map is cut into *shards* (`lock_regions`): lock regions. Three agents are the *members* of a shard, and one of
+them is its *leader*: the leader, by epoch and majority. A *host* is a process with vehicles in a shard or at its
+border. A *generation* is one incarnation of a host. The leader keeps an order of *entries* for each cell
+(`entries`): the vehicle of an entry enters the cell once all before it are over. An entry is never revoked and
+never runs out: it is over by the word of its host alone. Only authority is leased.
 
-This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in
-docs/design/right-of-way.md, and docs/design/external-vehicles.md says how guests come into it. All but
-`guest_session` and the file of lives is pure: time and chance are arguments.
+This package is the side of hosts. Members and leaders are in `vehicle_agent/traffic`; the proof is in
+docs/design/right-of-way.md, and docs/design/external-vehicles.md says how external vehicles come into it. All but
+`external_session` and the file of generations is pure: time and chance are arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
-1. Begin with a life whose number is greater than all that anybody knows, and have it on file before the first
-   word. First ask all agents (`KnownRequest`), until enough members of every plot have replied that one of them
+1. Begin with a generation whose number is greater than all that anybody knows, and have it on file before the first
+   word. First ask all agents (`KnownRequest`), until enough members of every shard have replied that one of them
    has its newest usable table.
-2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
+2. Tell each shard that concerns it everything about its vehicles there, whenever that is news and once a heartbeat.
    Entries that it omits are over.
-3. Enter a cell only by an entry that a `Granted` for this life, newer than all that it knows of the plot, adds to
-   the path of the vehicle, and only once all entries before it are over. Never go back to an older table of a plot,
-   not even after the vehicles have left it.
+3. Enter a cell only by an entry that a `Granted` for this generation, newer than all that it knows of the shard,
+   adds to the path of the vehicle, and only once all entries before it are over. Never go back to an older table of
+   a shard, not even after the vehicles have left it.
 4. Say `Left` of what its vehicles have left or given back, to those who wait for it, again and again until a usable
    table lists it no more. Never use such an entry again.
 5. Give back entries that wait for others which do not go on.
-6. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
-7. Speak to the warden, and to all members where no warden was heard for half a second.
+6. Stop once a table names a greater generation of this host, and say so where the vehicles are simulated ones.
+7. Speak to the leader, and to all members where no leader was heard for half a second.
 
-Duties of a warden:
+Duties of a leader:
 
 1. Add an entry at the end of a cell's order only, and one to a cell and table. Remove it only by a statement of its
-   host that knows the table which added it and omits it, or by proof that its life has ended.
+   host that knows the table which added it and omits it, or by proof that its generation has ended.
 2. Put a vehicle only behind one that goes on, and never so that it would wait for itself.
 3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
 
 Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
 
-`Standing`      Host to warden: all vehicles of the host that hold or want a cell of one plot, each with its
+`Standing`      Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
-                what that added, the host holds no more than it lists. `dead` are lives that are proved to
+                what that added, the host holds no more than it lists. `dead` are generations that are proved to
                 have ended, by which their entries are over.
-`Table`         Warden to members: the entries of one plot. Its stamp is (epoch, seq).
+`Table`         Leader to members: the entries of one shard. Its stamp is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable.
-`Granted`       Warden to host: what a usable table says of the vehicles of one host, under its stamp, each entry
+`Granted`       Leader to host: what a usable table says of the vehicles of one host, under its stamp, each entry
                 with those before it, and which other hosts follow. A host takes the entries that continue the path
                 of the vehicle, and passes over the others, which gives them back. `pushed` asks a vehicle to make
-                way into another plot; `occupied` are the cells of others around.
+                way into another shard; `occupied` are the cells of others around.
 `Left`          Host to host: these entries are over.
-`Claim`         Member to members, where no warden was heard for 0.6 s, longer where round trips are: who answers
-                with its table promises to store nothing of a lower epoch. Two promises make a warden, which goes on
+`Claim`         Member to members, where no leader was heard for 0.6 s, longer where round trips are: who answers
+                with its table promises to store nothing of a lower epoch. Two promises make a leader, which goes on
                 from the newest table of the two.
-`KnownRequest`  New life to all agents: what is on file of this host?
-`Known`         The answer: the greatest life in any table, the plots that list entries of the host, and, for a
-                guest, who the agents are and how large plots are.
+`KnownRequest`  New generation to all agents: what is on file of this host?
+`Known`         The answer: the greatest generation in any table, the shards that list entries of the host, and, for
+                an external vehicle, who the agents are and how large shards are.
 
-A *guest* (`Guest`) is a host that is not in the scenario. It is a member of no plot, so who joins and leaves
-changes no majority. It enters from nowhere: a standing asks for its first cell and holds nothing. It leaves by
-a standing without the vehicle. The cells of a dead guest stay shut until its next life proves, by the file which
-that has locked, that the process has ended, or until an operator removes it (`Removal`): a life that names all
-lives as ended, itself among them.
+An *external vehicle* (`ExternalVehicle`) is a host that is not in the scenario. It is a member of no shard, so who
+joins and leaves changes no majority. It enters from nowhere: a host state asks for its first cell and holds
+nothing. It leaves by a host state without the vehicle. The cells of a dead external vehicle stay shut until its
+next generation proves, by the file which that has locked, that the process has ended, or until an operator removes
+it (`Removal`): a generation that names all lives as ended, itself among them.
 """

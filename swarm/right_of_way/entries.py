@@ -1,6 +1,6 @@
 """Entries: a vehicle's place in the order of vehicles for each cell, as its host acts on them. Pure.
 
-A warden keeps one order of entries for each cell, and appends at its end only
+A leader keeps one order of entries for each cell, and appends at its end only
 (`vehicle_agent.traffic.cell_orders`). The vehicle of an entry enters the cell once every entry before it is over.
 An entry is over by the word `Left` of the host that had it, or by a usable table that lists it no more. Both are
 facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
@@ -10,14 +10,14 @@ Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
 
 1. The number of an entry is used once: (cell, epoch, sequence). A table adds one entry to a cell at most.
 2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
-   back while the first is still used. Entries of the same vehicle, of an earlier life, do not count.
+   back while the first is still used. Entries of the same vehicle, of an earlier generation, do not count.
 3. A host says that it has left a cell once its vehicle has, not when it sets out.
 4. An entry that was left, given back or passed over is never used again by this host.
-5. A host acts on tables for its own life only, and in their order.
-6. A new life begins with no entry. The entries of lives before it stay in their orders until these are proved to
-   have ended, which a life with a proof gives in its first statement. Then one of them passes to the new life if
-   the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new entry, at the end of the
-   order of a cell which the earlier life held; all others are over with the proof.
+5. A host acts on tables for its own generation only, and in their order.
+6. A new generation begins with no entry. The entries of generations before it stay in their orders until these are
+   proved to have ended, which a generation with a proof gives in its first statement. Then one of them passes to
+   the new generation if the vehicle's body is known to be on it. A vehicle whose body is made up enters by a new
+   entry, at the end of the order of a cell which the earlier generation held; all others are over with the proof.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ BEFORE_ALL: Stamp = (0, 0)
 
 @dataclass(slots=True)
 class HostEntries:
-    """The entries of the vehicles of one life of a host.
+    """The entries of the vehicles of one generation of a host.
 
-    plot_of   plot of a cell
+    shard_of  shard of a cell
     adjacent  whether one step leads from one cell to another
     bodies    vehicle -> the cell of its body, or where it would enter, while it has no place and that is known
-    away      vehicles that have left in this life: they take no entry
+    away      vehicles that have left in this generation: they take no entry
     paths     vehicle -> its entries in driving order, its own cell first
     placed    vehicles that are on the first cell of their paths; the others are nowhere
-    over      plot -> numbers that this life has left, given back or passed over, and its table still lists
+    over      shard -> numbers that this generation has left, given back or passed over, and its table still lists
     heard     (number, host) of which that host has said that it is over; entries of paths know it
-    knows     plot -> the newest table acted on
+    knows     shard -> the newest table acted on
     """
 
-    life: int
-    plot_of: Callable[[int], int]
+    generation: int
+    shard_of: Callable[[int], int]
     adjacent: Callable[[int, int], bool]
     bodies: dict[str, int] = field(default_factory=dict)
     away: set[str] = field(default_factory=set)
@@ -80,13 +80,15 @@ class HostEntries:
         ]
         return Entry(entry.number, before)
 
-    def hear_granted(self, plot: int, stamp: Stamp, life: int, grants: Mapping[str, Sequence[Entry]]) -> set[str]:
-        """A usable table of a plot names these entries of our vehicles. Returns the vehicles of which the path has
+    def hear_granted(
+        self, shard: int, stamp: Stamp, generation: int, grants: Mapping[str, Sequence[Entry]]
+    ) -> set[str]:
+        """A usable table of a shard names these entries of our vehicles. Returns the vehicles of which the path has
         other entries now."""
-        if life != self.life or stamp <= self.knows.get(plot, BEFORE_ALL):
+        if generation != self.generation or stamp <= self.knows.get(shard, BEFORE_ALL):
             return set()
-        self.knows[plot] = stamp
-        over = self.over.setdefault(plot, set())
+        self.knows[shard] = stamp
+        over = self.over.setdefault(shard, set())
         over.intersection_update(entry.number for entries in grants.values() for entry in entries)
         longer = set()
         for vehicle, entries in grants.items():
@@ -116,7 +118,7 @@ class HostEntries:
 
     def may_enter(self, entry: Entry) -> bool:
         """Returns True if all entries before one are over."""
-        ours = self.over.get(self.plot_of(entry.cell), ())
+        ours = self.over.get(self.shard_of(entry.cell), ())
         return all((entry.cell, epoch, seq) in ours for epoch, seq, _ in entry.after)
 
     def place(self, vehicle: str) -> bool:
@@ -156,16 +158,16 @@ class HostEntries:
 
     def _end(self, entries: Iterable[Entry]) -> None:
         for entry in entries:
-            self.over.setdefault(self.plot_of(entry.cell), set()).add(entry.number)
+            self.over.setdefault(self.shard_of(entry.cell), set()).add(entry.number)
 
     def of(self, vehicle: str) -> dict[int, list[Number]]:
-        """Returns plot -> the entries of a vehicle there."""
+        """Returns shard -> the entries of a vehicle there."""
         found: dict[int, list[Number]] = {}
         for entry in self.paths[vehicle]:
-            found.setdefault(self.plot_of(entry.cell), []).append(entry.number)
+            found.setdefault(self.shard_of(entry.cell), []).append(entry.number)
         return found
 
-    def holds(self, plot: int) -> dict[str, list[Number]]:
-        """Returns vehicle -> its entries in a plot: all others that its newest table lists are over."""
-        held = {vehicle: self.of(vehicle).get(plot, []) for vehicle in self.paths}
+    def holds(self, shard: int) -> dict[str, list[Number]]:
+        """Returns vehicle -> its entries in a shard: all others that its newest table lists are over."""
+        held = {vehicle: self.of(vehicle).get(shard, []) for vehicle in self.paths}
         return {vehicle: numbers for vehicle, numbers in held.items() if numbers}

@@ -1,4 +1,4 @@
-"""Cells that the vehicles of one host hold: grants of wardens that are on file with a majority."""
+"""Cells that the vehicles of one host hold: grants of leaders that are on file with a majority."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from itertools import chain, takewhile
 import msgspec
 
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
-from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Entry, Granted, Left, Number, Stand, Standing
+from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand
 
-_UNHEARD_NS = 5 * BEAT_NS // 2
-"""A host that has not heard a plot's warden for so long speaks to all members of the plot."""
+_UNHEARD_NS = 5 * HEARTBEAT_NS // 2
+"""A host that has not heard a shard's leader for so long speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
 _MOST_CELLS = 1 << 12
-"""Cells whose plot is remembered: more than the vehicles of one host have near them."""
+"""Cells whose shard is remembered: more than the vehicles of one host have near them."""
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -41,29 +41,29 @@ _NO_STANDS: Mapping[str, _Told] = {}
 
 @dataclass(frozen=True, slots=True)
 class Tell:
-    """Send a standing to these members of its plot."""
+    """Send a host state to these members of its shard."""
 
     members: tuple[str, ...]
-    standing: Standing
+    standing: HostState
 
 
 @dataclass(slots=True)
 class _View:
-    """State of one plot as a host knows it.
+    """State of one shard as a host knows it.
 
-    warden   of the last grant, and the time when that was received
-    heard    the newest standing of ours that the table in use takes into account
-    seen     vehicle -> its entries in the table in use
+    leader    of the last grant, and the time when that was received
+    heard     the newest host state of ours that the table in use takes into account
+    seen      vehicle -> its entries in the table in use
     followed  other host -> entries of ours behind which its vehicles wait, by the same table
-    left     other host -> those of these that are over, as we told it last, and when
-    pushed   vehicle -> the age with which it is to make way into another plot
-    others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
-    quiet    the first standing from which on we want nothing here; None while we do
-    told     the last statement about our vehicles, and its time
-    same     whether the next statement is known to be the same
+    left      other host -> those of these that are over, as we told it last, and when
+    pushed    vehicle -> the age with which it is to make way into another shard
+    others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
+    quiet     the first host state from which on we want nothing here; None while we do
+    told      the last statement about our vehicles, and its time
+    same      whether the next statement is known to be the same
     """
 
-    warden: str = ""
+    leader: str = ""
     heard_ns: int = 0
     heard: int = 0
     seen: dict[str, list[Number]] = field(default_factory=dict)
@@ -82,7 +82,7 @@ _Told = tuple[Stand, object]
 
 
 class _Said(msgspec.Struct, frozen=True):
-    """Statement about one vehicle while nothing about it changes: a stand per plot."""
+    """Statement about one vehicle while nothing about it changes: a stand per shard."""
 
     wish: Wish
     path: list[int]
@@ -94,48 +94,48 @@ class Holdings:
 
     vehicles  those of the host; None for all that bear its name
 
-    life      which life of the host this is; 0 before `begin`
-    plots     those that concern the host now: it speaks to their members and listens to their tables
-    replaced  a later life of this host has spoken: this one must end
-    newest    the greatest life of this host that a table in use names
-    refused   sentences about impossible statements; the reader clears them
+    generation  which generation of the host this is; 0 before `begin`
+    shards      those that concern the host now: it speaks to their members and listens to their tables
+    replaced    a later generation of this host has spoken: this one must end
+    newest      the greatest generation of this host that a table in use names
+    refused     sentences about impossible statements; the reader clears them
     """
 
-    def __init__(self, plots: Plots, agent: str, vehicles: Collection[str] | None) -> None:
-        self._plots = plots
-        self._plot_of = lru_cache(_MOST_CELLS)(plots.of)
+    def __init__(self, shards: Shards, agent: str, vehicles: Collection[str] | None) -> None:
+        self._shards = shards
+        self._shard_of = lru_cache(_MOST_CELLS)(shards.of)
         self._agent = agent
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
         self.end()
 
     def end(self) -> None:
-        """Holds nothing and know nothing, as before the first life."""
-        self.life = self.newest = 0
+        """Holds nothing and know nothing, as before the first generation."""
+        self.generation = self.newest = 0
         self.replaced = False
-        self.plots: dict[int, None] = {}
+        self.shards: dict[int, None] = {}
         self._dead: list[int] = []
-        self._entries = HostEntries(0, self._plot_of, self._plots.adjacent)
+        self._entries = HostEntries(0, self._shard_of, self._shards.adjacent)
         self._paths: dict[str, list[int]] = {}
         """Vehicle that has a place -> the cells that it holds, in driving order; another list when they change."""
         self._pushed: dict[str, int] | None = None
-        """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
+        """Vehicle -> the age with which it is asked to make way; None when a leader has spoken."""
         self._said: dict[str, _Said] = {}
         self._seen_anew: set[str] = set()
         """Vehicles to which another table grants other cells: their requests may change."""
         self._stands: dict[int, dict[str, _Told]] = {}
-        """Plot -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
+        """Shard -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
         self._seq = 0
 
-    def begin(self, life: int, dead: Sequence[int]) -> None:
-        """Begins a life; `dead` are earlier ones that are proved to have ended."""
-        self.life = self._entries.life = life
+    def begin(self, generation: int, dead: Sequence[int]) -> None:
+        """Begins a generation; `dead` are earlier ones that are proved to have ended."""
+        self.generation = self._entries.generation = generation
         self._dead = list(dead)
 
     def end_at_once(self) -> None:
-        """States that no vehicle drives by this life: it only releases the cells of those before it."""
-        self._dead.append(self.life)
+        """States that no vehicle drives by this generation: it only releases the cells of those before it."""
+        self._dead.append(self.generation)
 
     # --- what is held ---------------------------------------------------------------------------------------
 
@@ -151,7 +151,7 @@ class Holdings:
 
     @property
     def pushed(self) -> Mapping[str, int]:
-        """Vehicle -> the age with which it is asked to make way into another plot, of those that are."""
+        """Vehicle -> the age with which it is asked to make way into another shard, of those that are."""
         if self._pushed is None:
             self._pushed = {}
             for view in self._views.values():
@@ -160,10 +160,10 @@ class Holdings:
         return self._pushed
 
     def occupied(self) -> set[int]:
-        """The cells that vehicles hold, of all to which one of ours at rest could go, as far as wardens tell."""
+        """The cells that vehicles hold, of all to which one of ours at rest could go, as far as leaders tell."""
         occupied = set(chain.from_iterable(self._paths.values()))
-        for plot in self.plots:
-            occupied |= self._views[plot].others
+        for shard in self.shards:
+            occupied |= self._views[shard].others
         return occupied
 
     def may_enter(self, vehicle: str, cell: int) -> bool:
@@ -214,67 +214,67 @@ class Holdings:
 
     def enter(self, vehicle: str, cell: int) -> None:
         """States the cell of a vehicle that has no place: its body is there, or it would enter there. If an earlier
-        life of ours held it, it takes it, and releases all others. The newest call counts."""
+        generation of ours held it, it takes it, and releases all others. The newest call counts."""
         if vehicle not in self._paths:
             self._entries.enter(vehicle, cell)
-            self.watch([self._plots.of(cell)])
+            self.watch([self._shards.of(cell)])
 
     def leave(self, vehicle: str) -> None:
         """It stands nowhere any more: give back all that it holds."""
         self._entries.leave(vehicle)
         self._paths.pop(vehicle, None)
         said = self._said.pop(vehicle, None)
-        for plot in () if said is None else said.stands:
-            del self._stands[plot][vehicle]
-            self._views[plot].same = False
+        for shard in () if said is None else said.stands:
+            del self._stands[shard][vehicle]
+            self._views[shard].same = False
 
     @property
     def gone(self) -> bool:
-        """True if no vehicle of ours holds or requests a cell, and all wardens that we contacted know it."""
-        return not (self.plots or self._entries.paths or self._entries.bodies)
+        """True if no vehicle of ours holds or requests a cell, and all leaders that we contacted know it."""
+        return not (self.shards or self._entries.paths or self._entries.bodies)
 
     @property
     def answered(self) -> bool:
-        """Returns True if a table of each plot that concerns us takes this life into account."""
-        return self.life > 0 and not self.replaced and all(self._views[plot].heard for plot in self.plots)
+        """Returns True if a table of each shard that concerns us takes this generation into account."""
+        return self.generation > 0 and not self.replaced and all(self._views[shard].heard for shard in self.shards)
 
     def is_granted(self, vehicle: str) -> bool:
         """Returns True if a table in use grants cells to a vehicle, which may have left them."""
         return any(vehicle in view.seen for view in self._views.values())
 
-    def waiting(self, plot: int) -> list[str]:
-        """The vehicles that have entries in a plot, as far as its table in use tells."""
-        return list(self._views[plot].seen) if plot in self._views else []
+    def waiting(self, shard: int) -> list[str]:
+        """The vehicles that have entries in a shard, as far as its table in use tells."""
+        return list(self._views[shard].seen) if shard in self._views else []
 
-    def heard_ns(self, plot: int) -> int:
-        """Time when a plot's warden was heard last; 0 if none was."""
-        return self._views[plot].heard_ns if plot in self._views else 0
+    def heard_ns(self, shard: int) -> int:
+        """Time when a shard's leader was heard last; 0 if none was."""
+        return self._views[shard].heard_ns if shard in self._views else 0
 
-    # --- what wardens say -----------------------------------------------------------------------------------
+    # --- what leaders say -----------------------------------------------------------------------------------
 
-    def watch(self, plots: Collection[int]) -> None:
-        """Makes these plots concern us, until they are seen to hold nothing of ours."""
-        for plot in plots:
-            self.plots.setdefault(plot)
-            self._views.setdefault(plot, _View())
+    def watch(self, shards: Collection[int]) -> None:
+        """Makes these shards concern us, until they are seen to hold nothing of ours."""
+        for shard in shards:
+            self.shards.setdefault(shard)
+            self._views.setdefault(shard, _View())
 
     def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """Act on what a warden says to us, if it is newer than what we know. Returns the vehicles that have found
+        """Act on what a leader says to us, if it is newer than what we know. Returns the vehicles that have found
         their place."""
-        view = self._views.setdefault(granted.plot, _View())
-        knows = self._entries.knows.get(granted.plot, BEFORE_ALL)
+        view = self._views.setdefault(granted.shard, _View())
+        knows = self._entries.knows.get(granted.shard, BEFORE_ALL)
         if granted.epoch > knows[0] + FURTHEST_EPOCH or granted.seq > _FURTHEST_SEQ:
             self.refused.append(f"{granted.agent} names a table that is implausibly far ahead: {granted.stamp}")
             return []
-        if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < knows:
+        if granted.agent != self._shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
-        view.warden, view.heard_ns = granted.agent, now_ns
-        self.newest = max(self.newest, granted.life)
-        if granted.life > self.life and not self.replaced:
+        view.leader, view.heard_ns = granted.agent, now_ns
+        self.newest = max(self.newest, granted.generation)
+        if granted.generation > self.generation and not self.replaced:
             self.replaced = True
             self._say_all_again()
-        if granted.stamp == knows or granted.life != self.life or self.replaced:
-            return []  # what it grants was granted to another life
+        if granted.stamp == knows or granted.generation != self.generation or self.replaced:
+            return []  # what it grants was granted to another generation
         view.heard, view.same = granted.heard, False
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
@@ -284,10 +284,10 @@ class Holdings:
             id: entries
             for id, entries in granted.grants.items()
             if (self._vehicles is None or id in self._vehicles)
-            and {self._plot_of(entry.cell) for entry in entries} == {granted.plot}
+            and {self._shard_of(entry.cell) for entry in entries} == {granted.shard}
         }
         before, view.seen = view.seen, {id: [entry.number for entry in entries] for id, entries in ours.items()}
-        changed = self._entries.hear_granted(granted.plot, granted.stamp, granted.life, ours)
+        changed = self._entries.hear_granted(granted.shard, granted.stamp, granted.generation, ours)
         self._seen_anew.update(changed, [id for id in before if before[id] != view.seen.get(id)])
         for vehicle in changed & self._paths.keys():
             self._set_path(vehicle)
@@ -312,42 +312,44 @@ class Holdings:
     # --- what to say ----------------------------------------------------------------------------------------
 
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
-        """Returns the statements for each plot that concerns us, if they are new or the last one is a beat old.
-        Cells that a statement omits are released."""
+        """Returns the statements for each shard that concerns us, if they are new or the last one is a heartbeat
+        old. Cells that a statement omits are released."""
         self._seq += 1
         self._say_changed(wishes)
-        by_plot = {plot: self._stands.get(plot, _NO_STANDS) for plot in self.plots}
-        by_plot.update((plot, stands) for plot, stands in self._stands.items() if stands)
+        by_shard = {shard: self._stands.get(shard, _NO_STANDS) for shard in self.shards}
+        by_shard.update((shard, stands) for shard, stands in self._stands.items() if stands)
         entries = self._entries
         for vehicle, cell in entries.bodies.items():
             if vehicle not in entries.paths:
-                self._say_entering(by_plot, self._plots.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0))
+                self._say_entering(
+                    by_shard, self._shards.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
+                )
         for vehicle, path in entries.paths.items():
             if vehicle not in self._paths:
                 cell, end = path[0].cell, path[-1].cell
-                for plot, held in entries.of(vehicle).items():
-                    self._say_entering(by_plot, plot, Stand(vehicle, cell, end, held, [], [cell], 1, 0))
-        self._forget_left(by_plot)
+                for shard, held in entries.of(vehicle).items():
+                    self._say_entering(by_shard, shard, Stand(vehicle, cell, end, held, [], [cell], 1, 0))
+        self._forget_left(by_shard)
         return [
-            Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for stand, _ in stands.values()]))
-            for plot, stands in by_plot.items()
-            if self._is_news(plot, stands, now_ns)
+            Tell(self._listeners(shard, now_ns), self._standing(shard, [stand for stand, _ in stands.values()]))
+            for shard, stands in by_shard.items()
+            if self._is_news(shard, stands, now_ns)
         ]
 
-    def _say_entering(self, by_plot: dict[int, Mapping[str, _Told]], plot: int, stand: Stand) -> None:
-        """States what a vehicle that is nowhere has and wants of a plot."""
-        by_plot[plot] = {**by_plot.get(plot, _NO_STANDS), stand.vehicle: (stand, stand)}
-        self._views.setdefault(plot, _View()).same = False
+    def _say_entering(self, by_shard: dict[int, Mapping[str, _Told]], shard: int, stand: Stand) -> None:
+        """States what a vehicle that is nowhere has and wants of a shard."""
+        by_shard[shard] = {**by_shard.get(shard, _NO_STANDS), stand.vehicle: (stand, stand)}
+        self._views.setdefault(shard, _View()).same = False
 
     def lefts(self, now_ns: int) -> list[Left]:
-        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a beat old."""
+        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a heartbeat old."""
         words: dict[str, list[Number]] = {}
-        for plot, view in self._views.items():
-            over = self._entries.over.get(plot, set())
+        for shard, view in self._views.items():
+            over = self._entries.over.get(shard, set())
             for host, numbers in view.followed.items():
                 told, told_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
-                if left and (left != told or not 0 <= now_ns - told_ns < BEAT_NS):
+                if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
@@ -366,48 +368,48 @@ class Holdings:
                 continue
             said = known[vehicle] = self._say(vehicle, path, wish)
             moved = moved or before is None or before.stands.keys() != said.stands.keys()
-            for plot, told in said.stands.items():
-                self._views.setdefault(plot, _View()).same = False
+            for shard, told in said.stands.items():
+                self._views.setdefault(shard, _View()).same = False
                 if not moved:
-                    self._stands[plot][vehicle] = told
+                    self._stands[shard][vehicle] = told
         anew.clear()
         if moved:
             self._say_all_again()
             self._stands = {}
             for vehicle in self._paths:
-                for plot, told in known[vehicle].stands.items():
-                    self._stands.setdefault(plot, {})[vehicle] = told
+                for shard, told in known[vehicle].stands.items():
+                    self._stands.setdefault(shard, {})[vehicle] = told
 
     def _say_all_again(self) -> None:
-        """Statements of all plots may change."""
+        """Statements of all shards may change."""
         for view in self._views.values():
             view.same = False
 
-    def _standing(self, plot: int, stands: list[Stand]) -> Standing:
-        return Standing(
-            plot=plot,
+    def _standing(self, shard: int, stands: list[Stand]) -> HostState:
+        return HostState(
+            shard=shard,
             agent=self._agent,
-            life=self.life,
+            generation=self.generation,
             seq=self._seq,
-            knows=self._entries.knows.get(plot, BEFORE_ALL),
+            knows=self._entries.knows.get(shard, BEFORE_ALL),
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
         )
 
-    def _listeners(self, plot: int, now_ns: int) -> tuple[str, ...]:
-        view = self._views[plot]
-        if view.warden and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
-            return (view.warden,)
-        return self._plots.members(plot)
+    def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
+        view = self._views[shard]
+        if view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+            return (view.leader,)
+        return self._shards.members(shard)
 
-    def _is_news(self, plot: int, stands: Mapping[str, _Told], now_ns: int) -> bool:
-        view = self._views[plot]
-        lately = 0 <= now_ns - view.told_ns < BEAT_NS
+    def _is_news(self, shard: int, stands: Mapping[str, _Told], now_ns: int) -> bool:
+        view = self._views[shard]
+        lately = 0 <= now_ns - view.told_ns < HEARTBEAT_NS
         if not view.same:
             # An entry that we do not hold is freed only if we state so, knowing that table.
             in_step = view.seen == {id: stand.holds for id, (stand, _) in stands.items() if stand.holds}
-            stamp = self._entries.knows.get(plot, BEFORE_ALL)
+            stamp = self._entries.knows.get(shard, BEFORE_ALL)
             knows = stamp[0] if in_step else stamp
             told = (self.replaced, knows, [news for _, news in stands.values()])
             lately = lately and told == view.told
@@ -421,31 +423,31 @@ class Holdings:
         ahead, wants, better = [*wish.ahead], list[int](), 0
         if len(path) == 1:
             wants, better = [*wish.wants], wish.better
-        plot_of = self._plot_of
+        shard_of = self._shard_of
         concerned = [*path, *ahead[:1], *wants]
-        near: Collection[int] = {*map(plot_of, concerned)}
+        near: Collection[int] = {*map(shard_of, concerned)}
         if len(near) > 1:
-            near = dict.fromkeys(plot for plot in map(plot_of, concerned) if plot >= 0)
+            near = dict.fromkeys(shard for shard in map(shard_of, concerned) if shard >= 0)
         stands: dict[int, _Told] = {}
         held = [entry.number for entry in self._entries.paths[vehicle]]
-        for plot in near:
-            holds = held if len(near) == 1 else [number for number in held if plot_of(number[0]) == plot]
+        for shard in near:
+            holds = held if len(near) == 1 else [number for number in held if shard_of(number[0]) == shard]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms)
-            stands[plot] = stand, (vehicle, path[0], holds, ahead, better)
+            stands[shard] = stand, (vehicle, path[0], holds, ahead, better)
         return _Said(wish, path, stands)
 
-    def _forget_left(self, by_plot: Mapping[int, Mapping[str, _Told]]) -> None:
-        """Leaves the plots where we hold and want nothing, once their tables show that they know it."""
-        for plot, stands in by_plot.items():
-            view = self._views.setdefault(plot, _View())
+    def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
+        """Leaves the shards where we hold and want nothing, once their tables show that they know it."""
+        for shard, stands in by_shard.items():
+            view = self._views.setdefault(shard, _View())
             if stands:
                 view.quiet = None
             elif view.quiet is None:
                 view.quiet = self._seq
-        self.plots = {
-            plot: None
-            for plot in by_plot
-            if (quiet := self._views[plot].quiet) is None
-            or self._views[plot].heard < quiet
-            or self._views[plot].seen
+        self.shards = {
+            shard: None
+            for shard in by_shard
+            if (quiet := self._views[shard].quiet) is None
+            or self._views[shard].heard < quiet
+            or self._views[shard].seen
         }

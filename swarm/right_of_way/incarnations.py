@@ -11,51 +11,52 @@ from swarm.config.input_files import FileKind
 from swarm.files import writing
 from swarm.journal import Journal
 
-BEAT_NS = NS_PER_S // 5
-"""Period at which an unchanged statement is repeated: by it members know of a warden, and a warden of its hosts."""
+HEARTBEAT_NS = NS_PER_S // 5
+"""Period at which an unchanged statement is repeated: by it members know of a leader, and a leader of its hosts."""
 FURTHEST_EPOCH = 3 << 20
 """No run advances by this number of epochs while one process does not receive them."""
-_LIFE_BITS = 32
-"""Bits of chance in a life's number, by which two that begin at once differ."""
-_FURTHEST_LIFE = 1 << 16
+_GENERATION_BITS = 32
+"""Bits of chance in a generation's number, by which two that begin at once differ."""
+_FURTHEST_GENERATION = 1 << 16
 """Restarts of a host beyond the known number, which no host reaches in a run."""
 
 
-def first_life(after: int, chance: int) -> int:
-    """A new life's number: greater than all that are known. If two begin at the same time, chance decides."""
-    return ((after >> _LIFE_BITS) + 1 << _LIFE_BITS) | (chance & 0xFFFF_FFFF)
+def first_generation(after: int, chance: int) -> int:
+    """A new generation's number: greater than all that are known. If two begin at the same time, chance decides."""
+    return ((after >> _GENERATION_BITS) + 1 << _GENERATION_BITS) | (chance & 0xFFFF_FFFF)
 
 
-def is_far_ahead(life: int, known: int) -> bool:
+def is_far_ahead(generation: int, known: int) -> bool:
     """Returns True if a number is too high to be explained by restarts."""
-    return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
+    return generation >> _GENERATION_BITS > (known >> _GENERATION_BITS) + _FURTHEST_GENERATION
 
 
 _SIZE_BYTES = 1 << 13
-"""Space for some 30 starts of a guest before its file is written again."""
-_LIFE = struct.Struct("<Q")
+"""Space for some 30 starts of an external vehicle before its file is written again."""
+_GENERATION = struct.Struct("<Q")
 
 
-class MemoryLives:
-    """The lives of a guest that have begun here, the oldest first: by them a new life proves that those before it
-    have ended.
+class MemoryGenerations:
+    """The lives of an external vehicle that have begun here, the oldest first: by them a new generation proves that
+    those before it have ended.
 
-    These survive a simulated process, not this one. Cells granted to a forgotten life stay shut until an operator
-    removes it.
+    These survive a simulated process, not this one. Cells granted to a forgotten generation stay shut until an
+    operator removes it.
     """
 
     def __init__(self) -> None:
-        self.lives: list[int] = []
+        self.generations: list[int] = []
 
-    def save(self, lives: Sequence[int]) -> None:
-        self.lives = list(lives)
+    def save(self, generations: Sequence[int]) -> None:
+        self.generations = list(generations)
 
     def close(self) -> None:
         """Gives it to another process."""
 
 
-class LifeFile(MemoryLives):
-    """A journal of lives, locked for as long as the process lives: so an earlier life that ran on it has ended.
+class GenerationFile(MemoryGenerations):
+    """A journal of generations, locked for as long as the process lives: so an earlier generation that ran on it
+    has ended.
 
     Raises StoreError if the file is in use, is damaged or cannot be written.
     """
@@ -66,32 +67,32 @@ class LifeFile(MemoryLives):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._journal = Journal(
             path,
-            FileKind.LIVES,
-            lambda: [_encoded(self.lives)],
+            FileKind.GENERATIONS,
+            lambda: [_encoded(self.generations)],
             _older,
             size=_SIZE_BYTES,
             in_use="by this vehicle, which has right of way here already",
         )
         for body in self._journal.found:
-            self.lives = [number for (number,) in _LIFE.iter_unpack(body)]
+            self.generations = [number for (number,) in _GENERATION.iter_unpack(body)]
         self._journal.begin()
 
-    def save(self, lives: Sequence[int]) -> None:
-        super().save(lives)
-        self._journal.append(_encoded(lives))
+    def save(self, generations: Sequence[int]) -> None:
+        super().save(generations)
+        self._journal.append(_encoded(generations))
         self._journal.sync()
 
     def close(self) -> None:
         self._journal.close()
 
 
-def _encoded(lives: Sequence[int]) -> bytes:
-    return b"".join(map(_LIFE.pack, lives))
+def _encoded(generations: Sequence[int]) -> bytes:
+    return b"".join(map(_GENERATION.pack, generations))
 
 
 def _older(data: bytes) -> list[bytes]:
     """The lives in a file from before journals: one number a line."""
-    lives = [int(line) for line in data.decode("ascii").splitlines()]
-    if not lives or not all(0 < life < 1 << 63 for life in lives):
+    generations = [int(line) for line in data.decode("ascii").splitlines()]
+    if not generations or not all(0 < generation < 1 << 63 for generation in generations):
         raise ValueError(repr(data[:40]))
-    return [_encoded(lives)]
+    return [_encoded(generations)]

@@ -1,4 +1,4 @@
-"""Plots, the squares of the map in which right of way is decided, and the agents that decide it."""
+"""Shards, the squares of the map in which right of way is decided, and the agents that decide it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ from collections.abc import Collection, Sequence
 from hashlib import blake2s
 
 from swarm.errors import ConfigError
-from swarm.grid import MOST_PLOT_REGIONS, MOST_PLOTS, REGION_CELLS, GridSpec
+from swarm.grid import MOST_SHARD_REGIONS, MOST_SHARDS, REGION_CELLS, GridSpec
 
-MOST_PLOTS_AN_AGENT = 8
-"""With few plots for each agent some are wardens of much more than others; many cost messages."""
+MOST_SHARDS_AN_AGENT = 8
+"""With few shards for each agent some are leaders of much more than others; many cost messages."""
 _LAYERS = 2
 """The ground and the air."""
 FEWEST_FOR_MAJORITY = 3
-"""Members of a plot; a layer of fewer agents has one for each plot."""
+"""Members of a shard; a layer of fewer agents has one for each shard."""
 
 
 def fitting_regions(rows: int, cols: int, agents: int) -> int:
-    """Returns the least side of a plot, in regions, at which a grid has no more plots than these agents can use."""
+    """Returns the least side of a shard, in regions, at which a grid has no more shards than these agents can
+    use."""
     regions = 1
-    while _count(rows, cols, regions * REGION_CELLS) > MOST_PLOTS_AN_AGENT * agents and regions < MOST_PLOT_REGIONS:
+    while (
+        _count(rows, cols, regions * REGION_CELLS) > MOST_SHARDS_AN_AGENT * agents and regions < MOST_SHARD_REGIONS
+    ):
         regions += 1
     return regions
 
@@ -29,25 +32,25 @@ def _count(rows: int, cols: int, side: int) -> int:
     return -(-rows // side) * -(-cols // side)
 
 
-class Plots:
-    """The plots of a grid and their members. Both follow from the grid, the agents and the side alone, so processes
-    with the same side agree.
+class Shards:
+    """The shards of a grid and their members. Both follow from the grid, the agents and the side alone, so
+    processes with the same side agree.
 
-    The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998). With
+    The members of a shard are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998). With
     fewer than three agents there is one member: a majority of two would need both to be alive.
 
-    Ground and air are two layers, with plots and agents of their own: no vehicle in one requests, holds or waits
+    Ground and air are two layers, with shards and agents of their own: no vehicle in one requests, holds or waits
     for anything in the other.
 
     agents  those of the layer
-    side    side of a plot in cells: `map.plot_regions` times 256. Each plot has its own messages, so smaller plots
-            mean more messages
+    side    side of a shard in cells: `map.shard_regions` times 256. Each shard has its own messages, so smaller
+            shards mean more messages
     layer   0 is the ground, 1 the air
-    others  the agents of the other layer: no guest may take their names
+    others  the agents of the other layer: no external vehicle may take their names
 
-    all    the numbers of the layer's plots. Plots of different sizes have different numbers, so a statement about a
-           plot of another size is ignored and cannot release cells
-    spare  how many agents may use another plot size while agents with this size act as members (for plots larger
+    all    the numbers of the layer's shards. Shards of different sizes have different numbers, so a statement about
+           a shard of another size is ignored and cannot release cells
+    spare  how many agents may use another shard size while agents with this size act as members (for shards larger
            than a region, see `has_quorum`)
 
     Raises ConfigError where the numbers of so narrow a grid do not fit into a message.
@@ -73,16 +76,16 @@ class Plots:
         smaller = sum(_count(grid.rows, grid.cols, n * REGION_CELLS) for n in range(1, side // REGION_CELLS))
         self._first = _LAYERS * smaller + layer * self.count
         self.all = range(self._first, self._first + self.count)
-        if smaller and self.all.stop > MOST_PLOTS:
+        if smaller and self.all.stop > MOST_SHARDS:
             raise ConfigError(
-                f"map.plot_regions is {side // REGION_CELLS}: a grid of {grid.rows} x {grid.cols} cells is too"
-                " narrow for plots larger than a region"
+                f"map.shard_regions is {side // REGION_CELLS}: a grid of {grid.rows} x {grid.cols} cells is too"
+                " narrow for shards larger than a region"
             )
         self.majority = 2 if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
         self.spare = FEWEST_FOR_MAJORITY - 1 if self.majority > 1 else 0
 
     def of(self, cell: int) -> int:
-        """The plot of a cell; -1 of a cell outside the grid."""
+        """The shard of a cell; -1 of a cell outside the grid."""
         if not 0 <= cell < self._cells:
             return -1
         cols, side = self._cols, self.side
@@ -91,21 +94,21 @@ class Plots:
     def has_quorum(self, agents: Collection[str]) -> bool:
         """Returns True if no other layout can have seats, given that these agents use this one.
 
-        Three agents make a seat in a plot of one region, independent of the others. Larger plots therefore need so
-        many agents that fewer than three are left, or all agents if one makes a seat by itself.
+        Three agents make a seat in a shard of one region, independent of the others. Larger shards therefore need
+        so many agents that fewer than three are left, or all agents if one makes a seat by itself.
         """
         return self.side <= REGION_CELLS or len(set(self.agents).difference(agents)) <= self.spare
 
-    def members(self, plot: int) -> tuple[str, ...]:
-        members = self._members.get(plot)
+    def members(self, shard: int) -> tuple[str, ...]:
+        members = self._members.get(shard)
         if members is None:
-            by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
-            members = self._members[plot] = tuple(by_hash[: FEWEST_FOR_MAJORITY if self.majority > 1 else 1])
+            by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{shard}/{agent}".encode()).digest())
+            members = self._members[shard] = tuple(by_hash[: FEWEST_FOR_MAJORITY if self.majority > 1 else 1])
         return members
 
-    def warden(self, plot: int, epoch: int) -> str:
-        """The only member that may be warden in an epoch."""
-        members = self.members(plot)
+    def leader(self, shard: int, epoch: int) -> str:
+        """The only member that may be leader in an epoch."""
+        members = self.members(shard)
         return members[epoch % len(members)]
 
     def adjacent(self, one: int, other: int) -> bool:

@@ -4,7 +4,7 @@ One thread owns the state of a service (`process`); all others post to its `inbo
 and answers in time under overload. Mechanisms of every role:
 
 `membership`     Shows that the process is alive, compares runs, publishes counters (`stats`) and alarms.
-`election`       Decides which of several processes with one job leads: by rank, beats and a lease.
+`election`       Decides which of several processes with one job leads: by rank, heartbeats and a lease.
 `order_book`     Holds what operators have ordered. `order_client` is the side of those who obey, `operator` that of
                  those who order.
 `tracking`       Decides which of several trackers owns a target.

@@ -1,4 +1,4 @@
-"""Election of a leader among the processes with one job: by rank, beats and a lease.
+"""Election of a leader among the processes with one job: by rank, heartbeats and a lease.
 
 Leader election as in Garcia-Molina's bully algorithm, without its messages: ranks are fixed, and everybody tells
 the others regularly whether it is ready and whether it leads. `Leadership` decides and is pure; `Candidacy` is its
@@ -15,13 +15,13 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.processes import Beat
+from swarm.wire.messages.processes import Heartbeat
 from swarm.wire.topics import LEAD
 
-BEAT_NS = NS_PER_S // 10
-"""Time between two beats of a candidate: one message of some 50 bytes, ten times a second
+HEARTBEAT_NS = NS_PER_S // 10
+"""Time between two heartbeats of a candidate: one message of some 50 bytes, ten times a second
 (docs/design/leader-and-standby.md)."""
-LEASE_NS = 6 * BEAT_NS
+LEASE_NS = 6 * HEARTBEAT_NS
 """A leader that has been silent for so long is replaced."""
 SETTLED_NS = 2 * NS_PER_S
 """A better process takes over from a ready leader once it has been there and ready for so long. A process that was
@@ -30,12 +30,12 @@ _MOST_OTHERS = 64
 """Lives of other candidates that are remembered."""
 
 _Order = tuple[bool, int, int]
-"""The lower, the better: not ready, rank, older life."""
+"""The lower, the better: not ready, rank, older generation."""
 
 
 @dataclass(slots=True)
 class _Other:
-    """The last beat of another candidate, and when it was heard."""
+    """The last heartbeat of another candidate, and when it was heard."""
 
     order: _Order
     leads: bool
@@ -45,18 +45,18 @@ class _Other:
 class Leadership:
     """One candidate's view of who leads.
 
-    - A leader stops when it receives beats of a better-ranked leader. Better is: ready, then of lower rank, then
-      the younger life.
-    - A candidate that receives no leader's beat for one lease takes over, unless a better-ranked candidate is
+    - A leader stops when it receives heartbeats of a better-ranked leader. Better is: ready, then of lower rank,
+      then the younger generation.
+    - A candidate that receives no leader's heartbeat for one lease takes over, unless a better-ranked candidate is
       alive, which does so itself.
     - A candidate that receives a worse-ranked leader takes over once it has been ready for `SETTLED_NS`, or for a
       lease if that one is not ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
 
     All periods are measured on a clock that counts at most half a lease between two ticks. While this process
-    stalls, beats of others wait unread, and no process is considered dead because of that.
+    stalls, heartbeats of others wait unread, and no process is considered dead because of that.
 
-    alone    there is no other candidate: this one leads, always
+    alone      there is no other candidate: this one leads, always
     period_ns  time between two ticks
     """
 
@@ -76,21 +76,21 @@ class Leadership:
         self._better_since_ns: int | None = None
         """Since when this has been ready while a worse one leads; None if it is not so."""
         self._others: dict[tuple[int, int], _Other] = {}
-        """(rank, incarnation) -> its last beat. Forgotten after a lease."""
+        """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
 
-    def on_beat(self, beat: Beat, now_ns: int) -> None:
+    def on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
         """Takes in what another candidate says."""
-        rank = split_rank(beat.id)[1]
-        key = (rank, beat.incarnation)
+        rank = split_rank(heartbeat.id)[1]
+        key = (rank, heartbeat.incarnation)
         if key == (self._rank, self._incarnation):
             return
         if key not in self._others and len(self._others) >= _MOST_OTHERS:
             return
         heard_ns = self._awake_ns + self._counted(now_ns)
         before = self._others.get(key)
-        order = _order(beat.ready, rank, beat.incarnation)
-        self._others[key] = _Other(order, beat.leads, heard_ns)
-        if beat.leads:
+        order = _order(heartbeat.ready, rank, heartbeat.incarnation)
+        self._others[key] = _Other(order, heartbeat.leads, heard_ns)
+        if heartbeat.leads:
             self._led_ns = heard_ns
         elif before is not None and before.leads:
             self._led_ns = heard_ns - self.lease_ns  # it has stopped: there is nothing to wait for
@@ -147,7 +147,7 @@ log = logging.getLogger(__name__)
 
 
 class Candidacy:
-    """Beats for one process, and `Leadership` fed with those of the others of its job.
+    """Heartbeats for one process, and `Leadership` fed with those of the others of its job.
 
     standbys  how many others there are by the scenario; with none it leads and says nothing
     """
@@ -159,22 +159,22 @@ class Candidacy:
         self._post = post
         self._core = Leadership(setup.id, setup.incarnation, alone=standbys == 0, period_ns=int(NS_PER_S / tick_hz))
         self._due_ns = 0
-        """Time of the next beat; a change of the leader is published immediately."""
+        """Time of the next heartbeat; a change of the leader is published immediately."""
 
     @property
     def leads(self) -> bool:
         return self._core.leads
 
     def start(self) -> None:
-        """Listens to all candidates of this job, other lives of this id among them."""
+        """Listens to all candidates of this job, other generations of this id among them."""
         for rank in range(self._standbys + 1 if self._standbys else 0):
             id = ranked_id(job_of(self._setup.id), rank)
             self._bus.subscribe(LEAD, self._post, role=self._setup.role, id=id)
 
     def on_election_event(self, event: Event, now_ns: int) -> bool:
-        """Returns True if the event was a beat, which needs no other handler."""
-        if isinstance(event, Heard) and isinstance(event.message, Beat):
-            self._core.on_beat(event.message, now_ns)
+        """Returns True if the event was a heartbeat, which needs no other handler."""
+        if isinstance(event, Heard) and isinstance(event.message, Heartbeat):
+            self._core.on_heartbeat(event.message, now_ns)
             return True
         return False
 
@@ -183,8 +183,10 @@ class Candidacy:
         before = self._core.leads
         leads = self._core.tick(ready, now_ns)
         if self._standbys and (leads != before or now_ns >= self._due_ns):
-            self._due_ns = now_ns + BEAT_NS - BEAT_NS // 10  # ticks of the same period come a little early or late
-            self._beat(ready, leads)
+            self._due_ns = (
+                now_ns + HEARTBEAT_NS - HEARTBEAT_NS // 10
+            )  # ticks of the same period come a little early or late
+            self._heartbeat(ready, leads)
         return leads
 
     def tell(self, member: Member, now_ns: int) -> None:
@@ -198,9 +200,9 @@ class Candidacy:
     def stop(self) -> None:
         """Makes another take over immediately."""
         if self._standbys:
-            self._beat(False, False)
+            self._heartbeat(False, False)
 
-    def _beat(self, ready: bool, leads: bool) -> None:
+    def _heartbeat(self, ready: bool, leads: bool) -> None:
         setup = self._setup
-        beat = Beat(role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads)
-        self._bus.publish(LEAD, beat, role=setup.role, id=setup.id)
+        heartbeat = Heartbeat(role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads)
+        self._bus.publish(LEAD, heartbeat, role=setup.role, id=setup.id)

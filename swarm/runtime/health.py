@@ -108,7 +108,7 @@ _WRITE_NS = NS_PER_S // 10
 """Least time between two records without news: a hundredth of `HUNG_S`, by which readers judge."""
 _LONGEST_NEED = 100
 """Characters of one need: a line in a terminal."""
-LIFE_BEFORE = "the end of the life before it"
+GENERATION_BEFORE = "the end of the generation before it"
 """Need of a process that was started to follow one which still runs."""
 
 

@@ -19,7 +19,7 @@ from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS, Topic, asker_of
 from swarm.wire.versions import are_neighbours
 
-_MOST_STANDING, _MOST_OVER = 40, 20
+_MOST_HOST_STATES, _MOST_OVER = 40, 20
 """Alarms in a `Stats`, which has to stay a small message: it is sent each second."""
 
 
@@ -31,7 +31,8 @@ class Alarms:
 
     def __init__(self, before: Iterable[Alarm] = ()) -> None:
         self._standing: dict[tuple[str, str], Alarm] = {}
-        """(kind, about) -> what lasts. An alarm of an earlier life has ended: this life raises it again."""
+        """(kind, about) -> what lasts. An alarm of an earlier generation has ended: this generation raises it
+        again."""
         self._over: deque[Alarm] = deque((each for each in before if each.over_ns is not None), maxlen=_MOST_OVER)
 
     def happened(
@@ -50,7 +51,7 @@ class Alarms:
     ) -> None:
         """Something lasts from now on; said again, only its words and its place change."""
         known = self._standing.get((kind, about))
-        if known is None and len(self._standing) >= _MOST_STANDING:
+        if known is None and len(self._standing) >= _MOST_HOST_STATES:
             return
         since_ns = now_ns if known is None else known.since_ns
         self._standing[kind, about] = Alarm(
@@ -94,7 +95,7 @@ class Member:
 
     A process asks all others for their run when it starts, whenever a link comes back and whenever a router
     appears, as behind it there may be others. Two processes belong together when run id, terrain digest, the side
-    of plots and the classes of vehicles, in their order, are the same, and their builds speak neighbouring wire
+    of shards and the classes of vehicles, in their order, are the same, and their builds speak neighbouring wire
     versions; each is then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs.
     A confirmed one never exits because of an answer; it reports the sender as a stranger: counts it, and names it
     once.
@@ -103,7 +104,7 @@ class Member:
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
         self.info = info
         self._before = before
-        """Counts of earlier lives of this process, which late subscribers receive, too."""
+        """Counts of earlier generations of this process, which late subscribers receive, too."""
         self.alarms = Alarms(() if before is None else before.alarms)
         """Alarms for people that watch the run."""
         self.counters = Counters()
@@ -343,10 +344,10 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
             f"{mine.role} {mine.id} has terrain {mine.terrain} ({mine.rows} x {mine.cols}), but {who} has "
             f"{other.terrain} ({other.rows} x {other.cols}): terrain files or cost rules differ"
         )
-    if other.plot_cells != mine.plot_cells:
+    if other.shard_cells != mine.shard_cells:
         raise RunMismatchError(
-            f"{mine.role} {mine.id} has plots of right of way of {mine.plot_cells} cells a side, but {who} has "
-            f"{other.plot_cells}: map.plot_regions differs, or was set by a version that does not know it"
+            f"{mine.role} {mine.id} has shards of right of way of {mine.shard_cells} cells a side, but {who} has "
+            f"{other.shard_cells}: map.shard_regions differs, or was set by a version that does not know it"
         )
     if other.classes != mine.classes:
         raise RunMismatchError(

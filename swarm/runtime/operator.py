@@ -52,7 +52,7 @@ _LEAVE_S = 0.3
 _MOST_REPLIES = 1 << 16
 """More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
 _MOST_SEEN = 1 << 12
-"""The holder of a certificate may raise tokens of any number of lives, one after the other."""
+"""The holder of a certificate may raise tokens of any number of generations, one after the other."""
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,14 @@ from swarm.wire.messages.processes import RunInfo, Stats
 class RoleSetup:
     """One process of a run.
 
-    incarnation  nanoseconds at its start: a later start of the same (role, id) has a larger one
-    started_ns   start of the run
-    run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
-    added        of an agent that the scenario does not name: what it hosts
-    restarts     how often it was started before in this run
-    before       what its earlier lives have counted; None if that is not known
-    anew         True if the run begins with it: there was no earlier life of it
-    takes_over   whether the life before it may still run on this machine, and ends soon
+    incarnation    nanoseconds at its start: a later start of the same (role, id) has a larger one
+    started_ns     start of the run
+    run_dir        where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
+    added          of an agent that the scenario does not name: what it hosts
+    restarts       how often it was started before in this run
+    before         what its earlier generations have counted; None if that is not known
+    anew           True if the run begins with it: there was no earlier generation of it
+    takes_over     whether the generation before it may still run on this machine, and ends soon
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     health         receives the health of its loop; None: no reports
     """
@@ -68,7 +68,7 @@ class RoleSetup:
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
             wire_version=WIRE_VERSION,
-            plot_cells=self.scenario.map.plot_regions * REGION_CELLS,
+            shard_cells=self.scenario.map.shard_regions * REGION_CELLS,
         )
 
     @property

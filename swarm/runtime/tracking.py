@@ -35,7 +35,7 @@ SAME_NS = 3 * NS_PER_S // 4
 """Receivers measure when a tracker began as exactly as they look, which is at their ticks."""
 LONGEST_AGE_NS = 366 * 86_400 * NS_PER_S
 """A tracker that has tracked for longer has no clock, or gives no time as its incarnation: others come first."""
-MOST_LIVES = 16
+MOST_GENERATIONS = 16
 """Limit for the remembered trackers of one target. Of more living trackers the youngest are refused."""
 _MOST_TARGETS = 4096
 """Limit for the targets that are remembered: any process that may put poses can make up any number."""
@@ -55,7 +55,7 @@ class Verdict(Enum):
 
 
 @dataclass(slots=True, eq=False)
-class _Life:
+class _Generation:
     """One incarnation of a tracker, as of its newest pose.
 
     began_ns  when it began to track, by the receiver's clock; None if it does not tell
@@ -85,7 +85,7 @@ class Tracking:
         self._grid = grid
         self._until_ns = 0
         """Time when the last lease ends."""
-        self._lives: dict[tuple[str | None, int], _Life] = {}
+        self._generations: dict[tuple[str | None, int], _Generation] = {}
         """Includes ended lives, so that late poses are recognised."""
 
     def lost(self, now_ns: int) -> bool:
@@ -103,22 +103,27 @@ class Tracking:
         if not 0 <= pose.cell < self._grid.cells:
             return Verdict.OUTSIDE
         key = (pose.tracker, pose.incarnation)
-        life = self._lives.get(key)
-        if life is not None and _is_late(pose.seq, life, now_ns):
+        generation = self._generations.get(key)
+        if generation is not None and _is_late(pose.seq, generation, now_ns):
             return Verdict.LATE
         began_ns = _began_ns(pose, now_ns)
-        if life is not None and life.began_ns is not None and began_ns is not None and now_ns < life.until_ns:
-            began_ns = min(began_ns, life.began_ns)  # the one that came quickest tells best
+        if (
+            generation is not None
+            and generation.began_ns is not None
+            and began_ns is not None
+            and now_ns < generation.until_ns
+        ):
+            began_ns = min(began_ns, generation.began_ns)  # the one that came quickest tells best
         hands_over = pose.lease_s == 0
         until_ns = now_ns + (1 if hands_over else int(pose.lease_s * NS_PER_S))
-        self._lives[key] = _Life(pose.tracker, pose.incarnation, pose.seq, now_ns, until_ns, began_ns)
-        if len(self._lives) > MOST_LIVES:
+        self._generations[key] = _Generation(pose.tracker, pose.incarnation, pose.seq, now_ns, until_ns, began_ns)
+        if len(self._generations) > MOST_GENERATIONS:
             self._forget_one(now_ns)
         owner = self._owner(now_ns)
-        counts = owner is not None and owner is self._lives.get(key)
-        if hands_over and key in self._lives:
-            self._lives[key].until_ns = now_ns
-        self._until_ns = max(life.until_ns for life in self._lives.values())
+        counts = owner is not None and owner is self._generations.get(key)
+        if hands_over and key in self._generations:
+            self._generations[key].until_ns = now_ns
+        self._until_ns = max(generation.until_ns for generation in self._generations.values())
         if not counts:
             return Verdict.REFUSED
         self.pose, self.heard_ns = pose, now_ns
@@ -131,17 +136,21 @@ class Tracking:
             self.pose, self.heard_ns = pose, now_ns
             self._until_ns = now_ns + int(pose.lease_s * NS_PER_S)
 
-    def _owner(self, now_ns: int) -> _Life | None:
-        return _oldest([life for life in self._lives.values() if now_ns < life.until_ns])
+    def _owner(self, now_ns: int) -> _Generation | None:
+        return _oldest([generation for generation in self._generations.values() if now_ns < generation.until_ns])
 
     def _forget_one(self, now_ns: int) -> None:
         """The one that ended first, else the youngest."""
-        ended = [(life.until_ns, key) for key, life in self._lives.items() if now_ns >= life.until_ns]
+        ended = [
+            (generation.until_ns, key)
+            for key, generation in self._generations.items()
+            if now_ns >= generation.until_ns
+        ]
         if ended:
-            del self._lives[min(ended, key=lambda each: each[0])[1]]
+            del self._generations[min(ended, key=lambda each: each[0])[1]]
             return
-        youngest = max(self._lives, key=lambda key: _age_order(self._lives[key]))
-        del self._lives[youngest]
+        youngest = max(self._generations, key=lambda key: _age_order(self._generations[key]))
+        del self._generations[youngest]
 
 
 class Trackings:
@@ -179,10 +188,10 @@ class Trackings:
         return {id for id, tracking in self._of.items() if tracking.lost(now_ns)}
 
 
-def _is_late(seq: int, life: _Life, now_ns: int) -> bool:
+def _is_late(seq: int, generation: _Generation, now_ns: int) -> bool:
     """Same rule as in `swarm.liveness.Newest`: after a silence any other number counts as new, so that no pose
     outweighs all later ones."""
-    return seq == life.seq or (seq < life.seq and now_ns - life.heard_ns < POSE_SILENCE_NS)
+    return seq == generation.seq or (seq < generation.seq and now_ns - generation.heard_ns < POSE_SILENCE_NS)
 
 
 def _began_ns(pose: TargetPose, now_ns: int) -> int | None:
@@ -190,28 +199,28 @@ def _began_ns(pose: TargetPose, now_ns: int) -> int | None:
     return now_ns - age_ns if 0 <= age_ns <= LONGEST_AGE_NS else None
 
 
-def _oldest(living: list[_Life]) -> _Life | None:
+def _oldest(living: list[_Generation]) -> _Generation | None:
     """The owner among those who live."""
-    speakers: dict[Hashable, _Life] = {}
-    for life in living:
-        name = life.incarnation if life.name is None else life.name
+    speakers: dict[Hashable, _Generation] = {}
+    for generation in living:
+        name = generation.incarnation if generation.name is None else generation.name
         known = speakers.get(name)
-        if known is None or life.incarnation > known.incarnation:
-            speakers[name] = life
+        if known is None or generation.incarnation > known.incarnation:
+            speakers[name] = generation
     if len(speakers) < 2:
         return next(iter(speakers.values()), None)
-    told = [life.began_ns for life in speakers.values() if life.began_ns is not None]
+    told = [generation.began_ns for generation in speakers.values() if generation.began_ns is not None]
     first_ns = min(told, default=None)
-    elders = [life for life in speakers.values() if _is_elder(life, first_ns)]
-    return min(elders, key=lambda life: life.order)
+    elders = [generation for generation in speakers.values() if _is_elder(generation, first_ns)]
+    return min(elders, key=lambda generation: generation.order)
 
 
-def _is_elder(life: _Life, first_ns: int | None) -> bool:
+def _is_elder(generation: _Generation, first_ns: int | None) -> bool:
     """Returns True if no tracker began clearly before it."""
     if first_ns is None:
         return True  # of none is it known when it began
-    return life.began_ns is not None and life.began_ns - first_ns < SAME_NS
+    return generation.began_ns is not None and generation.began_ns - first_ns < SAME_NS
 
 
-def _age_order(life: _Life) -> tuple[bool, int, tuple[bool, str, int]]:
-    return life.began_ns is None, life.began_ns or 0, life.order
+def _age_order(generation: _Generation) -> tuple[bool, int, tuple[bool, str, int]]:
+    return generation.began_ns is None, generation.began_ns or 0, generation.order

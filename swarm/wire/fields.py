@@ -24,7 +24,7 @@ import msgspec
 from msgspec import Meta
 
 from swarm.errors import ConfigError, missing
-from swarm.grid import MOST_PLOTS
+from swarm.grid import MOST_SHARDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -102,7 +102,7 @@ Natural = Annotated[int, Meta(ge=0, lt=1 << 62)]
 StampNs = Annotated[int, Meta(ge=0, lt=1 << 62)]
 """A time in ns since 1970, or since a simulation began. The bound is in the year 2116."""
 Incarnation = Annotated[int, Meta(ge=0, lt=1 << 62)]
-"""The time at which a process started, which tells its lives apart."""
+"""The time at which a process started, which tells its generations apart."""
 Count = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of occurrences, exact in a float64."""
 Metres = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -146,8 +146,8 @@ Tile = Annotated[int, Meta(ge=0, lt=1 << 22)]
 """A tile of the largest grid."""
 Region = Annotated[int, Meta(ge=0, lt=1 << 16)]
 """A region of the largest grid."""
-Plot = Annotated[int, Meta(ge=0, lt=MOST_PLOTS)]
-"""A plot of the largest grid, on the ground or in the air."""
+Shard = Annotated[int, Meta(ge=0, lt=MOST_SHARDS)]
+"""A shard of the largest grid, on the ground or in the air."""
 
 ZERO_BUCKET = -20_000
 """Histogram bucket of zero and below; the smallest float has a higher one."""

@@ -34,23 +34,25 @@ and of files and of marks that were asked for."""
 class Topic:
     """One topic.
 
-    key        template below the namespace; `{name}` stands for one chunk
-    message    the published message, or the reply to a query
-    what       its meaning, for `docs/reference/wire.md`
-    rate       how often it is put or asked, for `docs/reference/wire.md`
-    access     which roles may put, serve, ask and hear it
-    request    for a queryable: the query; None for a topic that is only published
-    bulk       for a queryable: a message that carries many values, if the request asks for it
-    costly     for a queryable: askers take turns, by the field `asker` of the key; agents come before all others
-    published  whether values are put, not only answered
-    trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
-    trusted_in  part of those keys on which the same holds, where it does not hold on all
-    newest     each value carries the whole state of its key, so a reader may skip to the newest
-    echoed     whether a process that puts and subscribes hears what it has put itself
-    buffer     samples that wait for a slow reader; the oldest are dropped first
-    put_bytes  limit of a published payload; a longer one is rejected unread, as are questions and answers
+    key                      template below the namespace; `{name}` stands for one chunk
+    message                  the published message, or the reply to a query
+    what                     its meaning, for `docs/reference/wire.md`
+    rate                     how often it is put or asked, for `docs/reference/wire.md`
+    access                   which roles may put, serve, ask and hear it
+    request                  for a queryable: the query; None for a topic that is only published
+    bulk                     for a queryable: a message that carries many values, if the request asks for it
+    costly                   for a queryable: askers take turns, by the field `asker` of the key; agents come before
+                             all others
+    published                whether values are put, not only answered
+    trusted                  only with a code of the run's secret does a message on it count (`swarm.wire.access`)
+    trusted_in               part of those keys on which the same holds, where it does not hold on all
+    newest                   each value carries the whole state of its key, so a reader may skip to the newest
+    echoed                   whether a process that puts and subscribes hears what it has put itself
+    buffer                   samples that wait for a slow reader; the oldest are dropped first
+    put_bytes                limit of a published payload; a longer one is rejected unread, as are questions and
+                             answers
     ask_bytes, answer_bytes  the same of a question, and of each of its answers
-    fields     names of the chunks in `key`, in order
+    fields                   names of the chunks in `key`, in order
     """
 
     name: str
@@ -235,44 +237,44 @@ SHARED_COSTS = Topic(
     access(put="agent:author", hear="agent"), echoed=False,
     put_bytes=2 * _LONG,
 )  # fmt: skip
-STANDING = Topic(
-    "standing", "standing/{plot}/{member}/{agent}", traffic.Standing,
-    "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
-    "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
+HOST_STATE = Topic(
+    "host_state", "host_state/{shard}/{member}/{agent}", traffic.HostState,
+    "where a host's vehicles are in a shard and where they would go; for its leader, or all of its members where "
+    "none is heard; each counts, as two generations of a host must not hide each other's words", "on change, else 5 Hz",
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
 TABLE = Topic(
-    "table", "table/{plot}/{member}/{agent}", traffic.Table,
-    "which cells the warden of a plot has granted, for one of its members; a member that is asked promises an "
+    "table", "table/{shard}/{member}/{agent}", traffic.Table,
+    "which cells the leader of a shard has granted, for one of its members; a member that is asked promises an "
     "epoch and answers with what it has stored", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=traffic.Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 GRANTED = Topic(
-    "granted", "granted/{plot}/{host}/{agent}", traffic.Granted,
-    "which cells of a plot its warden has granted to one host, on file with its members", "on change, else 5 Hz",
+    "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,
+    "which cells of a shard its leader has granted to one host, on file with its members", "on change, else 5 Hz",
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
 LEFT = Topic(
     "left", "left/{host}/{agent}", traffic.Left,
     "which cells vehicles of a host have left, for another host whose vehicles follow them; each counts",
-    "on change, and at 5 Hz until the warden has counted it",
+    "on change, and at 5 Hz until the leader has counted it",
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
-    "per table by one member, 5 Hz by the other; 5 Hz by the warden, instead of a table that both have on file",
+    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
+    "per table by one member, 5 Hz by the other; 5 Hz by the leader, instead of a table that both have on file",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", traffic.Known,
-    "what an agent has on file about another, or a guest, for a new life of that", "asked at a start",
+    "what an agent has on file about another, or an external vehicle, for a new generation of that", "asked at a start",
     access(serve="agent:agent", ask="agent rover"),
     request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
     ask_bytes=_SHORT, answer_bytes=_LONG,
@@ -316,8 +318,8 @@ SIGHTED = Topic(
     access(put="agent:author", hear="agent planner keeper monitor"),
     put_bytes=_SHORT,
 )  # fmt: skip
-BODY = Topic(
-    "body", "body/{id}", vehicles.Body,
+OBSTACLE = Topic(
+    "body", "body/{id}", vehicles.Obstacle,
     "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
     "a person; each counts, as two senders under one id must not hide each other",
     "10 Hz while it moves, else once a second at least",
@@ -367,7 +369,7 @@ BELIEVED = Topic(
     put_bytes=_USUAL // 4,
 )  # fmt: skip
 LEAD = Topic(
-    "lead", "lead/{role}/{id}", processes.Beat, "which of the processes with one job are ready, and which leads",
+    "lead", "lead/{role}/{id}", processes.Heartbeat, "which of the processes with one job are ready, and which leads",
     "10 Hz, where there are standbys",
     access(put="planner:role,id places:role,id targets:role,id", hear="planner places targets monitor"),
     priority=Priority.INTERACTIVE,
@@ -432,8 +434,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, LEFT, STORED,
-    KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, PLACE_ROUTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, LEFT, STORED,
+    KNOWN, LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, OBSTACLE, ROUTE, COST, PLACE_ROUTE,
     NAMELESS_ROUTE, NAMELESS_COST, STATUS, BELIEVED, LEAD, ZONES,
     GIVE_ORDER, ORDERS, OBEYED, SEND_VEHICLE, GOALS, GOAL_STATES, STATS, NOTE,
 )  # fmt: skip

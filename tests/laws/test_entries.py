@@ -1,5 +1,6 @@
 """The second version of right of way as a model of its real cores: no two vehicles meet in any history, and each
-rule that is taken out is found. Every history has two plots with a seam, guests, restarts and second lives."""
+rule that is taken out is found. Every history has two shards with a seam, external vehicles, restarts and second
+lives."""
 
 from __future__ import annotations
 
@@ -38,9 +39,11 @@ def enters_at_once(patch: pytest.MonkeyPatch) -> None:
 def waits_for_the_last_before_it_only(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
 
-    def hasty(self: HostEntries, plot: int, stamp: Stamp, life: int, grants: dict[str, list[Entry]]) -> set[str]:
+    def hasty(
+        self: HostEntries, shard: int, stamp: Stamp, generation: int, grants: dict[str, list[Entry]]
+    ) -> set[str]:
         last = {id: [Entry(each.number, each.after[-1:]) for each in entries] for id, entries in grants.items()}
-        return hear(self, plot, stamp, life, last)
+        return hear(self, shard, stamp, generation, last)
 
     patch.setattr(HostEntries, "hear_granted", hasty)
 
@@ -61,7 +64,7 @@ def _forgetting(patch: pytest.MonkeyPatch, before: Callable[[HostEntries], objec
     hear = HostEntries.hear_granted
 
     def forgetful(self: HostEntries, *what: Any) -> set[str]:
-        over = {plot: set(numbers) for plot, numbers in self.over.items()}
+        over = {shard: set(numbers) for shard, numbers in self.over.items()}
         before(self)
         changed = hear(self, *what)
         self.over = over
@@ -78,10 +81,12 @@ def takes_later_what_it_passed_over(patch: pytest.MonkeyPatch) -> None:
     _forgetting(patch, lambda entries: None)
 
 
-def acts_on_what_was_granted_to_another_life(patch: pytest.MonkeyPatch) -> None:
+def acts_on_what_was_granted_to_another_generation(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
     patch.setattr(
-        HostEntries, "hear_granted", lambda self, plot, stamp, _, grants: hear(self, plot, stamp, self.life, grants)
+        HostEntries,
+        "hear_granted",
+        lambda self, shard, stamp, _, grants: hear(self, shard, stamp, self.generation, grants),
     )
 
 
@@ -94,30 +99,30 @@ def believes_that_another_vehicle_of_the_cell_has_left(patch: pytest.MonkeyPatch
     patch.setattr(HostEntries, "hear_left", careless)
 
 
-# --- rules of wardens -------------------------------------------------------------------------------------------
+# --- rules of leaders -------------------------------------------------------------------------------------------
 
 
 def forgets_who_is_before(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Orders, "before", lambda self, number, vehicle: iter(()))
 
 
-def forgets_those_before_in_earlier_lives(patch: pytest.MonkeyPatch) -> None:
+def forgets_those_before_in_earlier_generations(patch: pytest.MonkeyPatch) -> None:
     before = Orders.before
     patch.setattr(
         Orders, "before", lambda self, *of: (each for each in before(self, *of) if each[0] not in self._fences)
     )
 
 
-def opens_what_an_earlier_life_holds(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_standing
+def opens_what_an_earlier_generation_holds(patch: pytest.MonkeyPatch) -> None:
+    take = Orders.take_host_state
 
     def trusting(self: Orders, host: str, *what: Any) -> bool:
         changed = take(self, host, *what)
-        for life in [life for each, life in self.fenced if each == host]:
-            self.end(host, life)
+        for generation in [generation for each, generation in self.fenced if each == host]:
+            self.end(host, generation)
         return changed
 
-    patch.setattr(Orders, "take_standing", trusting)
+    patch.setattr(Orders, "take_host_state", trusting)
 
 
 def frees_what_the_host_did_not_know_of(patch: pytest.MonkeyPatch) -> None:
@@ -137,11 +142,12 @@ def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
 
 
 def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_standing
-    patch.setattr(Orders, "take_standing", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
+    take = Orders.take_host_state
+    patch.setattr(Orders, "take_host_state", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
 
 
-# --- rules of members and of lives ------------------------------------------------------------------------------
+# --- rules of members and of generations
+# ------------------------------------------------------------------------------
 
 
 def _setting(name: str, value: object) -> Mutation:
@@ -158,11 +164,11 @@ RULES: list[Mutation] = [
     says_left_when_it_sets_out,
     takes_back_what_it_gave,
     takes_later_what_it_passed_over,
-    acts_on_what_was_granted_to_another_life,
+    acts_on_what_was_granted_to_another_generation,
     believes_that_another_vehicle_of_the_cell_has_left,
     forgets_who_is_before,
-    forgets_those_before_in_earlier_lives,
-    opens_what_an_earlier_life_holds,
+    forgets_those_before_in_earlier_generations,
+    opens_what_an_earlier_generation_holds,
     frees_what_the_host_did_not_know_of,
     frees_what_was_not_said,
     forgets_where_bodies_are,

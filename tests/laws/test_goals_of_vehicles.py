@@ -98,7 +98,7 @@ def test_places_are_reached_in_order_and_the_last_order_counts_whatever_is_lost_
         assert (held.stamp_ns, held.cells, held.then, held.off) == (
             last.stamp_ns, last.cells, last.then, last.off,
         )  # fmt: skip
-        # Every place that counts as reached was. Where a life ends before it tells, some are repeated.
+        # Every place that counts as reached was. Where a generation ends before it tells, some are repeated.
         visited = set(history.visits.get((name, last.stamp_ns), ()))
         assert visited == set(range(len(visited)))
         assert held.done <= len(visited)

@@ -22,7 +22,7 @@ from swarm.wire.codec import MAX_JSON_BYTES, decode, encode, encode_json, may_be
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import CostRequest, PushedRoute, TargetPose
-from swarm.wire.messages.vehicles import Body
+from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.topics import TOPICS
 
 PUT = tuple({topic.message for topic in TOPICS if topic.published})
@@ -100,12 +100,12 @@ def test_a_column_is_a_list_of_its_numbers_or_base64_of_its_bytes():
         (MarkSet, {"cells": 5}, "cells is 5, expected a list of uint16, or base64 of their bytes"),
         (MarkSet, {"paces": ["fast", 1]}, "paces has 'fast', expected float32"),
         (MarkSet, {"cells": [5]}, "cells has 2 bytes, expected 2 values of 2"),
-        (Body, {"heading": 1.0}, "unknown field 'heading'; Body has id, group"),
-        (Body, {"x_m": None}, "x_m"),
-        (Body, {"x_m": "1"}, "x_m"),
-        (Body, {"seq": 1.5}, "seq"),
-        (Body, {"seq": 1 << 70}, "OverflowError"),
-        (Body, {"id": "a/b"}, "id 'a/b' is not 1 to 64 of letters"),
+        (Obstacle, {"heading": 1.0}, "unknown field 'heading'; Obstacle has id, group"),
+        (Obstacle, {"x_m": None}, "x_m"),
+        (Obstacle, {"x_m": "1"}, "x_m"),
+        (Obstacle, {"seq": 1.5}, "seq"),
+        (Obstacle, {"seq": 1 << 70}, "OverflowError"),
+        (Obstacle, {"id": "a/b"}, "id 'a/b' is not 1 to 64 of letters"),
         (PushedRoute, {"route": {"status": "ok", "start": 1, "directions": ["UP"]}}, "route.directions has 'UP'"),
     ],
 )

@@ -12,16 +12,16 @@ import pytest
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import job_of, ranked_id, split_rank
-from swarm.runtime.election import BEAT_NS, LEASE_NS, SETTLED_NS, Leadership
-from swarm.wire.messages.processes import Beat
+from swarm.runtime.election import HEARTBEAT_NS, LEASE_NS, SETTLED_NS, Leadership
+from swarm.wire.messages.processes import Heartbeat
 
 MS = NS_PER_S // 1000
 DELAY_NS = 30 * MS
-SOON_NS = LEASE_NS + 2 * BEAT_NS + DELAY_NS
+SOON_NS = LEASE_NS + 2 * HEARTBEAT_NS + DELAY_NS
 """A lease, a period of the sender and one of the receiver, and the transit time between them."""
-HANDOVER_NS = 2 * BEAT_NS + DELAY_NS
+HANDOVER_NS = 2 * HEARTBEAT_NS + DELAY_NS
 """Two lead for no longer than it takes until the worse one hears the better one. Much less than a lease."""
-STEADY_NS = SETTLED_NS + 2 * LEASE_NS + 4 * BEAT_NS
+STEADY_NS = SETTLED_NS + 2 * LEASE_NS + 4 * HEARTBEAT_NS
 
 
 @dataclass(eq=False)
@@ -31,12 +31,12 @@ class Candidate:
     rank: int
     skew_ns: int
     phase_ns: int
-    life: int = 0
+    generation: int = 0
     core: Leadership | None = None
     ready_ns: int = 0
     hung_until_ns: int = 0
-    waiting: list[Beat] = field(default_factory=list)
-    """Unread beats."""
+    waiting: list[Heartbeat] = field(default_factory=list)
+    """Unread heartbeats."""
 
 
 class World:
@@ -56,7 +56,9 @@ class World:
         self.changes: list[tuple[int, tuple[int, ...]]] = []
         """Time of each change of leaders, and their ranks."""
         spread = range(count)
-        self.all = [Candidate(n, self.chance.randrange(NS_PER_S), self.chance.randrange(BEAT_NS)) for n in spread]
+        self.all = [
+            Candidate(n, self.chance.randrange(NS_PER_S), self.chance.randrange(HEARTBEAT_NS)) for n in spread
+        ]
         for each in self.all:
             self.boot(each)
 
@@ -75,9 +77,9 @@ class World:
 
     def boot(self, who: Candidate) -> None:
         self.disturbed()
-        who.life += 1
+        who.generation += 1
         id = ranked_id("t0", who.rank)
-        who.core = Leadership(id, who.life, alone=False, period_ns=BEAT_NS)
+        who.core = Leadership(id, who.generation, alone=False, period_ns=HEARTBEAT_NS)
         who.ready_ns = self.now_ns + self.chance.randrange(NS_PER_S)
         self.at(who.ready_ns, self.disturbed)
         core = who.core
@@ -131,23 +133,23 @@ class World:
         if core.leads != before:
             self.note()
         id = ranked_id("t0", who.rank)
-        beat = Beat(role="planner", id=id, incarnation=who.life, ready=ready, leads=core.leads)
+        heartbeat = Heartbeat(role="planner", id=id, incarnation=who.generation, ready=ready, leads=core.leads)
         for other in self.all:
             if (other.rank in self.far) == (who.rank in self.far) and self.chance.random() >= self.lossy:
                 delay_ns = self.chance.randrange(DELAY_NS)
-                self.at(self.now_ns + delay_ns, lambda to=other: self.arrive(to, beat))  # type: ignore[misc]
+                self.at(self.now_ns + delay_ns, lambda to=other: self.arrive(to, heartbeat))  # type: ignore[misc]
         self.read(who, core, now_ns)
-        self.at(self.now_ns + BEAT_NS, lambda: self.tick(who, core))
+        self.at(self.now_ns + HEARTBEAT_NS, lambda: self.tick(who, core))
 
     def read(self, who: Candidate, core: Leadership, now_ns: int) -> None:
-        for beat in who.waiting:
-            core.on_beat(beat, now_ns)
+        for heartbeat in who.waiting:
+            core.on_heartbeat(heartbeat, now_ns)
         who.waiting.clear()
 
-    def arrive(self, who: Candidate, beat: Beat) -> None:
+    def arrive(self, who: Candidate, heartbeat: Heartbeat) -> None:
         if who.core is None:
             return
-        who.waiting.append(beat)
+        who.waiting.append(heartbeat)
         if self.now_ns >= who.hung_until_ns:
             self.read(who, who.core, self.now_ns + who.skew_ns)
 
@@ -256,19 +258,19 @@ def test_who_stalls_takes_nobody_for_dead_because_of_that() -> None:
     assert world.changes == before
 
 
-def test_of_two_lives_of_one_process_the_younger_leads() -> None:
-    older, younger = (Leadership("t0", life, alone=False, period_ns=BEAT_NS) for life in (1, 2))
+def test_of_two_generations_of_one_process_the_younger_leads() -> None:
+    older, younger = (Leadership("t0", generation, alone=False, period_ns=HEARTBEAT_NS) for generation in (1, 2))
 
-    def beat(core: Leadership, life: int) -> Beat:
-        return Beat(role="planner", id="t0", incarnation=life, ready=True, leads=core.leads)
+    def heartbeat(core: Leadership, generation: int) -> Heartbeat:
+        return Heartbeat(role="planner", id="t0", incarnation=generation, ready=True, leads=core.leads)
 
     for n in range(60):
-        now_ns = n * BEAT_NS
+        now_ns = n * HEARTBEAT_NS
         older.tick(True, now_ns)
         if n >= 10:
             younger.tick(True, now_ns)
-            older.on_beat(beat(younger, 2), now_ns)
-            younger.on_beat(beat(older, 1), now_ns)
+            older.on_heartbeat(heartbeat(younger, 2), now_ns)
+            younger.on_heartbeat(heartbeat(older, 1), now_ns)
         elif n == 9:
             assert older.leads
     assert younger.leads
@@ -276,21 +278,23 @@ def test_of_two_lives_of_one_process_the_younger_leads() -> None:
 
 
 def test_strangers_without_end_take_no_memory_and_one_lie_holds_for_a_lease_only() -> None:
-    core = Leadership("t0.r1", 1, alone=False, period_ns=BEAT_NS)
+    core = Leadership("t0.r1", 1, alone=False, period_ns=HEARTBEAT_NS)
     for n in range(20):
-        core.tick(True, n * BEAT_NS)
+        core.tick(True, n * HEARTBEAT_NS)
     assert core.leads
-    for life in range(1000):
-        core.on_beat(Beat(role="planner", id="t0", incarnation=life, ready=True, leads=True), 19 * BEAT_NS)
+    for generation in range(1000):
+        core.on_heartbeat(
+            Heartbeat(role="planner", id="t0", incarnation=generation, ready=True, leads=True), 19 * HEARTBEAT_NS
+        )
     assert len(core._others) <= 64
-    assert not core.tick(True, 20 * BEAT_NS)
-    leads = [core.tick(True, n * BEAT_NS) for n in range(21, 30)]
+    assert not core.tick(True, 20 * HEARTBEAT_NS)
+    leads = [core.tick(True, n * HEARTBEAT_NS) for n in range(21, 30)]
     assert leads[-1]
     assert core._others == {}
 
 
 def test_a_process_without_standbys_leads_from_its_start() -> None:
-    core = Leadership("t0", 1, alone=True, period_ns=BEAT_NS)
+    core = Leadership("t0", 1, alone=True, period_ns=HEARTBEAT_NS)
     assert core.leads
     assert core.tick(False, 0)
     assert core.tick(False, 10 * NS_PER_S)

@@ -14,8 +14,8 @@ from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import Entry, Fence, Granted, Left, Standing, Stored, Table
-from swarm.wire.topics import GRANTED, LEFT, STANDING, STORED, TABLE
+from swarm.wire.messages.traffic import Entry, Fence, Granted, HostState, Left, Stored, Table
+from swarm.wire.topics import GRANTED, HOST_STATE, LEFT, STORED, TABLE
 from vehicle_agent.service import AgentService
 
 LEAPS = (-1, 1, 2, 3, 100, 1 << 20, 1 << 32, (1 << 33) + 5, 1 << 40, 1 << 47)
@@ -25,18 +25,18 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
     """The same with another number, or without what it held."""
     leap = chance.choice(LEAPS)
     match said:
-        case Standing():
+        case HostState():
             return chance.choice(
                 (
-                    replace(said, life=said.life + leap),
+                    replace(said, generation=said.generation + leap),
                     replace(said, seq=said.seq + leap),
                     replace(said, seq=said.seq + abs(leap), knows=(said.knows[0] + 3, leap), vehicles=[]),
-                    replace(said, dead=[said.life]),
+                    replace(said, dead=[said.generation]),
                     replace(said, ended=True),
                 )
             )
         case Table():
-            later = {agent: (life + leap, seq + abs(leap)) for agent, (life, seq) in said.hosts.items()}
+            later = {agent: (generation + leap, seq + abs(leap)) for agent, (generation, seq) in said.hosts.items()}
             anywhere = {"a0-00": [(chance.randrange(cells), 0, 1) for _ in range(5)]}
             return chance.choice(
                 (
@@ -53,7 +53,7 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),
                     replace(said, seq=said.seq + abs(leap)),
-                    replace(said, seq=said.seq + 1, life=said.life + leap),
+                    replace(said, seq=said.seq + 1, generation=said.generation + leap),
                     replace(said, seq=said.seq + 1, heard=said.heard + abs(leap), grants={}),
                     replace(said, seq=said.seq + 1, grants=dict.fromkeys(said.grants, somewhere)),
                 )
@@ -76,7 +76,7 @@ def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> in
         if isinstance(event, Heard) and encode(event.message) not in lies:
             heard.append(event)
 
-    for topic in (STANDING, TABLE, GRANTED, LEFT, STORED):
+    for topic in (HOST_STATE, TABLE, GRANTED, LEFT, STORED):
         bus.subscribe(topic, post)
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:

@@ -27,7 +27,7 @@ from swarm.wire.messages import Message, Nothing, schema_of
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.traffic import Standing, Table
+from swarm.wire.messages.traffic import HostState, Table
 from swarm.wire.route_columns import Route, Routes, RouteStatus
 
 TYPES = tuple(BY_TYPE)
@@ -205,8 +205,8 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (TargetPose, {"target": "*"}, "target"),
         (Table, {"grants": {"v": []}}, "length >= 1"),
         (Table, {"grants": {"a b": [[1, 1, 1]]}}, "grants"),
-        (Standing, {"life": (1 << 64) - 1}, "life"),
-        (Standing, {"vehicles": [["v", 1, 1, [[1, 1, 1]], [], [2] * 9, 9, 0]]}, "length <= 8"),
+        (HostState, {"life": (1 << 64) - 1}, "life"),
+        (HostState, {"vehicles": [["v", 1, 1, [[1, 1, 1]], [], [2] * 9, 9, 0]]}, "length <= 8"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),
         (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),
         (RouteRequest, {"cells": [1] * 1001, "vehicles": ["a"] * 1001}, "length <= 1000"),

@@ -22,11 +22,11 @@ from swarm.wire.messages.traffic import Entry
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
-from vehicle_agent.traffic.warden import Warden
+from vehicle_agent.traffic.shard_leader import Leader
 
 QUIET_S = 12.0
 SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4), (1, 5, 7, 4))
-"""(agents, vehicles each, side of the map, side of a plot): one to nine plots, a sixth to a third of the cells
+"""(agents, vehicles each, side of the map, side of a shard): one to nine shards, a sixth to a third of the cells
 taken."""
 
 
@@ -39,12 +39,12 @@ def world_of(seed: int) -> TrafficWorld:
 
 
 def duel_of(seed: int) -> TrafficWorld:
-    """One plot, and members that take a busy warden for silent again and again, over a slow network."""
+    """One shard, and members that take a busy leader for silent again and again, over a slow network."""
     return TrafficWorld(seed, 3, 6, 7, 7, Faults(late=0.3, delay_ms=400, leaps=8, quiet_s=QUIET_S))
 
 
 def borders_of(seed: int) -> TrafficWorld:
-    """Nine plots of three by three cells, and a network that repeats half of all and delays much for seconds."""
+    """Nine shards of three by three cells, and a network that repeats half of all and delays much for seconds."""
     return TrafficWorld(seed, 4, 6, 9, 3, Faults(repeat=0.5, late=0.3, delay_ms=50, quiet_s=QUIET_S))
 
 
@@ -64,7 +64,7 @@ def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
 
 
 @pytest.mark.seeds(3)
-def test_no_two_meet_when_wardens_replace_each_other_all_the_time(seed: int) -> None:
+def test_no_two_meet_when_leaders_replace_each_other_all_the_time(seed: int) -> None:
     world = duel_of(seed)
     check(world, move_s=20.0)
     assert world.takeovers > 3
@@ -112,13 +112,13 @@ def test_without_faults_everybody_gets_where_it_wants() -> None:
     assert sum(world.reached.values()) > 300
 
 
-def test_a_warden_that_dies_is_replaced_within_a_second_and_the_vehicles_go_on() -> None:
+def test_a_leader_that_dies_is_replaced_within_a_second_and_the_vehicles_go_on() -> None:
     world = TrafficWorld(3, 4, 3, 10, 10, Faults())
     world.run(4.0)
-    (warden,) = (one for one in world.processes if 0 in one.rights._members and one.rights._members[0].warden)
-    world.processes.remove(warden)
-    warden.alive = False
-    others = [vehicle for vehicle in world.moves if not vehicle.startswith(warden.agent)]
+    (leader,) = (one for one in world.processes if 0 in one.rights._members and one.rights._members[0].leader)
+    world.processes.remove(leader)
+    leader.alive = False
+    others = [vehicle for vehicle in world.moves if not vehicle.startswith(leader.agent)]
     world.run(1.2)
     before = dict(world.moves)
     world.run(2.0)
@@ -132,8 +132,8 @@ def test_a_warden_that_dies_is_replaced_within_a_second_and_the_vehicles_go_on()
 def usable_without_majority(patch: pytest.MonkeyPatch) -> None:
     lead = Member._lead
 
-    def hasty(self: Member, warden: Warden, now_ns: int):  # type: ignore[no-untyped-def]
-        return [*lead(self, warden, now_ns), *self._on_file(warden, warden.seq, now_ns)]
+    def hasty(self: Member, leader: Leader, now_ns: int):  # type: ignore[no-untyped-def]
+        return [*lead(self, leader, now_ns), *self._on_file(leader, leader.seq, now_ns)]
 
     patch.setattr(Member, "_lead", hasty)
 
@@ -164,45 +164,45 @@ def one_promise_is_enough(patch: pytest.MonkeyPatch) -> None:
     take = Member._take_charge
 
     def hasty(self: Member, now_ns: int) -> None:
-        majority, self._plots.majority = self._plots.majority, 1
+        majority, self._shards.majority = self._shards.majority, 1
         take(self, now_ns)
-        self._plots.majority = majority
+        self._shards.majority = majority
 
     patch.setattr(Member, "_take_charge", hasty)
 
 
 def frees_what_nobody_reported(patch: pytest.MonkeyPatch) -> None:
-    tick = Warden.tick
+    tick = Leader.tick
 
-    def greedy(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
+    def greedy(self: Leader, now_ns: int):  # type: ignore[no-untyped-def]
         orders = self._orders
         for host, vehicles in orders.by_host.items():
             orders.remove(host, {vehicle: orders.of[vehicle][-1:] for vehicle in vehicles}, (1 << 60, 0))
         return tick(self, now_ns)
 
-    patch.setattr(Warden, "tick", greedy)
+    patch.setattr(Leader, "tick", greedy)
 
 
-def an_older_life_goes_on(patch: pytest.MonkeyPatch) -> None:
+def an_older_generation_goes_on(patch: pytest.MonkeyPatch) -> None:
     hear = Holdings.hear_granted
 
     def unfenced(self: Holdings, granted, now_ns):  # type: ignore[no-untyped-def]
-        self.life = self._entries.life = max(self.life, granted.life)
+        self.generation = self._entries.generation = max(self.generation, granted.generation)
         return hear(self, granted, now_ns)
 
     patch.setattr(Holdings, "hear_granted", unfenced)
 
 
-def forgets_where_an_older_life_may_stand(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_standing
+def forgets_where_an_older_generation_may_stand(patch: pytest.MonkeyPatch) -> None:
+    take = Orders.take_host_state
 
     def trusting(self: Orders, host: str, *what):  # type: ignore[no-untyped-def]
         changed = take(self, host, *what)
-        for life in [life for each, life in self.fenced if each == host]:
-            self.end(host, life)
+        for generation in [generation for each, generation in self.fenced if each == host]:
+            self.end(host, generation)
         return changed
 
-    patch.setattr(Orders, "take_standing", trusting)
+    patch.setattr(Orders, "take_host_state", trusting)
 
 
 def follows_without_a_word(patch: pytest.MonkeyPatch) -> None:
@@ -212,9 +212,9 @@ def follows_without_a_word(patch: pytest.MonkeyPatch) -> None:
 def follows_on_the_word_of_the_last_before_it(patch: pytest.MonkeyPatch) -> None:
     hear = HostEntries.hear_granted
 
-    def hasty(self: HostEntries, plot, stamp, life, grants):  # type: ignore[no-untyped-def]
+    def hasty(self: HostEntries, shard, stamp, generation, grants):  # type: ignore[no-untyped-def]
         last = {id: [Entry(each.number, each.after[-1:]) for each in entries] for id, entries in grants.items()}
-        return hear(self, plot, stamp, life, last)
+        return hear(self, shard, stamp, generation, last)
 
     patch.setattr(HostEntries, "hear_granted", hasty)
 
@@ -236,15 +236,15 @@ def takes_again_what_it_gave_back(patch: pytest.MonkeyPatch) -> None:
     def greedy(self: HostEntries, *what):  # type: ignore[no-untyped-def]
         over, self.over = self.over, {}
         changed = hear(self, *what)
-        for plot, numbers in over.items():
-            self.over.setdefault(plot, set()).update(numbers)
+        for shard, numbers in over.items():
+            self.over.setdefault(shard, set()).update(numbers)
         return changed
 
     patch.setattr(HostEntries, "hear_granted", greedy)
 
 
-def a_new_life_takes_what_the_last_one_held(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Orders, "_fence", lambda self, host, life: None)
+def a_new_generation_takes_what_the_last_one_held(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Orders, "_fence", lambda self, host, generation: None)
 
 
 def seats_a_file_that_is_not_the_first(patch: pytest.MonkeyPatch) -> None:
@@ -264,8 +264,8 @@ def acts_on_a_table_that_is_not_the_newest(patch: pytest.MonkeyPatch) -> None:
     def absent_minded(self: Holdings, wishes, now_ns):  # type: ignore[no-untyped-def]
         said = standings(self, wishes, now_ns)
         for known in (self._views, self._entries.knows, self._entries.over):
-            for plot in [plot for plot in known if plot not in self.plots]:
-                del known[plot]
+            for shard in [shard for shard in known if shard not in self.shards]:
+                del known[shard]
         return said
 
     patch.setattr(Holdings, "standings", absent_minded)
@@ -277,13 +277,13 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     stores_after_a_promise,
     one_promise_is_enough,
     frees_what_nobody_reported,
-    an_older_life_goes_on,
-    forgets_where_an_older_life_may_stand,
+    an_older_generation_goes_on,
+    forgets_where_an_older_generation_may_stand,
     follows_without_a_word,
     follows_on_the_word_of_the_last_before_it,
     says_that_it_has_left_when_it_sets_out,
     takes_again_what_it_gave_back,
-    a_new_life_takes_what_the_last_one_held,
+    a_new_generation_takes_what_the_last_one_held,
     seats_a_file_that_is_not_the_first,
     acts_on_a_table_that_is_not_the_newest,
 ]
@@ -291,8 +291,8 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
 
 FIRST = {
     "stores_after_a_promise": 39,
-    "an_older_life_goes_on": 14,
-    "forgets_where_an_older_life_may_stand": 14,
+    "an_older_generation_goes_on": 14,
+    "forgets_where_an_older_generation_may_stand": 14,
     "seats_a_file_that_is_not_the_first": 56,
     "acts_on_a_table_that_is_not_the_newest": 97,
 }

@@ -20,7 +20,7 @@ from support.map_strategies import set_of
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
-from swarm.right_of_way.incarnations import LifeFile
+from swarm.right_of_way.incarnations import GenerationFile
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.traffic import Table
@@ -77,7 +77,7 @@ def commit_promises(path: Path, number: int) -> None:
     store = FilePromiseStore(path)
     grants = {f"a1-{k:02d}": [(1000 * number + k, number, k)] for k in range(8)}
     for seq in range(3):
-        store.save(number, Table(plot=seq, agent="a1", epoch=number, seq=seq, hosts={"a1": (7, 1)}, grants=grants))
+        store.save(number, Table(shard=seq, agent="a1", epoch=number, seq=seq, hosts={"a1": (7, 1)}, grants=grants))
     store.sync()
     store.close()
 
@@ -88,23 +88,23 @@ def read_promises(path: Path) -> Parts:
     return (store.own, *map(store.saved.get, range(3)))
 
 
-def commit_lives(path: Path, number: int) -> None:
-    lives = LifeFile(path)
-    lives.save([*lives.lives, number + 1])
-    lives.close()
+def commit_generations(path: Path, number: int) -> None:
+    generations = GenerationFile(path)
+    generations.save([*generations.generations, number + 1])
+    generations.close()
 
 
-def read_lives(path: Path) -> Parts:
-    lives = LifeFile(path)
-    lives.close()
-    return (lives.lives,)
+def read_generations(path: Path) -> Parts:
+    generations = GenerationFile(path)
+    generations.close()
+    return (generations.generations,)
 
 
 KINDS = {
     "marks": Kind(commit_marks, read_marks),
     "marks with their log": Kind(commit_marks_to_the_log, read_marks, (".lock", "-wal")),
     "promises": Kind(commit_promises, read_promises),
-    "lives": Kind(commit_lives, read_lives),
+    "lives": Kind(commit_generations, read_generations),
 }
 
 

@@ -14,7 +14,7 @@ from support.makers import target_pose
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.runtime.tracking import LONGEST_AGE_NS, MOST_LIVES, SAME_NS, Tracking, Trackings, Verdict
+from swarm.runtime.tracking import LONGEST_AGE_NS, MOST_GENERATIONS, SAME_NS, Tracking, Trackings, Verdict
 from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 GRID = GridSpec(25, 40, 10.0)
@@ -60,7 +60,7 @@ def test_receivers_agree_on_the_oldest_tracker_that_lives_whatever_each_has_hear
     lease, each receives at least one pose of every tracker that lives."""
     chance = data.draw(st.randoms(use_true_random=False))
     names = data.draw(st.lists(st.sampled_from(["a", "b", "c", None]), min_size=1, max_size=5))
-    # Ages differ by more than receivers can mistake; two lives of one name begin at different times.
+    # Ages differ by more than receivers can mistake; two generations of one name begin at different times.
     ages_s = data.draw(st.lists(st.integers(1, 400), min_size=len(names), max_size=len(names), unique=True))
     trackers = [
         Tracker(
@@ -154,7 +154,7 @@ def test_a_lease_of_zero_hands_the_target_over_and_what_comes_late_does_not_take
     assert tracking.judge(second.pose(now_ns), now_ns + 2) is Verdict.COUNTS
 
 
-def test_a_tracker_that_starts_again_takes_over_from_its_earlier_life_at_once() -> None:
+def test_a_tracker_that_starts_again_takes_over_from_its_earlier_generation_at_once() -> None:
     tracking, first, again = Tracking(GRID), Tracker("a", START_NS), Tracker("a", START_NS + 10)
     last = first.pose(START_NS + 20)
     tracking.judge(first.pose(START_NS + 20), START_NS + 20)
@@ -205,7 +205,7 @@ def test_whatever_is_made_up_a_tracker_that_goes_on_is_heard_after_the_longest_l
         tracking.judge(tracker.pose(START_NS + at), START_NS + at) for at in range(0, 4 * NS_PER_S, NS_PER_S // 4)
     ]
     assert heard[-1] is Verdict.COUNTS
-    assert len(tracking._lives) <= MOST_LIVES
+    assert len(tracking._generations) <= MOST_GENERATIONS
 
 
 def test_a_flood_of_young_trackers_does_not_push_out_the_owner() -> None:
@@ -216,7 +216,7 @@ def test_a_flood_of_young_trackers_does_not_push_out_the_owner() -> None:
         young = Tracker(None, START_NS + 2 * NS_PER_S + n)
         assert tracking.judge(young.pose(now_ns), now_ns) is Verdict.REFUSED
         assert tracking.judge(owner.pose(now_ns), now_ns) is Verdict.COUNTS
-    assert len(tracking._lives) == MOST_LIVES
+    assert len(tracking._generations) == MOST_GENERATIONS
 
 
 @pytest.mark.parametrize("cell", [-2, GRID.cells, (1 << 32) - 1])

@@ -166,13 +166,14 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
 
     # The planner that answered last has ended; its standby may have led before, too.
     dead = {
-        target: max(before["answered"][target].items(), key=lambda life: life[1][1])[0] for target in gone.leads
+        target: max(before["answered"][target].items(), key=lambda generation: generation[1][1])[0]
+        for target in gone.leads
     }
 
     def answers(target: str) -> list[float]:
         """Time of the first answer after the loss by another planner than the dead one."""
         found = onlooker.notes["answered"][target]
-        return [first for life, (first, _) in found.items() if life != dead[target] and first > lost_s]
+        return [first for generation, (first, _) in found.items() if generation != dead[target] and first > lost_s]
 
     def first_routes() -> list[float]:
         """For each vehicle whose planner has ended: the time at which another planner pushed a route, or the
@@ -182,8 +183,8 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
             min(
                 *(
                     at_s
-                    for at_s, life in notes["pushed"].get(vehicle, ())
-                    if at_s > lost_s and str(life) != dead[target]
+                    for at_s, generation in notes["pushed"].get(vehicle, ())
+                    if at_s > lost_s and str(generation) != dead[target]
                 ),
                 *(at_s for at_s in notes["followed"].get(vehicle, ()) if at_s > lost_s),
                 math.inf,

@@ -229,7 +229,7 @@ def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> No
 
 def test_each_process_of_it_gives_the_same_when_its_inputs_are_replayed(live: LiveSwarm) -> None:
     replayed = list(replay_run(live.run_dir))
-    assert {(each.recorded.process, each.recorded.life) for each in replayed} >= {
+    assert {(each.recorded.process, each.recorded.generation) for each in replayed} >= {
         *(("planner-t0", 2), ("planner-t1", 1), ("agent-a0", 2), ("agent-a1", 1)),
         *(("keeper-0", 1), ("targets-0", 1)),
     }

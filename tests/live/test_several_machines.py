@@ -25,7 +25,7 @@ from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import Stats
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import BODY, MARKS, ROUTE, RUN, STATS
+from swarm.wire.topics import MARKS, OBSTACLE, ROUTE, RUN, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -169,7 +169,7 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
         keeper.serve(RUN, answer, role="keeper", id="0")
         keeper.subscribe(MARKS, tell)
         planner.serve(ROUTE, answer, target="t0")
-        agent.subscribe(BODY, tell)
+        agent.subscribe(OBSTACLE, tell)
         files = [str(certs / name) for name in ("ca.pem", "rover.all.r1.pem", "rover.all.r1.key")]
         with connect(endpoint, ca=files[0], certificate=files[1], key=files[2]) as program:
             other, rover = program.vehicle("r2"), program.vehicle("r1")

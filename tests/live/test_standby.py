@@ -21,7 +21,7 @@ from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.planning import RouteReply, RouteRequest
-from swarm.wire.messages.processes import Beat, Stats
+from swarm.wire.messages.processes import Heartbeat, Stats
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import LEAD, ROUTE, STATS
 
@@ -69,8 +69,8 @@ class Leaders:
 
     def _take(self, event: Event) -> None:
         match event:
-            case Heard(message=Beat() as beat):
-                self.told[beat.id] = beat.leads
+            case Heard(message=Heartbeat() as heartbeat):
+                self.told[heartbeat.id] = heartbeat.leads
             case Heard(message=Stats() as stats):
                 self.lost = stats.gauges.get("lost", 0.0)
 
@@ -112,7 +112,7 @@ def test_vehicles_and_clients_are_answered_again_soon_after_the_planners_machine
             for how, number in (("hangs", signal.SIGSTOP), ("is dead", signal.SIGKILL)):
                 asker = Asker(bus, "t0")
                 asker.ask_for(2.0)
-                before = {life for _, life in asker.answers}
+                before = {generation for _, generation in asker.answers}
                 os.killpg(launcher.pid, number)
                 asker.ask_for(SECONDS_PER_CASE)
                 gaps_s[how] = asker.longest_gap_s()

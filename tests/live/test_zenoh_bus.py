@@ -452,7 +452,7 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     listening = thief.declare_subscriber("swarm/stored/**", said.append)
     hears.subscribe(STORED, heard)
     world.settle()
-    ours.publish(STORED, stored(), plot=0, member="a1", agent="a0")
+    ours.publish(STORED, stored(), shard=0, member="a1", agent="a0")
     world.until(lambda: said and heard)
     put = (said[0].payload.to_bytes(), said[0].attachment.to_bytes())
     thief.put("swarm/stored/0/a1/a2", put[0], attachment=put[1])
@@ -462,7 +462,7 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     assert hears.counts["payloads_misrouted"] == hears.counts["payloads_dropped"] == 1
     listening.undeclare()
 
-    hears.serve(TABLE, answering((table(), {})), plot=0, member="a1", agent="a0")
+    hears.serve(TABLE, answering((table(), {})), shard=0, member="a1", agent="a0")
     world.settle()
     questions = []
 
@@ -472,7 +472,7 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
 
     spy = thief.declare_queryable("swarm/table/0/a1/a0", note_question)
     world.settle()
-    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0").of(Replied)) == 1
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0").of(Replied)) == 1
     answers = thief.get("swarm/table/0/a1/a0", payload=questions[0][0], attachment=questions[0][1])
     [answer] = [reply.ok for reply in answers if reply.ok is not None]
     spy.undeclare()
@@ -484,8 +484,8 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
 
     spy = thief.declare_queryable("swarm/table/0/a1/a0", again)
     world.settle()
-    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0").of(Replied)) == 1
-    assert asked(world, ours, TABLE, Claim(epoch=6), plot=0, member="a1", agent="a0").of(Replied) == []
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0").of(Replied)) == 1
+    assert asked(world, ours, TABLE, Claim(epoch=6), shard=0, member="a1", agent="a0").of(Replied) == []
     spy.undeclare()
 
 

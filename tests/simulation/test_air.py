@@ -71,11 +71,11 @@ def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(
 
     simulation.after_tick.append(look)
     simulation.run_until(SECONDS - 1.0)
-    plots = {
-        (each.agent.plan.group.vehicle_class, each._right_of_way.core.plots.all.start > 0)
+    shards = {
+        (each.agent.plan.group.vehicle_class, each._right_of_way.core.shards.all.start > 0)
         for each in agents(simulation).values()
     }
-    assert plots == {("ground", False), ("drone", True)}
+    assert shards == {("ground", False), ("drone", True)}
     assert LawBook(simulation).run(SECONDS) == []
     report = simulation.report(SECONDS)
     assert report["collisions"] == report["lethal_entries"] == 0

@@ -40,7 +40,7 @@ def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
 
 
 @pytest.mark.seeds(4)
-def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
+def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
     """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
     plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))
     simulation = Simulation(seeded(seed), faults=plan)
@@ -88,7 +88,7 @@ def test_vehicles_that_wait_because_two_of_three_members_are_gone_say_why_and_dr
     simulation.run_until(9)
     notes = [note for _, note in simulation.recorder.notes if note.kind == "waiting"]
     assert [note.id for note in notes] == ["a2"]
-    assert "plot 0 has no warden" in notes[0].text
+    assert "shard 0 has no leader" in notes[0].text
     before = cells(simulation)
     simulation.nodes["agent-a0"].boot()
     simulation.run_until(14)

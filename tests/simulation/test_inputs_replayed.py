@@ -79,7 +79,7 @@ def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
 ) -> None:
     replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 3)))
     assert {each.recorded.head.role for each in replayed} == {"keeper", "planner", "targets", "agent"}
-    assert seed != 4 or max(each.recorded.life for each in replayed) > 1  # crashes
+    assert seed != 4 or max(each.recorded.generation for each in replayed) > 1  # crashes
     for each in replayed:
         assert each.same, each
         assert each.outcome is not None
@@ -190,7 +190,7 @@ def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.Da
 
 
 def test_a_recording_that_ends_anywhere_is_replayed_up_to_there(run: Path, tmp_path: Path) -> None:
-    source = next(each.path for each in recordings_of(run, "planner-t0") if each.life == 2)
+    source = next(each.path for each in recordings_of(run, "planner-t0") if each.generation == 2)
     content = source.read_bytes()
     (tmp_path / "inputs").mkdir()
     path = tmp_path / "inputs" / source.name

@@ -1,4 +1,5 @@
-"""Bodies, guests, added agents, zones and orders at once, under all faults: what none of them breaks alone."""
+"""Obstacles, external vehicles, added agents, zones and orders at once, under all faults: what none of them breaks
+alone."""
 
 from __future__ import annotations
 

@@ -64,9 +64,9 @@ def _crashes(*when: tuple[float, str, bool]) -> Callable[[OrderedSimulation], No
     return plan
 
 
-def _guest(simulation: OrderedSimulation) -> None:
-    guest = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
-    simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(guest) and None)
+def _external(simulation: OrderedSimulation) -> None:
+    external = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
+    simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(external) and None)
     _crashes((3.5, "agent-g", True))(simulation)
 
 
@@ -89,11 +89,11 @@ RUNS: list[Run] = [
         _scenario(seed=6, standbys=StandbyConfig(planner=1, targets=1)),
         _crashes((2.0, "planner-t0", True), (2.2, "targets-0", False)),
     ),
-    ("a guest that goes", _scenario(seed=7), _guest),
+    ("an external vehicle that goes", _scenario(seed=7), _external),
     ("orders", _scenario(seed=8), _orders),
     ("a zone, an agent gone for good", _scenario(seed=9), _zone),
     (
-        "bodies, keeper killed",
+        "obstacles, keeper killed",
         _scenario(seed=10, rovers=(RoverConfig(name="r", count=2, speed_m_per_s=1.0, radius_m=4.0),)),
         _crashes((2.0, "keeper-0", False)),
     ),
@@ -218,8 +218,8 @@ def rows_in(text: str) -> list[list[str]]:
     labels = [column.label for column in facts.TARGET_FACTS if column.always]
     heads = [n for n, row in enumerate(rows) if row[: len(labels)] == labels]
     (head,) = heads
-    body = [row[: len(labels)] for row in rows[head + 1 :] if len(row) >= len(labels)]
-    return [row for row in body if not set(row[0]) <= set("-─")]
+    obstacle = [row[: len(labels)] for row in rows[head + 1 :] if len(row) >= len(labels)]
+    return [row for row in obstacle if not set(row[0]) <= set("-─")]
 
 
 def alarms_in(text: str, state: RunState) -> set[str]:

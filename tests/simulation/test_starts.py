@@ -10,7 +10,7 @@ from launch_scripts.simulation.worlds import SMALL, seeded
 from vehicle_agent.service import AgentService
 
 WITHIN_S = 1.3
-"""Seats, a warden, a table on file, costs and routes are a tick of an agent each, and a claim may come to nothing
+"""Seats, a leader, a table on file, costs and routes are a tick of an agent each, and a claim may come to nothing
 once."""
 
 

@@ -1,5 +1,5 @@
 """Agents think again only of vehicles about which something changed. No change may be missed: the kept value equals
-a recomputed one, in every tick, under faults, in crowds and among bodies."""
+a recomputed one, in every tick, under faults, in crowds and among obstacles."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.warden import Warden
+from vehicle_agent.traffic.shard_leader import Leader
 
 ROVERS = (
     RoverConfig(name="quick", count=3, speed_m_per_s=3.0, radius_m=4.0),
@@ -32,8 +32,8 @@ SECONDS = 6.0
 
 
 def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
-    """Agents that make marks all the time, three on one plot or more on many, or four in a crowd; among bodies, or
-    around targets that stay where they were caught."""
+    """Agents that make marks all the time, three on one shard or more on many, or four in a crowd; among obstacles,
+    or around targets that stay where they were caught."""
     kind, _, others = name.partition(" ")
     of_kind = {"small": SMALL, "wide": WIDE}.get(kind)
     scenario, terrain = (seeded(seed, of_kind), None) if of_kind else crowd(kind, seed, 40, 10, side=16)
@@ -79,13 +79,13 @@ def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeyp
     def compare_stands(node: Node) -> None:
         if isinstance(node.service, AgentService):
             agent = node.service.agent
-            by_plot: dict[int, list[object]] = {}
+            by_shard: dict[int, list[object]] = {}
             for id in agent.vehicles:
                 said = agent.holdings._say(id, agent.holdings._paths[id], agent.wishes[id])
-                for plot, told in said.stands.items():
-                    by_plot.setdefault(plot, []).append((id, told))
-            kept = {plot: [*stands.items()] for plot, stands in agent.holdings._stands.items() if stands}
-            assert kept == by_plot
+                for shard, told in said.stands.items():
+                    by_shard.setdefault(shard, []).append((id, told))
+            kept = {shard: [*stands.items()] for shard, stands in agent.holdings._stands.items() if stands}
+            assert kept == by_shard
 
     monkeypatch.setattr(CellRequests, "make", make_twice)
     simulation = simulation_of(name, seed)
@@ -95,17 +95,17 @@ def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeyp
     assert kept_wishes > 100
 
 
-def made_anew(warden: Warden) -> Warden:
-    """The twin of a warden, which has read its table, and looks at all vehicles of the plot."""
-    twin = copy.copy(warden)
-    twin._orders = Orders(warden._orders.table(warden._plot, "twin", (0, 0), {}))
+def made_anew(leader: Leader) -> Leader:
+    """The twin of a leader, which has read its table, and looks at all vehicles of the shard."""
+    twin = copy.copy(leader)
+    twin._orders = Orders(leader._orders.table(leader._shard, "twin", (0, 0), {}))
     twin._hosts = {
-        name: dataclasses.replace(host, asking=list(host.stands.values())) for name, host in warden._hosts.items()
+        name: dataclasses.replace(host, asking=list(host.stands.values())) for name, host in leader._hosts.items()
     }
     return twin
 
 
-def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[Entry]], list[int]]:
+def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, list[Entry]], list[int]]:
     """The entries that a table lists of a host, and the cells around its vehicles that others hold."""
     every = [*table.grants.items(), *(each for fence in table.fences for each in fence.entries.items())]
     ours = {vehicle: numbers for vehicle, numbers in table.grants.items() if agent_of(vehicle) == host}
@@ -116,7 +116,7 @@ def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[E
         earlier = [each for each in before if each[0][0] == number[0] and each[0][1:] < number[1:]]
         return Entry(number, [(n[1], n[2], of) for n, of in earlier if of != vehicle])
 
-    standing, cols = warden._hosts[host].standing, warden._plots.grid.cols
+    standing, cols = leader._hosts[host].standing, leader._shards.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]
     near = {stand.end + step for stand in (standing.vehicles if standing else ()) for step in steps}
     held = {number[0] for _, numbers in every for number in numbers}
@@ -126,31 +126,31 @@ def told_anew(warden: Warden, table: Table, host: str) -> tuple[dict[str, list[E
 
 
 @WORLDS
-def test_wardens_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name, seed, monkeypatch):
-    plan, granted, compared, told = Warden._plan, Warden.granted, 0, 0
+def test_leaders_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name, seed, monkeypatch):
+    plan, granted, compared, told = Leader._plan, Leader.granted, 0, 0
 
-    def plan_twice(warden: Warden, now_ns: int) -> None:
+    def plan_twice(leader: Leader, now_ns: int) -> None:
         nonlocal compared
-        twin = made_anew(warden)
+        twin = made_anew(leader)
         plan(twin, now_ns)
-        plan(warden, now_ns)
-        kept, anew = warden._orders, twin._orders
+        plan(leader, now_ns)
+        kept, anew = leader._orders, twin._orders
         assert kept.of == anew.of
         assert {cell: [*order.items()] for cell, order in kept.orders.items()} == {
             cell: [*order.items()] for cell, order in anew.orders.items()
         }
-        assert warden._pushed == twin._pushed
+        assert leader._pushed == twin._pushed
         compared += 1
 
-    def granted_twice(warden: Warden, table: Table, now_ns: int) -> Iterator[Granted]:
+    def granted_twice(leader: Leader, table: Table, now_ns: int) -> Iterator[Granted]:
         nonlocal told
-        for said in granted(warden, table, now_ns):
-            assert (said.grants, said.occupied) == told_anew(warden, table, said.host)
+        for said in granted(leader, table, now_ns):
+            assert (said.grants, said.occupied) == told_anew(leader, table, said.host)
             told += 1
             yield said
 
-    monkeypatch.setattr(Warden, "_plan", plan_twice)
-    monkeypatch.setattr(Warden, "granted", granted_twice)
+    monkeypatch.setattr(Leader, "_plan", plan_twice)
+    monkeypatch.setattr(Leader, "granted", granted_twice)
     simulation_of(name, seed).run_until(SECONDS)
     assert compared > 20
     assert told > 50

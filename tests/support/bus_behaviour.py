@@ -47,12 +47,12 @@ def test_a_process_hears_itself(world: World):
 def test_a_process_does_not_hear_itself_where_the_topic_says_so(world: World):
     a, b = world.bus("a"), world.bus("b")
     own, others = Box(), Box()
-    a.subscribe(STORED, own, plot=1)
-    b.subscribe(STORED, others, plot=1)
+    a.subscribe(STORED, own, shard=1)
+    b.subscribe(STORED, others, shard=1)
     world.settle()
-    stored = Stored(plot=1, agent="a0", epoch=3, seq=4)
-    a.publish(STORED, stored, plot=1, member="a1", agent="a0")
-    b.publish(STORED, stored, plot=1, member="a1", agent="a0")
+    stored = Stored(shard=1, agent="a0", epoch=3, seq=4)
+    a.publish(STORED, stored, shard=1, member="a1", agent="a0")
+    b.publish(STORED, stored, shard=1, member="a1", agent="a0")
     world.until(lambda: own and others)
     world.settle()
     assert [[event.message for event in box] for box in (own, others)] == [[stored], [stored]]

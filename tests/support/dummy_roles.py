@@ -126,7 +126,7 @@ def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
 
 
 class StandsStill(Idle):
-    """Its third tick never ends, in the first life of the process."""
+    """Its third tick never ends, in the first generation of the process."""
 
     def __init__(self, marker: Path) -> None:
         super().__init__()

@@ -1,4 +1,5 @@
-"""Everything that joins a running swarm at once: bodies, guests, added agents, zones, orders, under all faults."""
+"""Everything that joins a running swarm at once: obstacles, external vehicles, added agents, zones, orders, under
+all faults."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from support.simulated import Guest, OrderedSimulation, cells
+from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
 from launch_scripts.simulation.faults import Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
@@ -20,8 +21,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import added_agent
 from swarm.config.scenario import RoverConfig
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
-from swarm.wire.messages.vehicles import Body, RemoveVehicles
-from swarm.wire.topics import BODY, LEAVE
+from swarm.wire.messages.vehicles import Obstacle, RemoveVehicles
+from swarm.wire.topics import LEAVE, OBSTACLE
 from vehicle_agent.service import AgentService
 
 TICK_S = 0.1
@@ -32,8 +33,8 @@ _ROVERS = (
 )
 
 
-class Robot(Guest):
-    """A guest that is a body too, as in `swarm.client`."""
+class Robot(ExternalVehicle):
+    """An external vehicle that is an obstacle too, as in `swarm.client`."""
 
     def __init__(self, world: Interplay, name: str) -> None:
         super().__init__(world.simulation, name, world.chance.choice(world.free), world.chance, world.open)
@@ -41,7 +42,7 @@ class Robot(Guest):
         self.incarnation = self.seq = 0
 
     def boot(self) -> None:
-        if not self.world.guests_over:
+        if not self.world.externals_over:
             self.incarnation = self.incarnation if self.service is not None else self.now_ns
             super().boot()
 
@@ -49,12 +50,14 @@ class Robot(Guest):
         self.seq += 1
         x_m, y_m = self.grid.centre_m(cell)
         half_m = self.grid.resolution_m / 2
-        report = Body(id=self.name, incarnation=self.incarnation, seq=self.seq, x_m=x_m, y_m=y_m, radius_m=half_m)
-        self.bus.publish(BODY, report, id=self.name)
+        report = Obstacle(
+            id=self.name, incarnation=self.incarnation, seq=self.seq, x_m=x_m, y_m=y_m, radius_m=half_m
+        )
+        self.bus.publish(OBSTACLE, report, id=self.name)
 
 
 class Walker:
-    """A body without a driver: it stands, walks onto things, leaps, or reports nonsense at the bounds."""
+    """An obstacle without a driver: it stands, walks onto things, leaps, or reports nonsense at the bounds."""
 
     def __init__(self, world: Interplay, name: str, until_s: float) -> None:
         chance = world.chance
@@ -90,7 +93,7 @@ class Walker:
             self.x_m, self.y_m = world.grid.centre_m(chance.choice(world.free))
         self.seq += 1
         twin = 1 if self.kind == "twins" and self.seq % 2 else 0
-        report = Body(
+        report = Obstacle(
             id=self.name,
             incarnation=self.incarnation + twin,
             seq=self.seq,
@@ -101,7 +104,7 @@ class Walker:
             radius_m=self.radius_m,
             lease_s=0.0 if gone else self.lease_s,
         )
-        self.bus.publish(BODY, report, id=self.name)
+        self.bus.publish(OBSTACLE, report, id=self.name)
         return not gone
 
 
@@ -132,7 +135,7 @@ class Interplay:
         self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
         self.free = [int(cell) for cell in np.flatnonzero(self.open)]
         self.broken: list[str] = []
-        self.guests_over = False
+        self.externals_over = False
         self.routed_after_s: float | None = None
         self.removed: set[str] = set()
         self._before: dict[str, tuple[Any, dict[str, tuple[int, bool, bool]], np.ndarray, set[int]]] = {}
@@ -205,7 +208,7 @@ class Interplay:
         ]
         for order in ends:
             self.calls += [(quiet_s + 1.5 + again, lambda o=order: simulation.give(o)) for again in (0.0, 0.4, 0.8)]
-        self.calls.append((quiet_s + 1.5, self._end_guests))
+        self.calls.append((quiet_s + 1.5, self._end_externals))
         self.calls.sort(key=lambda call: call[0])
 
     def _node(self, name: str, do: Any) -> None:
@@ -215,13 +218,13 @@ class Interplay:
     def _remove(self, agent: str, vehicles: list[str]) -> None:
         self._operator.ask(LEAVE, RemoveVehicles(vehicles=vehicles), lambda event: None, tag="x", agent=agent)
 
-    def _end_guests(self) -> None:
-        self.guests_over = True
+    def _end_externals(self) -> None:
+        self.externals_over = True
         for robot in self.robots:
             if robot.service is None and robot.on is not None:  # it comes back, to leave by its own word
-                self.guests_over = False
+                self.externals_over = False
                 robot.boot()
-                self.guests_over = True
+                self.externals_over = True
             robot.leave()
 
     def _order(self) -> None:
@@ -265,10 +268,10 @@ class Interplay:
     def _forget_removed(self, node: Node) -> None:
         """A vehicle that has left by its agent's word stands on no cell."""
         if isinstance(node.service, AgentService):
-            bodies = self.trial._cells.get(node.name, {})
-            gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._entries.away)
+            obstacles = self.trial._cells.get(node.name, {})
+            gone = node.service._removed | (obstacles.keys() & node.service.agent.holdings._entries.away)
             for id in gone:
-                bodies.pop(id, None)
+                obstacles.pop(id, None)
             self.removed |= gone
         for robot in self.robots:
             self.trial._cells[robot.name] = {} if robot.on is None else {robot.name: robot.on}
@@ -284,7 +287,9 @@ class Interplay:
             for id, vehicle in agent.vehicles.items():
                 if id not in before:
                     if id.startswith("extra") and id not in self._seen and vehicle.cell in shut:
-                        self.broken.append(f"{now_s:.2f} {id} enters the map on cell {vehicle.cell}, on a body")
+                        self.broken.append(
+                            f"{now_s:.2f} {id} enters the map on cell {vehicle.cell}, on an obstacle"
+                        )
                     if id.startswith("extra") and id not in self._seen and np.isinf(closed[vehicle.cell]):
                         self.broken.append(f"{now_s:.2f} {id} enters the map on lethal cell {vehicle.cell}")
                     continue
@@ -306,7 +311,7 @@ class Interplay:
         self._seen.update(agent.vehicles)
         stopped = service._obedience.book.stopped
         states = {id: (v.cell, stopped(id), v.motion.at_rest) for id, v in agent.vehicles.items()}
-        self._before[node.name] = (service, states, pace.copy(), set(agent.bodies._closed))
+        self._before[node.name] = (service, states, pace.copy(), set(agent.obstacles._closed))
 
     # --- the run ----------------------------------------------------------------------------------------------
 

@@ -76,7 +76,7 @@ class MessageFuzzer:
         self._classes = (GROUND, *classes)
         self._now_ns = now_ns
         self._authors = [name for name in names if name.count(".") == 2] or ["all.a0.1"]
-        """<group>.<agent>.<life>"""
+        """<group>.<agent>.<generation>"""
         self._vehicles = [name for name in names if agent_of(name) != name] or ["a0-00"]
         self._chance = random.Random(seed)
         self.largest: tuple[int, ...] | None = None

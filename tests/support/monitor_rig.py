@@ -25,15 +25,15 @@ from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import GoalStates
 from swarm.wire.messages.planning import Believed, PlannerStatus, Sighted, TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.vehicles import Body, Fleet, Followed
+from swarm.wire.messages.vehicles import Fleet, Followed, Obstacle
 from swarm.wire.topics import (
     BELIEVED,
-    BODY,
     FLEET,
     FOLLOWED,
     GOAL_STATES,
     MARKS,
     NOTE,
+    OBSTACLE,
     POSE,
     SIGHTED,
     STATS,
@@ -128,8 +128,8 @@ def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
             bus.publish(BELIEVED, message, target=message.target)
         case GoalStates():
             bus.publish(GOAL_STATES, message, agent=message.agent)
-        case Body():
-            bus.publish(BODY, message, id=message.id)
+        case Obstacle():
+            bus.publish(OBSTACLE, message, id=message.id)
         case MarkSet():
             region = terrain.grid.region_of_tile(message.tile)
             bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)

@@ -25,7 +25,7 @@ from swarm.config.scenario import TlsConfig
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, is_keeper
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
-from swarm.wire.messages.processes import Beat
+from swarm.wire.messages.processes import Heartbeat
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import DIGEST, FLEET, FOLLOWED, LEAD, PUSHED_ROUTE, ROUTE
@@ -68,8 +68,8 @@ class Notes:
                 self.pushed.setdefault(pushed.vehicle, []).append((now_s, pushed.incarnation))
             case Heard(message=Followed() as followed):
                 self.followed.setdefault(followed.vehicle, []).append(now_s)
-            case Heard(message=Beat(role="planner", leads=True) as beat):
-                self.leads[beat.id] = now_s
+            case Heard(message=Heartbeat(role="planner", leads=True) as heartbeat):
+                self.leads[heartbeat.id] = now_s
             case Heard(message=Digest() as digest) if is_keeper(digest.author):
                 kept = self.acknowledged.setdefault(digest.author.split(".")[1], {})
                 for author, rows in digest.held.items():

@@ -1,4 +1,4 @@
-"""A world in which the cores of right of way meet everything that may happen: two plots with three members each,
+"""A world in which the cores of right of way meet everything that may happen: two shards with three members each,
 hosts with known and with made-up bodies, second lives beside the first, and a network that loses, repeats, delays
 and reorders. No time passes: any party acts at any moment."""
 
@@ -13,14 +13,14 @@ from swarm.right_of_way.entries import HostEntries
 from swarm.wire.messages.traffic import Entry, Number, Stamp, Table
 from vehicle_agent.traffic.cell_orders import Orders
 
-SIDE, MEMBERS, PLOTS = 6, 3, 2
+SIDE, MEMBERS, SHARDS = 6, 3, 2
 HOSTS = ("a", "b", "c", "guest")
 EACH = 3
 MADE_UP = ("b", "c")
-"""Hosts that simulate their vehicles: a new life does not know where a body was."""
+"""Hosts that simulate their vehicles: a new generation does not know where a body was."""
 
 
-def plot_of(cell: int) -> int:
+def shard_of(cell: int) -> int:
     return int(cell % SIDE >= SIDE // 2)
 
 
@@ -40,7 +40,7 @@ def vehicles_of(host: str) -> list[str]:
 
 @dataclass(eq=False)
 class Seat:
-    """A member of a plot: what is on its file, and its part as a warden."""
+    """A member of a shard: what is on its file, and its part as a leader."""
 
     stored: Table
     promised: int = 0
@@ -54,8 +54,9 @@ class Seat:
 
 
 @dataclass(eq=False)
-class Life:
-    """One life of a host; `dead` are lives that it can prove to have ended. One that is cut off drives on."""
+class Generation:
+    """One generation of a host; `dead` are generations that it can prove to have ended. One that is cut off drives
+    on."""
 
     host: str
     entries: HostEntries
@@ -84,17 +85,17 @@ class OrderWorld:
         self.collisions: list[tuple[str, str]] = []
         self.counts = dict.fromkeys(("moves", "followed", "seams", "takeovers", "lives", "given_back"), 0)
         cells = self.chance.sample(range(SIDE * SIDE), EACH * (len(HOSTS) - 1))
-        self.lives: list[Life] = []
+        self.generations: list[Generation] = []
         self.bodies: dict[tuple[str, int], int] = {}
-        """(vehicle, life) -> the cell of its body; a body of a dead process stays."""
-        first = [Table(plot=plot, agent="member", epoch=0, seq=0, hosts={}, grants={}) for plot in range(PLOTS)]
+        """(vehicle, generation) -> the cell of its body; a body of a dead process stays."""
+        first = [Table(shard=shard, agent="member", epoch=0, seq=0, hosts={}, grants={}) for shard in range(SHARDS)]
         spawns: dict[str, int] = {}
         for host in HOSTS[:-1]:
             for vehicle in vehicles_of(host):
                 spawns[vehicle] = cell = cells.pop()
-                first[plot_of(cell)].grants[vehicle] = [(cell, 0, 1)]
+                first[shard_of(cell)].grants[vehicle] = [(cell, 0, 1)]
                 self.bodies[vehicle, 0] = cell
-        self.seats = [[Seat(first[plot]) for _ in range(MEMBERS)] for plot in range(PLOTS)]
+        self.seats = [[Seat(first[shard]) for _ in range(MEMBERS)] for shard in range(SHARDS)]
         self.first = first
         if mutate is not None:
             mutate(self)
@@ -116,8 +117,8 @@ class OrderWorld:
 
     # --- members --------------------------------------------------------------------------------------------
 
-    def hear_table(self, plot: int, member: int, sender: int, table: Table) -> None:
-        seat = self.seats[plot][member]
+    def hear_table(self, shard: int, member: int, sender: int, table: Table) -> None:
+        seat = self.seats[shard][member]
         if not seat.up:
             return
         if (table.stamp[0] >= seat.promised or self.obliging) and table.stamp > seat.stored.stamp:
@@ -125,36 +126,36 @@ class OrderWorld:
             if seat.orders is not None and seat.stamp[0] < table.stamp[0]:
                 seat.orders = None
         if seat.stored.stamp == table.stamp:
-            self.send(self.hear_stored, plot, sender, member, table.stamp)
+            self.send(self.hear_stored, shard, sender, member, table.stamp)
 
-    def hear_stored(self, plot: int, member: int, sender: int, stamp: Stamp) -> None:
-        seat = self.seats[plot][member]
+    def hear_stored(self, shard: int, member: int, sender: int, stamp: Stamp) -> None:
+        seat = self.seats[shard][member]
         if not seat.up or stamp not in seat.told:
             return
         acked = seat.acked.setdefault(stamp, set())
         acked.add(sender)
         if len(acked) >= self.majority:
-            self.grant(plot, seat.told[stamp])
+            self.grant(shard, seat.told[stamp])
 
-    def grant(self, plot: int, table: Table) -> None:
+    def grant(self, shard: int, table: Table) -> None:
         orders = Orders(table)
-        for life in self.lives:
-            if not life.up:
+        for generation in self.generations:
+            if not generation.up:
                 continue
-            known = table.hosts.get(life.host, (0, 0))[0]
-            grants = orders.granted(life.host)
-            self.send(self.hear_granted, life, plot, table.stamp, known, grants)
+            known = table.hosts.get(generation.host, (0, 0))[0]
+            grants = orders.granted(generation.host)
+            self.send(self.hear_granted, generation, shard, table.stamp, known, grants)
 
-    def hear_claim(self, plot: int, member: int, claimant: int, epoch: int) -> None:
-        seat = self.seats[plot][member]
+    def hear_claim(self, shard: int, member: int, claimant: int, epoch: int) -> None:
+        seat = self.seats[shard][member]
         if seat.up and epoch > seat.promised:
             seat.promised = epoch
             if claimant != member:
                 seat.orders = None
-            self.send(self.hear_promise, plot, claimant, member, epoch, seat.stored)
+            self.send(self.hear_promise, shard, claimant, member, epoch, seat.stored)
 
-    def hear_promise(self, plot: int, member: int, sender: int, epoch: int, table: Table) -> None:
-        seat = self.seats[plot][member]
+    def hear_promise(self, shard: int, member: int, sender: int, epoch: int, table: Table) -> None:
+        seat = self.seats[shard][member]
         if not seat.up or seat.claimed != epoch:
             return
         seat.promises[sender] = table
@@ -163,20 +164,20 @@ class OrderWorld:
             seat.orders, seat.stamp, seat.claimed = Orders(newest), (epoch, 0), 0
             self.counts["takeovers"] += 1
 
-    def claim(self, plot: int, member: int) -> None:
-        seat = self.seats[plot][member]
+    def claim(self, shard: int, member: int) -> None:
+        seat = self.seats[shard][member]
         if seat.up:
             seat.claimed = (seat.promised // MEMBERS + 1) * MEMBERS + member
             seat.promises = {}
             for other in range(MEMBERS):
                 if other == member:
-                    self.hear_claim(plot, other, member, seat.claimed)
+                    self.hear_claim(shard, other, member, seat.claimed)
                 else:
-                    self.send(self.hear_claim, plot, other, member, seat.claimed)
+                    self.send(self.hear_claim, shard, other, member, seat.claimed)
 
-    def plan(self, plot: int, member: int) -> None:
-        """A warden appends some entries, anywhere beside where paths end, and tells its table."""
-        seat, chance = self.seats[plot][member], self.chance
+    def plan(self, shard: int, member: int) -> None:
+        """A leader appends some entries, anywhere beside where paths end, and tells its table."""
+        seat, chance = self.seats[shard][member], self.chance
         if not seat.up or seat.orders is None:
             return
         orders, fresh = seat.orders, (seat.stamp[0], seat.stamp[1] + 1)
@@ -185,92 +186,112 @@ class OrderWorld:
                 path = orders.of.get(vehicle)
                 if path and len(path) < 4:
                     orders.append(
-                        vehicle, chance.choice([c for c in beside(path[-1][0]) if plot_of(c) == plot]), fresh
+                        vehicle, chance.choice([c for c in beside(path[-1][0]) if shard_of(c) == shard]), fresh
                     )
                 elif not path:  # it comes in over the seam, or from nowhere
-                    near = [c for other in self.ends(vehicle) for c in beside(other) if plot_of(c) == plot]
-                    cells = near or [c for c in range(SIDE * SIDE) if plot_of(c) == plot]
+                    near = [c for other in self.ends(vehicle) for c in beside(other) if shard_of(c) == shard]
+                    cells = near or [c for c in range(SIDE * SIDE) if shard_of(c) == shard]
                     if near or chance.random() < 0.3:
                         orders.append(vehicle, chance.choice(cells), fresh)
-        told = orders.table(plot, "member", fresh, {})
+        told = orders.table(shard, "member", fresh, {})
         seat.stamp = fresh
         seat.told = {stamp: table for stamp, table in seat.told.items() if stamp[0] == told.stamp[0]}
         seat.told[told.stamp] = told
         for other in range(MEMBERS):
-            self.send(self.hear_table, plot, other, member, told)
+            self.send(self.hear_table, shard, other, member, told)
 
     def ends(self, vehicle: str) -> list[int]:
         """Cells where paths of a vehicle end, as its hosts say."""
-        paths = (life.entries.paths.get(vehicle) for life in self.lives if life.up)
+        paths = (generation.entries.paths.get(vehicle) for generation in self.generations if generation.up)
         return [path[-1].cell for path in paths if path]
 
     # --- hosts ----------------------------------------------------------------------------------------------
 
     def boot(self, host: str, dead: list[int], bodies: dict[str, int]) -> None:
-        number = 1 + max([life.entries.life for life in self.lives if life.host == host], default=0)
-        entries = HostEntries(number, plot_of, adjacent, bodies)
+        number = 1 + max(
+            [generation.entries.generation for generation in self.generations if generation.host == host], default=0
+        )
+        entries = HostEntries(number, shard_of, adjacent, bodies)
         for key in [key for key in self.bodies if key[0].rpartition("-")[0] == host and key[1] in dead]:
             cell = self.bodies.pop(key)
             if key[0] in bodies:
                 self.bodies[key[0], number] = cell
-        self.lives.append(Life(host, entries, dead))
+        self.generations.append(Generation(host, entries, dead))
         self.counts["lives"] += 1
 
-    def hear_granted(self, life: Life, plot: int, stamp: Stamp, known: int, grants: dict[str, list[Entry]]) -> None:
-        if not life.up or life.cut:
-            return
-        if known > life.entries.life and not life.replaced:
-            life.replaced = True  # it drives no more, and its made-up bodies vanish
-            if life.host in MADE_UP:
-                for vehicle in vehicles_of(life.host):
-                    self.bodies.pop((vehicle, life.entries.life), None)
-        if not life.replaced:
-            life.entries.hear_granted(plot, stamp, known, grants)
-
-    def tell(self, life: Life) -> None:
-        life.seq += 1
-        if life.cut:
-            return
-        for plot, seats in enumerate(self.seats):
-            holds, knows = life.entries.holds(plot), life.entries.knows.get(plot, (0, 0))
-            for member in range(len(seats)):
-                self.send(self.hear_standing, plot, member, life, life.seq, holds, knows, life.replaced)
-        for other in self.lives:
-            over = frozenset(number for numbers in life.entries.over.values() for number in numbers)
-            if other is not life and other.up and over:
-                self.send(self.hear_left, other, life.host, over)
-
-    def hear_left(self, life: Life, host: str, numbers: frozenset[Number]) -> None:
-        if life.up:
-            life.entries.hear_left(host, numbers)
-
-    def hear_standing(
-        self, plot: int, member: int, life: Life, seq: int, holds: dict[str, Any], knows: Stamp, ended: bool
+    def hear_granted(
+        self, generation: Generation, shard: int, stamp: Stamp, known: int, grants: dict[str, list[Entry]]
     ) -> None:
-        seat = self.seats[plot][member]
+        if not generation.up or generation.cut:
+            return
+        if known > generation.entries.generation and not generation.replaced:
+            generation.replaced = True  # it drives no more, and its made-up bodies vanish
+            if generation.host in MADE_UP:
+                for vehicle in vehicles_of(generation.host):
+                    self.bodies.pop((vehicle, generation.entries.generation), None)
+        if not generation.replaced:
+            generation.entries.hear_granted(shard, stamp, known, grants)
+
+    def tell(self, generation: Generation) -> None:
+        generation.seq += 1
+        if generation.cut:
+            return
+        for shard, seats in enumerate(self.seats):
+            holds, knows = generation.entries.holds(shard), generation.entries.knows.get(shard, (0, 0))
+            for member in range(len(seats)):
+                self.send(
+                    self.hear_host_state,
+                    shard,
+                    member,
+                    generation,
+                    generation.seq,
+                    holds,
+                    knows,
+                    generation.replaced,
+                )
+        for other in self.generations:
+            over = frozenset(number for numbers in generation.entries.over.values() for number in numbers)
+            if other is not generation and other.up and over:
+                self.send(self.hear_left, other, generation.host, over)
+
+    def hear_left(self, generation: Generation, host: str, numbers: frozenset[Number]) -> None:
+        if generation.up:
+            generation.entries.hear_left(host, numbers)
+
+    def hear_host_state(
+        self,
+        shard: int,
+        member: int,
+        generation: Generation,
+        seq: int,
+        holds: dict[str, Any],
+        knows: Stamp,
+        ended: bool,
+    ) -> None:
+        seat = self.seats[shard][member]
         if not seat.up or seat.orders is None:
             return
-        number = life.entries.life
+        number = generation.entries.generation
         if ended:
-            seat.orders.end(life.host, number)
+            seat.orders.end(generation.host, number)
         else:
-            bodies = {id: cell for id, cell in life.entries.bodies.items() if plot_of(cell) == plot}
+            bodies = {id: cell for id, cell in generation.entries.bodies.items() if shard_of(cell) == shard}
             fresh = (seat.stamp[0], seat.stamp[1] + 1)
-            known = seat.orders.hosts.get(life.host, (0, 0))[0]
-            if number > known:  # a table is skipped, so that two lives begin with different entries
+            known = seat.orders.hosts.get(generation.host, (0, 0))[0]
+            if number > known:  # a table is skipped, so that two generations begin with different entries
                 seat.stamp = fresh
                 fresh = (fresh[0], fresh[1] + 1)
-            seat.orders.take_standing(life.host, number, seq, holds, knows, life.dead, bodies, fresh)
+            seat.orders.take_host_state(generation.host, number, seq, holds, knows, generation.dead, bodies, fresh)
 
-    def drive(self, life: Life) -> None:
-        entries, chance = life.entries, self.chance
-        if not entries.paths or life.replaced:
+    def drive(self, generation: Generation) -> None:
+        entries, chance = generation.entries, self.chance
+        if not entries.paths or generation.replaced:
             return
         vehicle = chance.choice(sorted(entries.paths))
         path = entries.paths[vehicle]
-        if life.host == HOSTS[-1] and vehicle in entries.placed and chance.random() < 0.01:
+        if generation.host == HOSTS[-1] and vehicle in entries.placed and chance.random() < 0.01:
             entries.leave(vehicle)
-            self.bodies.pop((vehicle, entries.life), None)
+            self.bodies.pop((vehicle, entries.generation), None)
             return
         if vehicle in entries.placed and len(path) > 1 and chance.random() < 0.08:
             entries.give_back(vehicle)
@@ -282,42 +303,46 @@ class OrderWorld:
             cell = entries.paths[vehicle][0].cell
             self.counts["moves"] += 1
             self.counts["followed"] += follows
-            self.counts["seams"] += plot_of(before.cell) != plot_of(cell)
-            self.bodies[vehicle, entries.life] = cell
+            self.counts["seams"] += shard_of(before.cell) != shard_of(cell)
+            self.bodies[vehicle, entries.generation] = cell
             for (other, number), there in self.bodies.items():
                 if there == cell and other != vehicle and self.is_there(other, number):
                     self.collisions.append((vehicle, other))
 
     def is_there(self, vehicle: str, number: int) -> bool:
-        """Returns True if a body exists: a simulated one does once a life of its host has placed it."""
+        """Returns True if a body exists: a simulated one does once a generation of its host has placed it."""
         host = vehicle.rpartition("-")[0]
-        lives = [life.entries for life in self.lives if life.host == host and life.entries.life == number]
-        return host not in MADE_UP or any(vehicle in entries.placed for entries in lives)
+        generations = [
+            generation.entries
+            for generation in self.generations
+            if generation.host == host and generation.entries.generation == number
+        ]
+        return host not in MADE_UP or any(vehicle in entries.placed for entries in generations)
 
     def disturb(self) -> None:
-        """A member or a host dies or starts again; or a second life starts beside the first."""
+        """A member or a host dies or starts again; or a second generation starts beside the first."""
         chance = self.chance
         if chance.random() < 0.2:
-            for life in self.lives:
-                life.cut = False
+            for generation in self.generations:
+                generation.cut = False
         if chance.random() < 0.4:
-            plot, member = chance.randrange(PLOTS), chance.randrange(MEMBERS)
-            seat = self.seats[plot][member]
-            stored = self.first[plot] if self.forgetful and not seat.up else seat.stored
+            shard, member = chance.randrange(SHARDS), chance.randrange(MEMBERS)
+            seat = self.seats[shard][member]
+            stored = self.first[shard] if self.forgetful and not seat.up else seat.stored
             promised = 0 if self.forgetful and not seat.up else seat.promised
-            self.seats[plot][member] = Seat(stored, promised, not seat.up)
+            self.seats[shard][member] = Seat(stored, promised, not seat.up)
             return
         host = chance.choice(HOSTS)
-        ours = [life for life in self.lives if life.host == host]
-        life = ours[-1]
-        if life.up and (host not in MADE_UP or chance.random() < 0.7):
-            life.up = False
-        elif life.up and not self.proves_too_much:
-            life.cut = True
+        ours = [generation for generation in self.generations if generation.host == host]
+        generation = ours[-1]
+        if generation.up and (host not in MADE_UP or chance.random() < 0.7):
+            generation.up = False
+        elif generation.up and not self.proves_too_much:
+            generation.cut = True
             self.boot(host, [], {})  # on another machine
         else:
-            life.cut = life.up
-            dead = [each.entries.life for each in ours if not each.up or self.proves_too_much]
+            generation.cut = generation.up
+            dead = [each.entries.generation for each in ours if not each.up or self.proves_too_much]
             if len(dead) == len(ours):
                 dead.append(0)
             known = {vehicle: cell for (vehicle, at), cell in self.bodies.items() if at in dead}
@@ -333,14 +358,14 @@ class OrderWorld:
             if draw < 0.90 and self.net:
                 self.deliver()
             elif draw < 0.94:
-                life = chance.choice([each for each in self.lives if each.up] or self.lives)
-                if life.up:
-                    self.drive(life)
-                    self.tell(life)
+                generation = chance.choice([each for each in self.generations if each.up] or self.generations)
+                if generation.up:
+                    self.drive(generation)
+                    self.tell(generation)
             elif draw < 0.97:
-                self.plan(chance.randrange(PLOTS), chance.randrange(MEMBERS))
+                self.plan(chance.randrange(SHARDS), chance.randrange(MEMBERS))
             elif draw < 0.97 + self.claims or step < 6:
-                self.claim(chance.randrange(PLOTS), chance.randrange(MEMBERS))
+                self.claim(chance.randrange(SHARDS), chance.randrange(MEMBERS))
             elif chance.random() < 10 * self.crash:
                 self.disturb()
             if self.collisions:

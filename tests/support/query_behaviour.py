@@ -165,13 +165,13 @@ def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
 
 def test_one_that_hears_a_topic_may_serve_it_too(world: World):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
-    table = Table(plot=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
+    table = Table(shard=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
     b.subscribe(TABLE, heard)
     b.serve(TABLE, answering((table, {"plot": 0, "member": "a1", "agent": "a0"})))
     world.settle()
-    a.publish(TABLE, table, plot=0, member="a1", agent="a0")
+    a.publish(TABLE, table, shard=0, member="a1", agent="a0")
     world.until(lambda: heard)
     claim = Claim(epoch=1)
     assert [
-        event.message for event in asked(world, a, TABLE, claim, plot=0, member="a1", agent="a0").of(Replied)
+        event.message for event in asked(world, a, TABLE, claim, shard=0, member="a1", agent="a0").of(Replied)
     ] == [table]

@@ -1,4 +1,4 @@
-"""Helpers for tests of whole swarms: agents and vehicles, orders, agents that join, guests."""
+"""Helpers for tests of whole swarms: agents and vehicles, orders, agents that join, external vehicles."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.liveness import ranked_id
-from swarm.right_of_way.guest_session import GuestService
-from swarm.right_of_way.incarnations import MemoryLives
+from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way.incarnations import MemoryGenerations
 from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, SEND_VEHICLE, ZONES
@@ -122,8 +122,8 @@ class OrderedSimulation(Simulation):
             node.retired = True
 
 
-class Guest:
-    """A guest that drives at random on what it is granted, among vehicles that chase targets.
+class ExternalVehicle:
+    """An external vehicle that drives at random on what it is granted, among vehicles that chase targets.
 
     open  whether each cell may be entered
     on    where it is; None until it is granted a cell, and once it has left
@@ -136,15 +136,15 @@ class Guest:
         cell: int,
         chance: random.Random,
         open: Sequence[bool],
-        lives: MemoryLives | None = None,
+        generations: MemoryGenerations | None = None,
     ) -> None:
         self.simulation, self.name, self.cell, self.chance, self.open = simulation, name, cell, chance, open
         self.grid = simulation.terrain.grid
-        self.lives = lives or MemoryLives()
+        self.generations = generations or MemoryGenerations()
         self.on: int | None = None
         self.moves = 0
         self.warnings: list[str] = []
-        self.service: GuestService | None = None
+        self.service: ExternalService | None = None
         self.bus: Any = None
 
     @property
@@ -157,15 +157,15 @@ class Guest:
         simulation, now_ns = self.simulation, self.now_ns
         namespace = simulation.scenario.network.namespace
         self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
-        self.service = GuestService(
-            self.name, self.grid, now_ns, self.lives, self.bus, self.hear, self.warnings.append
+        self.service = ExternalService(
+            self.name, self.grid, now_ns, self.generations, self.bus, self.hear, self.warnings.append
         )
         self.service.start(now_ns)
         self.service.enter(self.cell if self.on is None else self.on, now_ns)
 
     def hear(self, event: Event) -> None:
         if self.service is not None:
-            self.service.on_guest_event(event, self.now_ns)
+            self.service.on_external_event(event, self.now_ns)
 
     def crash(self) -> None:
         if self.service is not None:
@@ -180,19 +180,19 @@ class Guest:
     def tick(self) -> None:
         if self.service is None:
             return
-        guest, chance = self.service.guest, self.chance
-        if guest is not None and guest.cells:
-            if len(guest.cells) > 1 and chance.random() < 0.5:
-                guest.left(guest.cells[0])
+        external, chance = self.service.external, self.chance
+        if external is not None and external.cells:
+            if len(external.cells) > 1 and chance.random() < 0.5:
+                external.left(external.cells[0])
                 self.moves += 1
-            self.on = self.cell = guest.cells[0]
-            path = list(guest.cells)
+            self.on = self.cell = external.cells[0]
+            path = list(external.cells)
             while len(path) < 4:
                 near = [cell for cell in self.near(path[-1]) if cell not in path[-2:]]
                 if not near:
                     break
                 path.append(chance.choice(near))
-            guest.want(path, self.near(self.on))
+            external.want(path, self.near(self.on))
             self.stands(self.on)
         self.service.tick(self.now_ns)
 

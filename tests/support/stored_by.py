@@ -44,7 +44,7 @@ def write(folder: Path) -> None:
         store.save_sightings([sighted])
         store.save_orders(orders)
     promises = FilePromiseStore(folder / "promises-a0")
-    promises.save_own(OwnRecord(disk=7, lives=[1, 1 << 32], noted={"a1": 5}, noted_by=["a2"]))
+    promises.save_own(OwnRecord(disk=7, generations=[1, 1 << 32], noted={"a1": 5}, noted_by=["a2"]))
     promises.save(4, table)
     promises.close()
 
@@ -55,9 +55,9 @@ def read(folder: Path) -> str:
         store.bind("terrain", _GRID)
         kept = [*store.load(), *store.sightings(), *store.orders()]
     promises = FilePromiseStore(folder / "promises-a0")
-    [(plot, (promised, table))] = promises.saved.items()
+    [(shard, (promised, table))] = promises.saved.items()
     kept += [promises.own, table]
-    return "\n".join([f'{{"plot": {plot}, "promised": {promised}}}', *(encode(each).decode() for each in kept)])
+    return "\n".join([f'{{"plot": {shard}, "promised": {promised}}}', *(encode(each).decode() for each in kept)])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Agents, their members and wardens, and the bodies of their vehicles, on a network that may do anything."""
+"""Agents, their members and leaders, and the bodies of their vehicles, on a network that may do anything."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
@@ -73,7 +73,7 @@ class Disk:
 
 
 class Process:
-    """One life of one agent. Its vehicles' bodies are on `disk`: they stand where they are when it dies."""
+    """One generation of one agent. Its vehicles' bodies are on `disk`: they stand where they are when it dies."""
 
     def __init__(self, world: TrafficWorld, agent: str, disk: Disk) -> None:
         self.world, self.agent, self.disk = world, agent, disk
@@ -90,7 +90,7 @@ class Process:
 
     def make_rights(self) -> RightOfWay:
         world, disk = self.world, self.disk
-        return RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved)
+        return RightOfWay(self.agent, world.shards, world.spawns, disk.own, disk.saved)
 
     @property
     def now_ns(self) -> int:
@@ -119,18 +119,20 @@ class Process:
                 case AskKnown():
                     self.world.begin(self)
                 case Save(promised, table):
-                    self.disk.saved[table.plot] = (promised, table)
+                    self.disk.saved[table.shard] = (promised, table)
                 case AskPromises():
                     for member in action.members:
                         self.world.claim(self, action, member)
                 case Tell(members, standing):
                     for member in members:
-                        self.world.send(self, member, lambda to, s=standing: to.rights.hear_standing(s, to.now_ns))
+                        self.world.send(
+                            self, member, lambda to, s=standing: to.rights.hear_host_state(s, to.now_ns)
+                        )
                 case Table():
-                    for member in self.world.plots.members(action.plot):
+                    for member in self.world.shards.members(action.shard):
                         self.world.send(self, member, lambda to, t=action: to.hear_table(t))
                 case Stored():
-                    for member in self.world.plots.members(action.plot):
+                    for member in self.world.shards.members(action.shard):
                         self.world.send(self, member, lambda to, s=action: to.hear_stored(s))
                 case Granted():
                     self.world.send(self, action.host, lambda to, g=action: to.hear_granted(g))
@@ -169,7 +171,7 @@ class Process:
         self.own_time.tick(self.world.now_ns + self.offset_ns)
         self.see_tokens()
         wishes = {}
-        if holdings.life and not holdings.replaced:
+        if holdings.generation and not holdings.replaced:
             for vehicle in self.vehicles:
                 if holdings.path(vehicle):
                     self.drive(vehicle)
@@ -240,7 +242,7 @@ class TrafficWorld:
         self.now_ns = 0
         self.grid = GridSpec(size, size, 1.0)
         names = [f"a{k}" for k in range(agents)]
-        self.plots = Plots(self.grid, names, side)
+        self.shards = Shards(self.grid, names, side)
         # Pillars on every fourth cell at most, so that the rest hangs together.
         pillars = {
             row * size + col
@@ -320,7 +322,7 @@ class TrafficWorld:
         return self.now_ns >= self.faults.quiet_s * NS_PER_S
 
     def send(self, source: Process, agent: str | None, deliver: Callable[[Process], None]) -> None:
-        """To every life of an agent, or of all."""
+        """To every generation of an agent, or of all."""
         for process in self.processes:
             if agent in (None, process.agent):
                 self.carry(source, process, lambda to=process: deliver(to))
@@ -352,7 +354,7 @@ class TrafficWorld:
 
     def claim(self, source: Process, claim: AskPromises, member: str) -> None:
         def ask(to: Process) -> None:
-            actions = to.rights.hear_claim(claim.plot, claim.epoch, to.now_ns)
+            actions = to.rights.hear_claim(claim.shard, claim.epoch, to.now_ns)
             to.perform([action for action in actions if not isinstance(action, Table)])
             for table in actions:
                 if isinstance(table, Table):
@@ -368,7 +370,7 @@ class TrafficWorld:
         """Ask everybody what they know of us, again and again as long as it is needed."""
 
         own = source.disk.own
-        request = KnownRequest(agent=source.agent, disk=own.disk, plot_cells=source.rights.plots.side)
+        request = KnownRequest(agent=source.agent, disk=own.disk, shard_cells=source.rights.shards.side)
 
         def answer(to: Process) -> None:
             for action in to.ask_known(request):
@@ -392,7 +394,7 @@ class TrafficWorld:
         return Process(self, agent, disk)
 
     def start(self, agent: str, disk: Disk) -> None:
-        """Start a process, which begins a life."""
+        """Start a process, which begins a generation."""
         process = self.process_of(agent, disk)
         self.processes.append(process)
         self.begin(process)
@@ -410,7 +412,7 @@ class TrafficWorld:
         self.at(self.chance.randrange(TICK_NS), tick)
 
     def begin(self, process: Process) -> None:
-        """Ask everybody, then begin a life."""
+        """Ask everybody, then begin a generation."""
         self.ask_known(process, first=True)
         self.at(200 * MS, lambda: process.begin() if process.alive else None)
 
@@ -425,16 +427,16 @@ class TrafficWorld:
             self.start(process.agent, process.disk)
 
     def ended(self, process: Process) -> None:
-        """A life that has been replaced drives no more, and its bodies are gone. It goes on as a member."""
+        """A generation that has been replaced drives no more, and its bodies are gone. It goes on as a member."""
         process.disk.bodies.clear()
 
     def twin(self, process: Process) -> None:
-        """Cut a process off, alone or one way, and start another life of its agent on another machine."""
+        """Cut a process off, alone or one way, and start another generation of its agent on another machine."""
         replaced = {name for name, disks in self.disks.items() if len(disks) > 1} | {process.agent}
         if len(self.spawns) < 3 or len(self.disks[process.agent]) > 2:
             return
-        if any(replaced.issuperset(self.plots.members(plot)) for plot in range(self.plots.count)):
-            return  # docs/design/right-of-way.md: of the three files of a plot's members one at least is the first
+        if any(replaced.issuperset(self.shards.members(shard)) for shard in range(self.shards.count)):
+            return  # docs/design/right-of-way.md: of the three files of a shard's members one at least is the first
         self.twins += 1
         cut = (f"{id(process.disk)}", "")
         self.cut.add(cut)
@@ -461,7 +463,7 @@ class TrafficWorld:
         elif chance.random() < faults.twins / 10:
             self.twin(somebody)
         if chance.random() < faults.leaps / 10:
-            # One machine's clock leaps, or all but one: then they take a warden for silent that is not.
+            # One machine's clock leaps, or all but one: then they take a leader for silent that is not.
             alone = chance.random() < 0.5
             for process in self.processes:
                 if (process is somebody) == alone:

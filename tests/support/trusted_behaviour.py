@@ -18,24 +18,24 @@ OTHERS = (None, Authenticator(b"another secret", "run"), Authenticator(b"secret"
 
 
 def table(seq: int = 1) -> Table:
-    return Table(plot=0, agent="a0", epoch=1, seq=seq, hosts={}, grants={})
+    return Table(shard=0, agent="a0", epoch=1, seq=seq, hosts={}, grants={})
 
 
 def stored(seq: int = 1) -> Stored:
-    return Stored(plot=0, agent="a0", epoch=1, seq=seq)
+    return Stored(shard=0, agent="a0", epoch=1, seq=seq)
 
 
 def test_on_a_trusted_topic_only_who_knows_the_secret_of_the_run_is_heard(world):
     ours, hears = world.bus("ours", authenticator=OURS), world.bus("hears", authenticator=OURS)
     others = [world.bus(f"other{n}", authenticator=each) for n, each in enumerate(OTHERS)]
     box, anybody = Box(), Box()
-    hears.subscribe(STORED, box, plot=0)
+    hears.subscribe(STORED, box, shard=0)
     others[0].subscribe(STORED, anybody)
     world.settle()
     for bus in others:
-        bus.publish(STORED, stored(2), plot=0, member="a1", agent="a0")
+        bus.publish(STORED, stored(2), shard=0, member="a1", agent="a0")
     world.settle()
-    ours.publish(STORED, stored(1), plot=0, member="a1", agent="a0")
+    ours.publish(STORED, stored(1), shard=0, member="a1", agent="a0")
     world.until(lambda: box)
     assert [event.message.seq for event in box] == [1]
     assert hears.counts["payloads_dropped"] == 3
@@ -82,22 +82,22 @@ def test_a_question_without_the_secret_is_refused(world):
         served.append(event)
         answering((table(), {}))(event)
 
-    world.bus("serves", authenticator=OURS).serve(TABLE, post, plot=0, member="a1", agent="a0")
+    world.bus("serves", authenticator=OURS).serve(TABLE, post, shard=0, member="a1", agent="a0")
     stranger, ours = world.bus("stranger"), world.bus("ours", authenticator=OURS)
     world.settle()
-    box = asked(world, stranger, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0")
+    box = asked(world, stranger, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
     assert "no process of this run" in box.of(AskEnded)[0].failure
     assert not box.of(Replied)
     assert not served
-    box = asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0")
+    box = asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
     assert [event.request.epoch for event in served.of(Asked)] == [3]
     assert len(box.of(Replied)) == 1
 
 
 def test_an_answer_without_the_secret_does_not_count(world):
     liar, ours = world.bus("liar"), world.bus("ours", authenticator=OURS)
-    liar.serve(TABLE, answering((table(), {})), plot=0, member="a1", agent="a0")
+    liar.serve(TABLE, answering((table(), {})), shard=0, member="a1", agent="a0")
     world.settle()
-    box = asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0")
+    box = asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
     assert not box.of(Replied)
     assert ours.counts["payloads_dropped"] == 1

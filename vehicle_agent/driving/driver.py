@@ -17,7 +17,7 @@ from vehicle_agent.driving.motion import Motion, Point
 
 
 class Driver:
-    """Drives vehicles cell by cell, and stops them before what the map, or a body, closes.
+    """Drives vehicles cell by cell, and stops them before what the map, or an obstacle, closes.
 
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
@@ -26,10 +26,10 @@ class Driver:
     measures  whether to note how fast they drove
 
     patience_ns  how long one waits for others that do not go on
-    driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs, and the
-              wind, taken out:
-              what vehicles measure; the owner empties it
-    entered   cells that vehicles have entered and not looked around from; the owner empties it
+    driven       (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs, and the
+                 wind, taken out:
+                 what vehicles measure; the owner empties it
+    entered      cells that vehicles have entered and not looked around from; the owner empties it
     """
 
     def __init__(

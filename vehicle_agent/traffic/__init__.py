@@ -1,19 +1,19 @@
-"""Right of way for those who decide it: the members and wardens of plots, and where vehicles would go next.
+"""Right of way for those who decide it: the members and leaders of shards, and where vehicles would go next.
 
-The map is cut into plots (`swarm.right_of_way.lock_regions`). Each plot has three members, which are agents; one of
-them is its warden. The host's part is in `swarm.right_of_way`; docs/design/right-of-way.md has the proof. Here:
+The map is cut into shards (`swarm.right_of_way.lock_regions`). Each shard has three members, which are agents; one
+of them is its leader. The host's part is in `swarm.right_of_way`; docs/design/right-of-way.md has the proof. Here:
 
-1. A host tells the warden where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
+1. A host tells the leader where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
    around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.
-2. The warden plans all vehicles without a next cell at once (`pibt`) and appends entries to the orders of cells
+2. The leader plans all vehicles without a next cell at once (`pibt`) and appends entries to the orders of cells
    (`cell_orders`): a vehicle follows one that goes on. An entry is never revoked: only its host's word ends it.
-3. The warden sends its table to the other members, under (epoch, number). A member puts it on file and says so
-   (`Stored`). With the warden's own file one is a majority: then hosts receive the grants of the table.
-4. A warden that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store
-   no table of a lower one (Paxos). The new warden begins with the newest table that a majority knows.
+3. The leader sends its table to the other members, under (epoch, number). A member puts it on file and says so
+   (`Stored`). With the leader's own file one is a majority: then hosts receive the grants of the table.
+4. A leader that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store
+   no table of a lower one (Paxos). The new leader begins with the newest table that a majority knows.
 5. Promises and stored tables are on file before any message states them. No clock decides anything but when to
    claim.
 
 `RightOfWay` is one agent's part: its seats as a member, and its vehicles as a host. `Detours` leads vehicles around
-bodies, which speak no right of way.
+obstacles, which speak no right of way.
 """

@@ -1,7 +1,7 @@
-"""Orders: which vehicles may use each cell of a plot, one after the other, as its warden keeps them. Pure.
+"""Orders: which vehicles may use each cell of a shard, one after the other, as its leader keeps them. Pure.
 
 `swarm.right_of_way.entries` has the rules. Entries are appended at the end of an order, and removed by the word of
-their own host, or by proof that its life has ended.
+their own host, or by proof that its generation has ended.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def cells_beside(cell: int, cols: int) -> frozenset[int]:
 
 
 class Orders:
-    """The entries of one plot. A warden looks at them several times a tick, and few of them change.
+    """The entries of one shard. A leader looks at them several times a tick, and few of them change.
 
-    hosts    host -> (life, sequence) of its newest statement
-    of       vehicle -> its entries in driving order, of its host's newest life; another list when they change
+    hosts    host -> (generation, sequence) of its newest statement
+    of       vehicle -> its entries in driving order, of its host's newest generation; another list when they change
     by_host  host -> its vehicles that have entries
-    fenced   (host, life) -> entries of a life that may still drive
+    fenced   (host, generation) -> entries of a generation that may still drive
     orders   cell -> number -> vehicle, the first first
     """
 
@@ -48,20 +48,24 @@ class Orders:
         for vehicle, entries in table.grants.items():
             self._set(vehicle, list(entries))
         for fence in table.fences:
-            self.fenced[fence.agent, fence.life] = {vehicle: list(of) for vehicle, of in fence.entries.items()}
-        lives = [(self.of, False), *((of, True) for of in self.fenced.values())]
-        each = [(number, vehicle, shut) for of, shut in lives for vehicle, all in of.items() for number in all]
+            self.fenced[fence.agent, fence.generation] = {
+                vehicle: list(of) for vehicle, of in fence.entries.items()
+            }
+        generations = [(self.of, False), *((of, True) for of in self.fenced.values())]
+        each = [
+            (number, vehicle, shut) for of, shut in generations for vehicle, all in of.items() for number in all
+        ]
         for number, vehicle, shut in sorted(each, key=lambda one: one[0][1:]):
             self.orders.setdefault(number[0], {})[number] = vehicle
             if shut:
                 self._fences.add(number)
 
-    def table(self, plot: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
+    def table(self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
         """Returns the same as a message."""
-        fences = [Fence(host, life, dict(of)) for (host, life), of in self.fenced.items()]
+        fences = [Fence(host, generation, dict(of)) for (host, generation), of in self.fenced.items()]
         epoch, seq = stamp
         return Table(
-            plot=plot,
+            shard=shard,
             agent=agent,
             epoch=epoch,
             seq=seq,
@@ -86,11 +90,11 @@ class Orders:
         return sum(len(self.of[vehicle]) for vehicle in self.by_host.get(host, ()))
 
     def is_fenced(self, cell: int) -> bool:
-        """Returns True if an earlier life of a host may be on a cell, or enter it."""
+        """Returns True if an earlier generation of a host may be on a cell, or enter it."""
         return bool(self._fences) and not self._fences.isdisjoint(self.order(cell))
 
     def before(self, number: Number, vehicle: str) -> Iterator[tuple[Number, str]]:
-        """The entries for which one waits. Those of the same vehicle are of an earlier life."""
+        """The entries for which one waits. Those of the same vehicle are of an earlier generation."""
         for other, of in self.order(number[0]).items():
             if other == number:
                 return
@@ -144,10 +148,10 @@ class Orders:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def take_standing(
+    def take_host_state(
         self,
         host: str,
-        life: int,
+        generation: int,
         seq: int,
         holds: Mapping[str, Sequence[Number]],
         knows: Stamp,
@@ -158,41 +162,43 @@ class Orders:
         """A host states what its vehicles hold; what it omits of tables that it knows is over. Returns True if a
         host may wait for what this changes.
 
-        dead    earlier lives of the host that have certainly ended
+        dead    earlier generations of the host that have certainly ended
         bodies  vehicle without a place -> the cell on which its body is, or where it would enter
         fresh   stamp of entries that are added
         """
         known, heard = self.hosts.get(host, (0, 0))
-        if (life, seq) <= (known, heard):
+        if (generation, seq) <= (known, heard):
             return False
-        begins = life > known
-        self.hosts[host] = life, seq
+        begins = generation > known
+        self.hosts[host] = generation, seq
         if begins and known:
             self._fence(host, known)
         self.remove(host, holds, knows)
         earlier = [of for (of_host, _), of in reversed(self.fenced.items()) if of_host == host]
-        for vehicle in {vehicle: None for of in earlier for vehicle in of} if begins and life not in dead else ():
+        for vehicle in (
+            {vehicle: None for of in earlier for vehicle in of} if begins and generation not in dead else ()
+        ):
             if vehicle not in self.of and vehicle not in bodies:
                 self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
         for each in dead:
             self._open(host, each, bodies)
         return begins or any(earlier)
 
-    def _fence(self, host: str, life: int) -> None:
-        """A life of a host was replaced, and may still drive."""
+    def _fence(self, host: str, generation: int) -> None:
+        """A generation of a host was replaced, and may still drive."""
         mine = {vehicle: self.of.pop(vehicle) for vehicle in self.by_host.pop(host, ())}
         if mine:
-            fence = self.fenced.setdefault((host, life), {})
+            fence = self.fenced.setdefault((host, generation), {})
             for vehicle, entries in mine.items():
                 fence[vehicle] = [*fence.get(vehicle, ()), *entries]
                 self._fences.update(entries)
 
-    def _open(self, host: str, life: int, bodies: Mapping[str, int]) -> None:
-        """A life has ended: its entries are over, except those on which bodies are.
+    def _open(self, host: str, generation: int, bodies: Mapping[str, int]) -> None:
+        """A generation has ended: its entries are over, except those on which bodies are.
 
         Those of vehicles that are to begin from there must not wait: two such vehicles would wait for each other.
         """
-        for vehicle, entries in self.fenced.pop((host, life), {}).items():
+        for vehicle, entries in self.fenced.pop((host, generation), {}).items():
             here = [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
             self._fences.difference_update(entries)
             for entry in entries:
@@ -202,8 +208,8 @@ class Orders:
                 self._set(vehicle, [*here, *self.entries(vehicle)])
 
     def _begin(self, vehicle: str, entries: Sequence[Number], fresh: Stamp) -> None:
-        """A new life of a vehicle whose body is made up enters where an earlier one was, if it can on a cell which
-        no other vehicle is to enter."""
+        """A new generation of a vehicle whose body is made up enters where an earlier one was, if it can on a cell
+        which no other vehicle is to enter."""
         cells = [number[0] for number in entries]
         alone = (cell for cell in cells if set(self.order(cell).values()) <= {vehicle})
         cell, (epoch, seq) = next(alone, cells[-1]), fresh
@@ -211,14 +217,14 @@ class Orders:
             seq += 1
         self.newest = max(self.newest, seq)
 
-    def lives_of(self, host: str) -> set[int]:
+    def generations_of(self, host: str) -> set[int]:
         """Returns the fenced lives of a host."""
-        return {life for name, life in self.fenced if name == host}
+        return {generation for name, generation in self.fenced if name == host}
 
-    def end(self, host: str, life: int) -> bool:
-        """A life that was replaced states that it drives no more. Returns whether that opens cells."""
-        opens = (host, life) in self.fenced
-        self._open(host, life, {})
+    def end(self, host: str, generation: int) -> bool:
+        """A generation that was replaced states that it drives no more. Returns whether that opens cells."""
+        opens = (host, generation) in self.fenced
+        self._open(host, generation, {})
         return opens
 
     def remove(self, host: str, holds: Mapping[str, Sequence[Number]], knows: Stamp) -> None:

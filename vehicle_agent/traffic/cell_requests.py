@@ -1,6 +1,6 @@
-"""Requests of an agent's vehicles to wardens, each kept until one of its inputs changes.
+"""Requests of an agent's vehicles to leaders, each kept until one of its inputs changes.
 
-`Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, bodies, and cells held by
+`Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, obstacles, and cells held by
 others) and of nothing else, so a kept wish equals a new one. Its inputs are compared in one place,
 `CellRequests.make`: arguments are compared, and each kind of cell reports its changed cells.
 """
@@ -16,13 +16,13 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Holdings, Wish
 from vehicle_agent.agent_maps import meet
-from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.cell_orders import cells_beside
 from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S
-"""For a vehicle's wish time stands still for so long: then its age grows, by a step in which wardens compare ages.
+"""For a vehicle's wish time stands still for so long: then its age grows, by a step in which leaders compare ages.
 Each vehicle's turns begin at another time, so that no tick has all wishes to make
 (docs/design/zenoh-topology-and-inboxes.md)."""
 _WAITING_TURN_NS = NS_PER_S
@@ -48,7 +48,7 @@ class CellRequests:
         grid: GridSpec,
         steering: Steering,
         holdings: Holdings,
-        bodies: Bodies,
+        obstacles: Obstacles,
         near_cells: int,
         target_cell: Callable[[str | None], int | None],
         in_reach: Callable[[str | None, int], bool],
@@ -58,7 +58,7 @@ class CellRequests:
         self._cols = grid.cols
         self._steering = steering
         self._holdings = holdings
-        self._bodies = bodies
+        self._obstacles = obstacles
         self._near_cells = near_cells
         self._target_cell = target_cell
         self._in_reach = in_reach
@@ -135,8 +135,8 @@ class CellRequests:
                 self.of[id] = wish
 
     def _forget_near(self, vehicles: Sequence[Vehicle]) -> None:
-        """Keeps no wish of a vehicle near which the ground has changed, or what bodies close and threaten."""
-        changed = [*self._changed, *self._bodies.take_changed()]
+        """Keeps no wish of a vehicle near which the ground has changed, or what obstacles close and threaten."""
+        changed = [*self._changed, *self._obstacles.take_changed()]
         self._changed = []
         if not (changed and vehicles):
             return

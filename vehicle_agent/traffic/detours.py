@@ -1,7 +1,7 @@
-"""Ways around bodies that stand on routes. Planners know no bodies, so the host drives around them itself.
+"""Ways around obstacles that stand on routes. Planners know no obstacles, so the host drives around them itself.
 
-A route that passes a standing body is replaced by the cheapest way from where the vehicle's path ends back onto the
-route behind the body: A* on the host's own map, with the cells of all bodies closed.
+A route that passes a host state obstacle is replaced by the cheapest way from where the vehicle's path ends back
+onto the route behind the obstacle: A* on the host's own map, with the cells of all obstacles closed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.obstacles import Obstacles
 
 _LOOK_CELLS = 200
-"""Cells of the route ahead that are searched for bodies, and behind a body for where to come back."""
+"""Cells of the route ahead that are searched for obstacles, and behind an obstacle for where to come back."""
 _CELLS_PER_TICK = 400
 """Expanded by all searches of a host: some 4 ms (docs/design/reported-obstacles.md)."""
 _MOST_CELLS = 20_000
@@ -32,7 +32,7 @@ _DIAGONAL = math.sqrt(2.0)
 
 
 class Detours:
-    """Leads vehicles around standing bodies.
+    """Leads vehicles around standing obstacles.
 
     pace   float32 (rows, cols), s/m; inf is lethal
     steps  the neighbours of a cell to which one may drive: not lethal, not closed, not too steep
@@ -46,7 +46,7 @@ class Detours:
         grid: GridSpec,
         pace: NDArray[np.float32],
         steps: Callable[[int], list[int]],
-        bodies: Bodies,
+        obstacles: Obstacles,
         climb: Climb | None = None,
     ) -> None:
         self.found = 0
@@ -54,7 +54,7 @@ class Detours:
         self._grid = grid
         self._pace = pace.reshape(-1)
         self._steps = steps
-        self._bodies = bodies
+        self._obstacles = obstacles
         self._searches: dict[str, tuple[int, Iterator[list[int] | None]]] = {}
         """Vehicle -> the search under way for it, and the route for which it was begun."""
         self._waits: dict[str, tuple[int, int]] = {}
@@ -62,7 +62,7 @@ class Detours:
 
     def tick(self, vehicles: Iterable[Vehicle], path: Callable[[str], Sequence[int]], now_ns: int) -> None:
         """Begins and continue searches; vehicles for which one has ended follow what it has found."""
-        standing = self._bodies.standing if self._bodies.any else ()
+        standing = self._obstacles.standing if self._obstacles.any else ()
         if not standing:
             self._searches.clear()
             self._waits.clear()
@@ -114,7 +114,7 @@ class Detours:
         behind = route[first : first + _LOOK_CELLS]
         rest_s, goals = 0.0, {}
         for index in range(len(behind) - 1, -1, -1):
-            if behind[index] not in self._bodies.closed:
+            if behind[index] not in self._obstacles.closed:
                 goals[behind[index]] = (rest_s, first + index)
             if index:
                 rest_s += self._step_s(behind[index - 1], behind[index])

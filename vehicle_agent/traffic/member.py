@@ -1,7 +1,7 @@
-"""A member of a plot: it promises, stores tables, and becomes the plot's warden when the last one is silent.
+"""A member of a shard: it promises, stores tables, and becomes the shard's leader when the last one is silent.
 
 The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. Promises and tables must
-be on file before any message states them. No clock decides anything but when a member tries to become warden.
+be on file before any message states them. No clock decides anything but when a member tries to become leader.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table
-from vehicle_agent.traffic.warden import Warden
+from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table
+from vehicle_agent.traffic.shard_leader import Leader
 
-LEASE_NS = 3 * BEAT_NS
-"""A warden that is silent for so long may be replaced, later where answers take long. Until then its members refuse
+LEASE_NS = 3 * HEARTBEAT_NS
+"""A leader that is silent for so long may be replaced, later where answers take long. Until then its members refuse
 every claim (docs/design/right-of-way.md)."""
 _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
-"""Time without a host's message after which no warden is needed."""
+"""Time without a host's message after which no leader is needed."""
 _TICK_NS = NS_PER_S // 10
 _UNKNOWN_NS = NS_PER_S
 """Assumed before the first answer: a claim that comes too late costs once, one that comes too early each time."""
@@ -45,9 +45,9 @@ class Save:
 
 @dataclass(frozen=True, slots=True)
 class AskPromises:
-    """Ask the other members of a plot to promise this epoch."""
+    """Ask the other members of a shard to promise this epoch."""
 
-    plot: int
+    shard: int
     epoch: int
     members: tuple[str, ...]
 
@@ -88,11 +88,11 @@ class RoundTrips:
 
 
 class Member:
-    """One agent's seat among the members of one plot.
+    """One agent's seat among the members of one shard.
 
     promised  no table of a lower epoch is stored any more
     stored    the newest table on file; the table of the run's start until there is another
-    warden    the warden itself, while this member is in charge
+    leader    the leader itself, while this member is in charge
 
     fleets    agent -> its vehicles, all of the run
     trips     round trips to other agents, shared by all seats of this one
@@ -101,7 +101,7 @@ class Member:
 
     def __init__(
         self,
-        plots: Plots,
+        shards: Shards,
         me: str,
         promised: int,
         stored: Table,
@@ -110,30 +110,30 @@ class Member:
         trips: RoundTrips | None = None,
         tick_ns: int = _TICK_NS,
     ) -> None:
-        self.plot = stored.plot
+        self.shard = stored.shard
         self._trips = RoundTrips() if trips is None else trips
         self._tick_ns = tick_ns
         self._asked: dict[Stamp, int] = {}
         """Stamp of a table that was sent once -> when; of a claim the sequence is 0."""
         self.promised = promised
         self.stored = stored
-        self.warden: Warden | None = None
-        self._plots = plots
+        self.leader: Leader | None = None
+        self._shards = shards
         self._me = me
         self._fleets = fleets
-        self._members = plots.members(self.plot)
+        self._members = shards.members(self.shard)
         self._others = tuple(member for member in self._members if member != me)
         self._rank = self._members.index(me)
         self._claimed = 0
         self._promises: dict[str, Table] = {}
         self._claim_above = 0
         self._leader = ""
-        self._led_until_ns = now_ns  # the warden that we know of is in charge at least so long
+        self._led_until_ns = now_ns  # the leader that we know of is in charge at least so long
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
         self._told: list[Table] = []
-        """Tables published as warden, the oldest first, from the newest one that is on file on."""
+        """Tables published as leader, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
         """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
@@ -144,9 +144,9 @@ class Member:
 
     @property
     def _lease_ns(self) -> int:
-        """A warden speaks once a beat; the table of a new one comes a round trip after our promise. A table that is
-        lost is told again after another."""
-        return max(LEASE_NS, BEAT_NS + 2 * (self._trips.bound_ns(self._others) + self._tick_ns))
+        """A leader speaks once a heartbeat; the table of a new one comes a round trip after our promise. A table
+        that is lost is told again after another."""
+        return max(LEASE_NS, HEARTBEAT_NS + 2 * (self._trips.bound_ns(self._others) + self._tick_ns))
 
     def _turn_ns(self) -> int:
         """Time by which this member claims later than the first: that one's claim arrives before."""
@@ -169,33 +169,33 @@ class Member:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def hear_standing(self, standing: Standing, now_ns: int) -> None:
+    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
-            # A new plot cannot have another warden; and hosts receive no more from the previous one.
+            # A new shard cannot have another leader; and hosts receive no more from the previous one.
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
             start_ns = max(_START_NS, self._trips.bound_ns(self._others) + self._tick_ns)
             self._due_ns = max(self._due_ns, now_ns + (start_ns if led else 0) + self._turn_ns())
             self._acked_ns = now_ns
         self._wanted_ns = now_ns
-        if self.warden is not None:
-            self.warden.take_standing(standing, now_ns)
+        if self.leader is not None:
+            self.leader.take_host_state(standing, now_ns)
 
     # --- what members say -----------------------------------------------------------------------------------
 
     @property
     def on_file(self) -> Stored:
-        return Stored(plot=self.plot, agent=self._me, epoch=self.stored.epoch, seq=self.stored.seq)
+        return Stored(shard=self.shard, agent=self._me, epoch=self.stored.epoch, seq=self.stored.seq)
 
     def hear_table(self, table: Table, now_ns: int) -> list[MemberAction]:
-        if table.agent == self._me or table.agent != self._plots.warden(self.plot, table.epoch):
+        if table.agent == self._me or table.agent != self._shards.leader(self.shard, table.epoch):
             return []
         if table.epoch < self.promised:
-            # A claim of ours or of another came to nothing: let the warden claim again, so that we can follow it.
-            return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
+            # A claim of ours or of another came to nothing: let the leader claim again, so that we can follow it.
+            return [Stored(shard=self.shard, agent=self._me, epoch=self.promised, seq=0)]
         if table.epoch > self.promised + FURTHEST_EPOCH:
             return [Refused(f"{table.agent} names an epoch that is implausibly far ahead: {table.epoch}")]
-        if self.warden is not None and table.epoch > self.warden.epoch:
-            self.warden = None
+        if self.leader is not None and table.epoch > self.leader.epoch:
+            self.leader = None
         self._led(now_ns, table.agent)
         actions: list[MemberAction] = []
         if table.stamp > self.stored.stamp:
@@ -203,7 +203,7 @@ class Member:
             actions.append(Save(self.promised, self.stored))
         if table.stamp == self.stored.stamp:
             self._said = min(self._said, (table.epoch, table.seq - 1))  # a repeated table is acknowledged again
-            if self._plots.warden(self.plot, table.epoch + 1) == self._me:
+            if self._shards.leader(self.shard, table.epoch + 1) == self._me:
                 actions.append(self._say(now_ns))
         return actions
 
@@ -212,21 +212,21 @@ class Member:
         return self.on_file
 
     def _say_late(self, now_ns: int) -> list[MemberAction]:
-        """Returns the reply of the member that is second after the warden about its file. With the warden the first
+        """Returns the reply of the member that is second after the leader about its file. With the leader the first
         one makes a majority, so the second says only what the first does not, and, as others may not hear the
-        first, speaks at least once in a beat."""
+        first, speaks at least once in a heartbeat."""
         stamp = self.stored.stamp
-        if self.warden is not None or self._said >= stamp:
+        if self.leader is not None or self._said >= stamp:
             return []
-        if self._other_said >= stamp and now_ns - self._said_ns < BEAT_NS:
+        if self._other_said >= stamp and now_ns - self._said_ns < HEARTBEAT_NS:
             return []
         return [self._say(now_ns)]
 
     def hear_claim(self, epoch: int, now_ns: int) -> list[MemberAction]:
         """Promise, or say nothing. The last action is the table to answer with."""
-        claimant = self._plots.warden(self.plot, epoch)
+        claimant = self._shards.leader(self.shard, epoch)
         led = now_ns < self._led_until_ns and claimant != self._leader
-        if epoch <= self.promised or self.warden is not None or led:
+        if epoch <= self.promised or self.leader is not None or led:
             return []
         if epoch > self.promised + FURTHEST_EPOCH:
             return [Refused(f"a claim names an epoch that is implausibly far ahead: {epoch}")]
@@ -243,52 +243,52 @@ class Member:
             self._take_charge(now_ns)
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """Takes acknowledgements as warden, and grants by the tables that are on file now."""
+        """Takes acknowledgements as leader, and grants by the tables that are on file now."""
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq)
-        if stored.seq and stored.agent == self._plots.warden(self.plot, stored.epoch):
+        if stored.seq and stored.agent == self._shards.leader(self.shard, stored.epoch):
             return self._hear_same(stored, now_ns)
         self._other_said = max(self._other_said, (stored.epoch, stored.seq))
-        if self.warden is None:
+        if self.leader is None:
             return []
-        if stored.epoch == self.warden.epoch:
+        if stored.epoch == self.leader.epoch:
             self._acked_ns = now_ns
-            if stored.seq and stored.agent == self._plots.warden(self.plot, stored.epoch + 1):  # replies at once
+            if stored.seq and stored.agent == self._shards.leader(self.shard, stored.epoch + 1):  # replies at once
                 self._answered(stored.agent, (stored.epoch, stored.seq), now_ns)
-            return self._on_file(self.warden, stored.seq, now_ns)
+            return self._on_file(self.leader, stored.seq, now_ns)
         if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
         return []
 
     def _hear_same(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """Handles a warden's repetition of a table by its number. A member that has it replies as if it had come
+        """Handles a leader's repetition of a table by its number. A member that has it replies as if it had come
         whole; one with an older table says so, and gets the whole. A member with a newer one is silent: two that
         both reply would never end."""
         stamp = (stored.epoch, stored.seq)
         if stored.epoch < self.promised:
-            return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
-        if self.warden is not None and stored.epoch > self.warden.epoch:
-            self.warden = None
+            return [Stored(shard=self.shard, agent=self._me, epoch=self.promised, seq=0)]
+        if self.leader is not None and stored.epoch > self.leader.epoch:
+            self.leader = None
         if stamp == self.stored.stamp:
             return self.hear_table(self.stored, now_ns)
         return [self.on_file] if stamp > self.stored.stamp else []
 
-    def _on_file(self, warden: Warden, seq: int, now_ns: int) -> list[MemberAction]:
+    def _on_file(self, leader: Leader, seq: int, now_ns: int) -> list[MemberAction]:
         """Another member has stored the table of this number, or a later one: with ours that is a majority."""
         while len(self._told) > 1 and self._told[1].seq <= seq:
             del self._told[0]
         if not self._told or self._told[0].seq > seq:
             return []
-        return [*warden.granted(self._told[0], now_ns)]
+        return [*leader.granted(self._told[0], now_ns)]
 
-    # --- being warden ---------------------------------------------------------------------------------------
+    # --- being leader ---------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> list[MemberAction]:
         wanted = self._wanted_ns is not None and now_ns - self._wanted_ns <= _WANTED_NS
-        if wanted and self.warden is not None and self._claim_above <= self.warden.epoch:
-            return self._lead(self.warden, now_ns)
-        if not wanted or (self.warden is None and now_ns < self._due_ns):
+        if wanted and self.leader is not None and self._claim_above <= self.leader.epoch:
+            return self._lead(self.leader, now_ns)
+        if not wanted or (self.leader is None and now_ns < self._due_ns):
             return self._say_late(now_ns)
         return self._claim(now_ns)
 
@@ -301,18 +301,18 @@ class Member:
         self._ask((self._claimed, 0), now_ns)
         actions: list[MemberAction] = [Save(self.promised, self.stored)]
         if self._others:
-            actions.append(AskPromises(self.plot, self._claimed, self._others))
+            actions.append(AskPromises(self.shard, self._claimed, self._others))
         self._take_charge(now_ns)
         return actions
 
-    def _lead(self, warden: Warden, now_ns: int) -> list[MemberAction]:
+    def _lead(self, leader: Leader, now_ns: int) -> list[MemberAction]:
         if self._others and now_ns - self._acked_ns > self._lease_ns:
-            self.warden = None  # no messages arrive in one direction: leave it to the others
+            self.leader = None  # no messages arrive in one direction: leave it to the others
             self._led(now_ns, self._me)
             return []
-        actions: list[MemberAction] = [Refused(text) for text in warden.refused]
-        warden.refused.clear()
-        table = warden.tick(now_ns)
+        actions: list[MemberAction] = [Refused(text) for text in leader.refused]
+        leader.refused.clear()
+        table = leader.tick(now_ns)
         if table is not None:
             self._ask(table.stamp, now_ns)
             if table is not self.stored:
@@ -321,26 +321,26 @@ class Member:
                 actions.append(Save(self.promised, table))
             # A table on file with both others needs no more than its number: at rest tables were a fifth of all
             # bytes.
-            answered = now_ns - self._acked_ns < 2 * BEAT_NS
+            answered = now_ns - self._acked_ns < 2 * HEARTBEAT_NS
             known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
             actions.append(self.on_file if known and answered else table)
-            if self._plots.majority == 1:
-                actions += self._on_file(warden, table.seq, now_ns)
+            if self._shards.majority == 1:
+                actions += self._on_file(leader, table.seq, now_ns)
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
-        if self.warden is None and len(self._promises) >= self._plots.majority:
+        if self.leader is None and len(self._promises) >= self._shards.majority:
             newest = max(self._promises.values(), key=lambda table: table.stamp)
-            self.warden = Warden(self._plots, self._me, self._claimed, newest, self._fleets)
+            self.leader = Leader(self._shards, self._me, self._claimed, newest, self._fleets)
             self._told = []
             self._acked_ns = now_ns
-            # Once in an epoch: a promise that is repeated after the warden has resigned must not restart it.
+            # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.
             self._claimed, self._promises = 0, {}
 
     def _promise(self, epoch: int) -> None:
         self.promised = epoch
         self._promises = {}
-        self.warden = None
+        self.leader = None
 
     def _led(self, now_ns: int, leader: str) -> None:
         self._leader = leader

@@ -21,7 +21,7 @@ class Mover:
     """A vehicle at rest.
 
     wants    the cells that it could go to, the best first; the first `better` of them are better than to stay
-    outside  it stands in another plot and asks to come in
+    outside  it stands in another shard and asks to come in
     """
 
     id: str
@@ -33,16 +33,16 @@ class Mover:
 
 
 class Round:
-    """One round of planning in one plot.
+    """One round of planning in one shard.
 
     movers  all that are at rest
     closed  whether a cell stays occupied under any plan
-    inside  whether a cell belongs to the plot
+    inside  whether a cell belongs to the shard
     onward  the cells for which those wait that are on a cell, or go there first
 
     to      vehicle -> the cell that it is to go to; its own if it stays
     taken   cell -> the vehicle that is to go there
-    pushed  vehicle -> the age of the one that it could not make way for within the plot
+    pushed  vehicle -> the age of the one that it could not make way for within the shard
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Round:
             if not self._inside(cell):
                 if pushed or mover.outside:
                     continue
-                return False  # it waits for the other plot's warden
+                return False  # it waits for the other shard's leader
             if cell in self.taken or cell in self._chain or self._closed(cell):
                 continue
             other = self._standing.get(cell)

@@ -1,4 +1,5 @@
-"""One agent's part in right of way: its seats among the members of plots, and the cells that its own vehicles hold.
+"""One agent's part in right of way: its seats among the members of shards, and the cells that its own vehicles
+hold.
 
 Messages and time in, actions out. The shell performs actions in their order: a saved file must be on disk before
 later messages are sent.
@@ -16,27 +17,27 @@ from swarm.config.agents import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish
-from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Known, KnownRequest, Left, Standing, Stored, Table
+from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.messages.traffic import HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
 
 class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     """An agent's record about itself and the others' files.
 
-    disk      names this file: a number drawn when it was made
-    lives     the agent's lives that have run on it, the last ones
-    noted     agent -> its file, the first that we received
-    noted_by  the agents that have noted ours
-    plot_cells  side of the plots of which this file holds promises, if it holds any
+    disk         names this file: a number drawn when it was made
+    generations  the agent's lives that have run on it, the last ones
+    noted        agent -> its file, the first that we received
+    noted_by     the agents that have noted ours
+    shard_cells  side of the shards of which this file holds promises, if it holds any
     """
 
     disk: int
-    lives: list[int] = []
+    generations: list[int] = []
     noted: dict[str, int] = {}
     noted_by: list[str] = []
-    plot_cells: int = REGION_CELLS
+    shard_cells: int = REGION_CELLS
 
 
 Action = MemberAction | Tell | Left | OwnRecord | Known | AskKnown
@@ -45,25 +46,26 @@ Action = MemberAction | Tell | Left | OwnRecord | Known | AskKnown
 class RightOfWay:
     """Right of way of one agent.
 
-    spawns  agent -> vehicle -> the cell where it stands when the run begins
-    own     what this agent's file holds: of itself,
-    saved   and of plots: (promised epoch, stored table)
-    vehicles  of an agent that is not in `spawns`, a guest: it has no seat, and its vehicles enter one by one
+    spawns    agent -> vehicle -> the cell where it stands when the run begins
+    own       what this agent's file holds: of itself,
+    saved     and of shards: (promised epoch, stored table)
+    vehicles  of an agent that is not in `spawns`, an external vehicle: it has no seat, and its vehicles enter one
+              by one
     tick_ns   between two ticks
 
     host      our part as a host of vehicles
     holdings  which cells our vehicles hold: none before `begin`
     trips     round trips to the other agents
-    silent    whether our file cannot be written now: then we are no member of any plot, and note no other agent's
+    silent    whether our file cannot be written now: then we are no member of any shard, and note no other agent's
               file. Our vehicles' held and granted cells do not depend on it
 
-    Raises StoreError if the file holds promises of plots of another size: the same cells would be granted twice.
+    Raises StoreError if the file holds promises of shards of another size: the same cells would be granted twice.
     """
 
     def __init__(
         self,
         agent: str,
-        plots: Plots,
+        shards: Shards,
         spawns: Mapping[str, Mapping[str, int]],
         own: OwnRecord,
         saved: Mapping[int, tuple[int, Table]],
@@ -73,49 +75,51 @@ class RightOfWay:
         self.agent = agent
         self.trips = RoundTrips()
         self._tick_ns = tick_ns
-        self.plots = plots
+        self.shards = shards
         if not (saved or own.noted or own.noted_by):  # no vehicle depends on it: it takes any size
-            own = replace(own, plot_cells=plots.side)
-        elif own.plot_cells != plots.side:
+            own = replace(own, shard_cells=shards.side)
+        elif own.shard_cells != shards.side:
             raise StoreError(
-                f"agent {agent} has on file what it promised of plots of {own.plot_cells} cells, the scenario has "
-                f"{plots.side}: set map.plot_regions to {own.plot_cells // REGION_CELLS}, or begin another run"
+                f"agent {agent} has on file what it promised of shards of {own.shard_cells} cells, the scenario has "
+                f"{shards.side}: set map.shard_regions to {own.shard_cells // REGION_CELLS}, or begin another run"
             )
         self.own = own
-        self._is_guest = agent not in spawns
-        self.host = Host(plots, agent, vehicles if self._is_guest else spawns[agent])
+        self._is_external = agent not in spawns
+        self.host = Host(shards, agent, vehicles if self._is_external else spawns[agent])
         self.holdings = self.host.holdings
         self._spawns = spawns
         self._saved = dict(saved)
         self._members: dict[int, Member] = {}
         self.silent = False
 
-    # --- beginning a life -----------------------------------------------------------------------------------
+    # --- beginning a generation -----------------------------------------------------------------------------------
 
     @property
     def settled(self) -> bool:
-        """True if no recovery query about us is pending: we live, all other agents have noted our file (a guest's
-        is not noted; it has to know its plots), and no later life leaves it to us to state, wherever cells of ours
-        are shut, that we have stopped."""
-        noted = self.host.informed if self._is_guest else len(self.own.noted_by) >= len(self._spawns) - 1
-        return self.holdings.life > 0 and noted and not self.holdings.replaced
+        """True if no recovery query about us is pending: we live, all other agents have noted our file (an external
+        vehicle's is not noted; it has to know its shards), and no later generation leaves it to us to state,
+        wherever cells of ours are shut, that we have stopped."""
+        noted = self.host.informed if self._is_external else len(self.own.noted_by) >= len(self._spawns) - 1
+        return self.holdings.generation > 0 and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
-        """Another agent has begun a life. The last action is what to answer.
+        """Another agent has begun a generation. The last action is what to answer.
 
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
-        first. A guest never has a seat: its file is not noted, and it receives the list of seats.
+        first. An external vehicle never has a seat: its file is not noted, and it receives the list of seats.
         """
-        if request.layer != self.plots.layer or request.agent in self.plots.others:
+        if request.layer != self.shards.layer or request.agent in self.shards.others:
             return []
-        if request.agent == self.agent or self.silent or self._is_guest:
+        if request.agent == self.agent or self.silent or self._is_external:
             return []
         if request.agent not in self._spawns or not request.disk:
             if not self._has_quorum:
                 return []
             known = self._known_of(request.agent, request.disk)
-            return [replace(known, lives=self._lives_of(request.agent), agents=list(self.plots.agents))]
-        if request.plot_cells != self.plots.side:
+            return [
+                replace(known, generations=self._generations_of(request.agent), agents=list(self.shards.agents))
+            ]
+        if request.shard_cells != self.shards.side:
             return []  # what it grants is nothing that we may help to make usable
         actions: list[Action] = []
         if request.agent not in self.own.noted:
@@ -125,81 +129,85 @@ class RightOfWay:
 
     def hear_known(self, known: Known) -> list[Action]:
         """An answer to our question."""
-        if known.agent not in self._spawns or known.agent == self.agent or known.plot_cells != self.plots.side:
+        if known.agent not in self._spawns or known.agent == self.agent or known.shard_cells != self.shards.side:
             return []
-        self.host.hear_known(known.agent, known.life, known.plots)
-        if self.silent or self._is_guest or known.disk != self.own.disk or known.agent in self.own.noted_by:
+        self.host.hear_known(known.agent, known.generation, known.shards)
+        if self.silent or self._is_external or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
 
     def begin(self, chance: int) -> list[Action]:
-        """Begins a new life, once those who could be asked have answered.
+        """Begins a new generation, once those who could be asked have answered.
 
         chance  a random number
         """
         self.host.hear_known(self.agent, *self._known(self.agent))
-        lives = self.host.begin(self.own.lives, chance)
-        home = map(self.plots.of, self._spawns.get(self.agent, {}).values())
-        self.holdings.watch([plot for plot in home if plot in self.plots.all])
-        self.own = replace(self.own, lives=lives)
+        generations = self.host.begin(self.own.generations, chance)
+        home = map(self.shards.of, self._spawns.get(self.agent, {}).values())
+        self.holdings.watch([shard for shard in home if shard in self.shards.all])
+        self.own = replace(self.own, generations=generations)
         return [self.own]
 
     @property
     def _has_quorum(self) -> bool:
-        """Returns True once the run has confirmed this plot size."""
-        return self.plots.has_quorum({self.agent, *self.own.noted_by})
+        """Returns True once the run has confirmed this shard size."""
+        return self.shards.has_quorum({self.agent, *self.own.noted_by})
 
     def _known_of(self, agent: str, disk: int) -> Known:
-        life, plots = self._known(agent)
-        return Known(agent=self.agent, disk=disk, life=life, plots=plots, plot_cells=self.plots.side)
+        generation, shards = self._known(agent)
+        return Known(
+            agent=self.agent, disk=disk, generation=generation, shards=shards, shard_cells=self.shards.side
+        )
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
-        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles or keep
-        some of an earlier life shut."""
+        """The greatest generation of an agent in any stored table, and the shards that grant cells to its vehicles
+        or keep some of an earlier generation shut."""
         stored = self._stored()
-        life = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
-        return life, sorted(
-            plot
-            for plot, table in stored.items()
+        generation = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
+        return generation, sorted(
+            shard
+            for shard, table in stored.items()
             if any(agent_of(vehicle) == agent for vehicle in table.grants)
             or any(fence.agent == agent for fence in table.fences)
         )
 
     def _stored(self) -> dict[int, Table]:
-        """Plot -> the newest table of it on our file."""
-        stored = {plot: table for plot, (_, table) in self._saved.items()}
-        stored.update((plot, member.stored) for plot, member in self._members.items())
+        """Shard -> the newest table of it on our file."""
+        stored = {shard: table for shard, (_, table) in self._saved.items()}
+        stored.update((shard, member.stored) for shard, member in self._members.items())
         return stored
 
-    def _lives_of(self, agent: str) -> list[int]:
+    def _generations_of(self, agent: str) -> list[int]:
         """All lives of an agent that stored tables name, the newest ones."""
-        lives = {table.hosts[agent][0] for table in self._stored().values() if agent in table.hosts}
-        lives.update(each.life for table in self._stored().values() for each in table.fences if each.agent == agent)
-        return sorted(lives)[-LIVES_KEPT:]
+        generations = {table.hosts[agent][0] for table in self._stored().values() if agent in table.hosts}
+        generations.update(
+            each.generation for table in self._stored().values() for each in table.fences if each.agent == agent
+        )
+        return sorted(generations)[-GENERATIONS_KEPT:]
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_standing(self, standing: Standing, now_ns: int) -> None:
-        member = self._member(standing.plot, now_ns)
+    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
+        member = self._member(standing.shard, now_ns)
         if member is not None:
-            member.hear_standing(standing, now_ns)
+            member.hear_host_state(standing, now_ns)
 
     def hear_table(self, table: Table, now_ns: int) -> list[Action]:
-        member = self._member(table.plot, now_ns)
+        member = self._member(table.shard, now_ns)
         return [] if member is None else [*member.hear_table(table, now_ns)]
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[Action]:
-        member = self._member(stored.plot, now_ns)
+        member = self._member(stored.shard, now_ns)
         return [] if member is None else [*member.hear_stored(stored, now_ns)]
 
-    def hear_claim(self, plot: int, epoch: int, now_ns: int) -> list[Action]:
+    def hear_claim(self, shard: int, epoch: int, now_ns: int) -> list[Action]:
         """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
-        member = self._member(plot, now_ns)
+        member = self._member(shard, now_ns)
         return [] if member is None else [*member.hear_claim(epoch, now_ns)]
 
     def hear_promise(self, member: str, epoch: int, table: Table, now_ns: int) -> None:
-        seat = self._members.get(table.plot)
+        seat = self._members.get(table.shard)
         if seat is not None:
             seat.hear_promise(member, epoch, table, now_ns)
 
@@ -219,31 +227,31 @@ class RightOfWay:
             actions.append(AskKnown())
         return actions
 
-    def _member(self, plot: int, now_ns: int) -> Member | None:
-        """Returns our seat in a plot. None if we have none, or the other members have not all noted our file: then
-        it is not known to be the first, and promises in the first are not in it; or while agents of plots of
+    def _member(self, shard: int, now_ns: int) -> Member | None:
+        """Returns our seat in a shard. None if we have none, or the other members have not all noted our file: then
+        it is not known to be the first, and promises in the first are not in it; or while agents of shards of
         another size could have seats."""
         if self.silent:
             return None
-        known = self._members.get(plot)
-        if known is not None or plot not in self.plots.all:
+        known = self._members.get(shard)
+        if known is not None or shard not in self.shards.all:
             return known
-        members = self.plots.members(plot)
+        members = self.shards.members(shard)
         noted = {self.agent, *self.own.noted_by}
         if self.agent not in members or not noted.issuperset(members) or not self._has_quorum:
             return None
-        promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
-        made = self._members[plot] = Member(
-            self.plots, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
+        promised, stored = self._saved.get(shard) or (0, self._at_start(shard))
+        made = self._members[shard] = Member(
+            self.shards, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
         )
         return made
 
-    def _at_start(self, plot: int) -> Table:
-        """The table from before any warden: vehicles stand where the run begins."""
+    def _at_start(self, shard: int) -> Table:
+        """The table from before any leader: vehicles stand where the run begins."""
         grants = {
             vehicle: [(cell, 0, 1)]
             for fleet in self._spawns.values()
             for vehicle, cell in fleet.items()
-            if self.plots.of(cell) == plot
+            if self.shards.of(cell) == shard
         }
-        return Table(plot=plot, agent=self.agent, epoch=0, seq=0, hosts={}, grants=grants)
+        return Table(shard=shard, agent=self.agent, epoch=0, seq=0, hosts={}, grants=grants)

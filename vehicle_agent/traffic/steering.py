@@ -1,4 +1,4 @@
-"""Next cells of each vehicle: a host's requests to wardens for it."""
+"""Next cells of each vehicle: a host's requests to leaders for it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
-from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.obstacles import Obstacles
 
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
@@ -41,13 +41,13 @@ class Steering:
     A planner's route is the cost-to-go along one line. A cell beside it costs the step back to the route and the
     rest from there; so a host needs no tree of the planner, and one that is pushed aside finds back by itself.
 
-    pace         float32 (rows, cols), s/m; inf is lethal; read at each call
-    reserve      cells ahead of itself that a vehicle may be granted
-    bodies       vehicles without right of way: their cells are passed like lethal ones, but by routes
-    climb        says which steps are too steep; None if none is
+    pace       float32 (rows, cols), s/m; inf is lethal; read at each call
+    reserve    cells ahead of itself that a vehicle may be granted
+    obstacles  vehicles without right of way: their cells are passed like lethal ones, but by routes
+    climb      says which steps are too steep; None if none is
 
     waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on
-    shut_in      vehicles that have stood for long on cells from which bodies leave no step
+    shut_in      vehicles that have stood for long on cells from which obstacles leave no step
     ways_out     cell that only an operator's zone closes -> steps from there out of it: a vehicle there leaves
     """
 
@@ -57,7 +57,7 @@ class Steering:
         pace: NDArray[np.float32],
         planner: PlannerConfig,
         reserve: int,
-        bodies: Bodies,
+        obstacles: Obstacles,
         climb: Climb | None = None,
     ) -> None:
         self._grid = grid
@@ -66,14 +66,14 @@ class Steering:
         self._diagonal = planner.neighbours == 8
         self._corner_cutting = planner.corner_cutting
         self._reserve = reserve
-        self._bodies = bodies
-        self._shut = bodies.closed
+        self._obstacles = obstacles
+        self._shut = obstacles.closed
         self.ways_out: Mapping[int, int] = {}
         self.waiting_ns: dict[str, tuple[int, int]] = {}
         self.shut_in: set[str] = set()
 
     def closed(self, cell: int) -> bool:
-        """Returns True if a cell is lethal, or a body closes it."""
+        """Returns True if a cell is lethal, or an obstacle closes it."""
         return cell in self._shut or not math.isfinite(self._pace.item(cell))
 
     def passable(self, tail: int, head: int) -> bool:
@@ -94,7 +94,7 @@ class Steering:
         return not self._diagonal or self.closed(tail + col) or self.closed(tail + rows * cols)
 
     def passable_steps(self, cells: Sequence[int]) -> int:
-        """Returns the number of leading steps of `cells` that the map allows. Bodies count for none: they may be
+        """Returns the number of leading steps of `cells` that the map allows. Obstacles count for none: they may be
         gone before the vehicle is there."""
         if len(cells) < 2:
             return 0
@@ -125,9 +125,9 @@ class Steering:
         lot: int,
     ) -> Wish:
         """Returns the request for a vehicle that holds these cells. Depends on nothing but its arguments, on ground
-        and bodies near the vehicle, and on `ways_out`.
+        and obstacles near the vehicle, and on `ways_out`.
 
-        pushed_ms  the age with which it is to make way into another plot; 0 if it is not
+        pushed_ms  the age with which it is to make way into another shard; 0 if it is not
         age_ms     for how long it has been on its way
         held       the cells that vehicles hold
         in_reach   whether a target is within capture range of a cell
@@ -146,7 +146,7 @@ class Steering:
             wants = sorted(
                 steps,
                 key=lambda cell: (
-                    self._bodies.danger(cell) if flees else 0.0,
+                    self._obstacles.danger(cell) if flees else 0.0,
                     self._is_one_way(here, cell),
                     not in_reach(vehicle.target, cell),
                     cell in held,
@@ -164,7 +164,8 @@ class Steering:
             cost[cell] += _OCCUPIED * (cell in held)
         if self.threatened(here):
             wants = sorted(
-                cost, key=lambda cell: (self._bodies.danger(cell), cell in one_way, cost[cell], hash((lot, cell)))
+                cost,
+                key=lambda cell: (self._obstacles.danger(cell), cell in one_way, cost[cell], hash((lot, cell))),
             )
             return Wish(ahead, wants, len(wants), _OLDEST_MS)
         if ahead and ahead[0] in cost and ahead[0] not in one_way:
@@ -176,8 +177,9 @@ class Steering:
         return Wish(ahead, wants, len(wants) if pushed_ms else better, age_ms)
 
     def threatened(self, cell: int) -> bool:
-        """Returns True if a body is on a cell or approaches it: a vehicle there makes way before all others."""
-        return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
+        """Returns True if an obstacle is on a cell or approaches it: a vehicle there makes way before all
+        others."""
+        return self._obstacles.any and (cell in self._shut or self._obstacles.danger(cell) > 0.0)
 
     def blocked(self, vehicle: Vehicle, now_ns: int) -> bool:
         """Returns True if a vehicle that holds no cell but its own is at rest though its route goes on. Asks for
@@ -197,7 +199,7 @@ class Steering:
         return True
 
     def _is_shut_in(self, cell: int) -> bool:
-        """Returns True if no step leads from a cell, and bodies close a cell beside it."""
+        """Returns True if no step leads from a cell, and obstacles close a cell beside it."""
         return not self.steps(cell) and any(each in self._shut for _, each in self._grid.neighbours(cell))
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:

@@ -20,7 +20,7 @@ from swarm.config.load import is_loopback
 from swarm.config.setting_types import Metres, Name, Positive, Section
 from swarm.errors import ConfigError
 from swarm.wire.messages.planning import GROUND
-from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M
+from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_RADIUS_M
 
 ROS_ENDPOINT = "tcp/127.0.0.1:7447"
 """Default endpoint of rmw_zenohd: the same as a swarm's router."""
@@ -103,21 +103,21 @@ class TopicSettings(Section, frozen=True, kw_only=True):
 class Robots(Section, frozen=True, kw_only=True):
     """Robots of ROS that are vehicles of the swarm, from the first message on which says where they are.
 
-    id         of the one robot; not given where the topic has {robot}: then every robot that has such a topic
-    topic      where each says where it is
-    type       of this topic: odometry, pose, pose_with_covariance
-    frame      in which it says so, beside the map frame
-    offset_m   where the origin of that frame lies in the map frame: x, y
-    turn_rad   how far that frame is turned against the map frame, counter-clockwise
-    radius_m   others keep clear of it
-    lease_s    it is no vehicle any more so long after its last message
-    hz         the swarm hears of it at most so often
-    group      whose it is
+    id             of the one robot; not given where the topic has {robot}: then every robot that has such a topic
+    topic          where each says where it is
+    type           of this topic: odometry, pose, pose_with_covariance
+    frame          in which it says so, beside the map frame
+    offset_m       where the origin of that frame lies in the map frame: x, y
+    turn_rad       how far that frame is turned against the map frame, counter-clockwise
+    radius_m       others keep clear of it
+    lease_s        it is no vehicle any more so long after its last message
+    hz             the swarm hears of it at most so often
+    group          whose it is
     vehicle_class  whose routes it gets: one of the scenario's classes
-    target     the target that it follows; not given: none, until it is given a goal
-    plan       topic of its route
-    goal       topic of the goal: published when it follows a target, subscribed when another program gives it a
-               goal
+    target         the target that it follows; not given: none, until it is given a goal
+    plan           topic of its route
+    goal           topic of the goal: published when it follows a target, subscribed when another program gives it a
+                   goal
     """
 
     id: RosName | None = None
@@ -127,7 +127,7 @@ class Robots(Section, frozen=True, kw_only=True):
     offset_m: tuple[Metres, Metres] = (0.0, 0.0)
     turn_rad: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     radius_m: Annotated[float, Meta(ge=0, le=MOST_RADIUS_M)] = 1.0
-    lease_s: Annotated[float, Meta(gt=0, le=LONGEST_BODY_LEASE_S)] = 2.0
+    lease_s: Annotated[float, Meta(gt=0, le=LONGEST_OBSTACLE_LEASE_S)] = 2.0
     hz: Annotated[float, Meta(gt=0, le=MOST_ROBOT_HZ)] = 10.0
     group: Name = "all"
     vehicle_class: Name = GROUND

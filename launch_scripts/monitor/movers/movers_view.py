@@ -1,7 +1,7 @@
 """Moving half of the view: receives positions, and draws them frame by frame.
 
-Targets are pins with a label, hidden ones rings where they were seen, bodies discs, beliefs balls that are the more
-opaque the likelier a target is there, alarms poles with their words.
+Targets are pins with a label, hidden ones rings where they were seen, obstacles discs, beliefs balls that are the
+more opaque the likelier a target is there, alarms poles with their words.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import Believed, Sighted
-from swarm.wire.messages.vehicles import Body, Fleet, Followed
-from vehicle_agent.bodies import Bodies
+from swarm.wire.messages.vehicles import Fleet, Followed, Obstacle
+from vehicle_agent.obstacles import Obstacles
 
 MOST_LABELS = 40
 """With more labels nothing can be read."""
@@ -60,7 +60,7 @@ Place = tuple[float, float]
 
 
 class MoversView:
-    """Vehicles, targets, sightings, bodies, routes and trails.
+    """Vehicles, targets, sightings, obstacles, routes and trails.
 
     figures  have heard each message before `hear`
     filter   whose sightings count
@@ -83,7 +83,7 @@ class MoversView:
         self._sightings = Sightings(filter)
         self._believed: dict[str, tuple[Believed, int]] = {}
         """Unseen target -> its believed position, and the time of that belief."""
-        self._bodies = Bodies(pen.mesh.grid)
+        self._obstacles = Obstacles(pen.mesh.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._targets: set[str] = set()
         """Those of the table of figures: one that an operator removed is not there."""
@@ -126,8 +126,8 @@ class MoversView:
                 self._sightings.receive(sighted, now_ns)
             case Believed(target=target) as believed if target in self._believed or len(self._believed) < _SHOWN:
                 self._believed[believed.target] = believed, now_ns
-            case Body() as body:
-                self._bodies.take_report(body, now_ns)
+            case Obstacle() as obstacle:
+                self._obstacles.take_report(obstacle, now_ns)
             case Followed() as followed:
                 try:
                     self._vehicles.begun(followed, now_ns)
@@ -160,10 +160,10 @@ class MoversView:
             self._draw_goals(observed.goals(), observed.vehicles())
         if self._limit.due("beliefs", now_ns):
             self._draw_beliefs(now_ns)
-        self._bodies.tick(now_ns)
-        self._bodies.take_changed()
-        self._bodies.complaints.clear()
-        self._draw_bodies(self._bodies.reports, now_ns)
+        self._obstacles.tick(now_ns)
+        self._obstacles.take_changed()
+        self._obstacles.complaints.clear()
+        self._draw_obstacles(self._obstacles.reports, now_ns)
 
     def _draw_targets(self, places_m: Mapping[str, Place], lost: Collection[str], now_ns: int) -> None:
         """Draws the targets with published positions, of which those in `lost` have no tracker now, and those that
@@ -210,16 +210,16 @@ class MoversView:
         above_m = np.array([0, 0, above * self._mesh.scale_m], np.float32)
         self._pen.points(entity, positions=places[:MOST_LABELS] + above_m, labels=texts[:MOST_LABELS])
 
-    def _draw_bodies(self, bodies: Sequence[Body], now_ns: int) -> None:
-        """Draws discs as large as the bodies, if something about them is new."""
+    def _draw_obstacles(self, obstacles: Sequence[Obstacle], now_ns: int) -> None:
+        """Draws discs as large as the obstacles, if something about them is new."""
         if not self._limit.due("bodies", now_ns):
             return
-        centres, radii_m = self._discs(bodies, [each.radius_m for each in bodies], 0.2)
+        centres, radii_m = self._discs(obstacles, [each.radius_m for each in obstacles], 0.2)
         sizes = np.stack([radii_m, radii_m, 0.35 * radii_m], axis=1)
         if self._pen.news("world/bodies", centres=centres, sizes=sizes):
             discs = rr.Ellipsoids3D(
-                centers=centres, half_sizes=sizes, colors=[styles.BODY_COLOUR], fill_mode="solid",
-                labels=[f"{each.id} of {each.group}" for each in bodies], show_labels=len(bodies) <= MOST_LABELS,
+                centers=centres, half_sizes=sizes, colors=[styles.OBSTACLE_COLOUR], fill_mode="solid",
+                labels=[f"{each.id} of {each.group}" for each in obstacles], show_labels=len(obstacles) <= MOST_LABELS,
             )  # fmt: skip
             self._pen.log("world/bodies", discs)
 
@@ -248,7 +248,9 @@ class MoversView:
         [place] = self._pen.placed([place_m], 0.1)
         self._pen.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=place))
 
-    def _discs(self, there: Sequence[Sighted | Body], radii_m: list[float], above: float) -> tuple[Floats, Floats]:
+    def _discs(
+        self, there: Sequence[Sighted | Obstacle], radii_m: list[float], above: float
+    ) -> tuple[Floats, Floats]:
         """Centres float32 (n, 3), and radii float32 (n,), m, that are seen."""
         grid = self._mesh.grid
         centres = self._pen.placed([(each.x_m - grid.west_m, grid.north_m - each.y_m) for each in there], above)

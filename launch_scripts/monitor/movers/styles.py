@@ -31,7 +31,7 @@ NOBODY: Colour = (170, 176, 182)
 TARGET_COLOUR: Colour = (255, 255, 255)
 """Colour of all targets, where hues are groups."""
 LOST_COLOUR: Colour = (120, 124, 130)
-BODY_COLOUR: Colour = (118, 84, 60)
+OBSTACLE_COLOUR: Colour = (118, 84, 60)
 SIGHTED_COLOUR: Colour = (255, 255, 255)
 SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
@@ -132,7 +132,7 @@ class Looks:
             *states,
             Look("ball", self.target(target), "target on a pole"),
             Look("ring", SIGHTED_COLOUR, "hidden target seen"),
-            Look("ball", BODY_COLOUR, "body to keep off"),
+            Look("ball", OBSTACLE_COLOUR, "obstacle to keep off"),
             Look("line", self.route(target), "route, trail"),
             Look("ball", ALARM_COLOUR, "alarm on a pole"),
             Look("ball", FLAG_COLOUR, "place of an order"),

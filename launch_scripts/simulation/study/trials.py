@@ -53,7 +53,7 @@ def code_version() -> str:
 LAWS = {
     "collisions": "no collision",
     "lethal_entries": "no lethal entry",
-    "driven_into": "bodies are avoided",
+    "driven_into": "obstacles are avoided",
 }
 """Figure of a report that must be 0 -> the law. Outcomes of trials without faults."""
 _LEFT_OUT = ("by_vehicle", "seed")

@@ -3,9 +3,9 @@
 A report of a vehicle holds from its stamp until the vehicle's next report. If reports between two are missing (the
 sequence number jumps) and the vehicle moved meanwhile, the older one is known to hold at its timestamp only.
 
-A report of a body holds from when it was heard until the next one or the end of its lease. Vehicles tell when they
-were on a cell by their agents' clocks, bodies are timed by the referee's: overlaps which late messages explain do
-not count."""
+A report of an obstacle holds from when it was heard until the next one or the end of its lease. Vehicles tell when
+they were on a cell by their agents' clocks, obstacles are timed by the referee's: overlaps which late messages
+explain do not count."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
-from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body, Fleet
-from swarm.wire.topics import BODY, FLEET
-from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
+from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Fleet, Obstacle
+from swarm.wire.topics import FLEET, OBSTACLE
+from vehicle_agent.obstacles import MOST_OBSTACLES, REACTION_S, capsule_of
 
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""
 _REMEMBER_NS = 5 * NS_PER_S
-"""Stays and bodies that ended longer ago are forgotten, which bounds memory and the time of a look. It is more than
-twice the 2 s after which a silent link counts as gone, so late reports find what they are compared with."""
+"""Stays and obstacles that ended longer ago are forgotten, which bounds memory and the time of a look. It is more
+than twice the 2 s after which a silent link counts as gone, so late reports find what they are compared with."""
 _APART_NS = 2 * NS_PER_S
 """Two that meet again within this time are counted once: a vehicle takes about a second to cross a cell, and
 several reports state one encounter."""
@@ -64,15 +64,16 @@ class LethalEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class BodyHit:
-    """A vehicle and a body on one cell at one time; reported once per encounter.
+class ObstacleHit:
+    """A vehicle and an obstacle on one cell at one time; reported once per encounter.
 
-    by_vehicle  the vehicle is at fault: it entered the cell, though the body had closed it in time
-    said_s      how long the body had closed the cell when the vehicle entered it; negative if the vehicle was first
+    by_vehicle  the vehicle is at fault: it entered the cell, though the obstacle had closed it in time
+    said_s      how long the obstacle had closed the cell when the vehicle entered it; negative if the vehicle was
+                first
     """
 
     vehicle: str
-    body: str
+    obstacle: str
     cell: int
     stamp_ns: int
     by_vehicle: bool
@@ -82,15 +83,15 @@ class BodyHit:
     def sentence(self, began_ns: int) -> str:
         """Returns the finding and the reports which prove it."""
         if self.by_vehicle:
-            found = f"{self.vehicle} drove into body {self.body}, which had closed the cell for {self.said_s:.1f} s"
+            found = f"{self.vehicle} drove into obstacle {self.obstacle}, which had closed the cell for {self.said_s:.1f} s"
         elif self.said_s < 0.0:
-            found = f"body {self.body} drove into {self.vehicle}, which was there first"
+            found = f"obstacle {self.obstacle} drove into {self.vehicle}, which was there first"
         else:
-            found = f"body {self.body} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
+            found = f"obstacle {self.obstacle} met {self.vehicle}, {self.said_s:.2f} s after its first report of the cell"
         return found + _proven(self.evidence, began_ns)
 
 
-Broken = Collision | LethalEntry | BodyHit
+Broken = Collision | LethalEntry | ObstacleHit
 
 
 @dataclass(slots=True, eq=False)
@@ -166,7 +167,7 @@ class Referee:
         """Stays of vehicles that have gone on since."""
         self._encounters: Encounters = {}
         self._swept_ns = 0
-        self._bodies = BodyReferee(grid)
+        self._obstacles = ObstacleReferee(grid)
 
     @property
     def cells(self) -> NDArray[np.int64]:
@@ -174,9 +175,9 @@ class Referee:
         own = np.array([stay.cell for stay in self._vehicles.values()], np.int64)
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
-    def hear_body(self, body: Body, now_ns: int) -> None:
-        """Takes in where a body is."""
-        self._bodies.on_body(body, now_ns)
+    def hear_obstacle(self, obstacle: Obstacle, now_ns: int) -> None:
+        """Takes in where an obstacle is."""
+        self._obstacles.on_obstacle(obstacle, now_ns)
 
     def on_fleet(self, fleet: Fleet) -> list[Broken]:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
@@ -184,7 +185,7 @@ class Referee:
             return self._air.on_fleet(fleet)
         broken: list[Broken] = []
         author, seq, stamp_ns, region = fleet.author, fleet.seq, fleet.stamp_ns, fleet.region
-        vehicles, stays, covered = self._vehicles, self._stays, self._bodies.covered
+        vehicles, stays, covered = self._vehicles, self._stays, self._obstacles.covered
         # In one loop: each vehicle reports in every tick, and all that most of them have to say is that they are
         # still where they were.
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
@@ -221,8 +222,8 @@ class Referee:
         if not truth.item(entered.cell) < math.inf:
             broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns, (replace(entered),)))
 
-    def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:
-        yield from self._bodies.check(stay)
+    def _meetings(self, stay: Stay) -> Iterator[Collision | ObstacleHit]:
+        yield from self._obstacles.check(stay)
         for other in self._stays.get(stay.cell, ()):
             overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
             if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
@@ -246,21 +247,21 @@ class Referee:
 
 
 IN_TIME_NS = NS_PER_S // 5
-"""Two ticks of an agent: a cell that a body has closed for so long is closed to every vehicle."""
+"""Two ticks of an agent: a cell that an obstacle has closed for so long is closed to every vehicle."""
 _LATE_NS = 3 * NS_PER_S // 20
 """Shorter overlaps are no hit: the referee and an agent may hear of the same report so long after each other."""
 
 
 @dataclass(slots=True, eq=False)
 class Cover:
-    """A body on a cell.
+    """An obstacle on a cell.
 
     closed_ns  since when it has closed the cell
     end_ns     while it is there the end of its lease
     seq        of the last report of it there; the first has `first_seq`
     """
 
-    body: str
+    obstacle: str
     begin_ns: int
     closed_ns: int
     end_ns: int
@@ -269,12 +270,12 @@ class Cover:
 
     @property
     def name(self) -> str:
-        return f"body {self.body}"
+        return f"obstacle {self.obstacle}"
 
     @property
     def key(self) -> str:
         """The key of the reports, below the namespace."""
-        return BODY.below({"id": self.body})
+        return OBSTACLE.below({"id": self.obstacle})
 
 
 @dataclass(slots=True, eq=False)
@@ -286,8 +287,8 @@ class _Record:
     """Cell -> since when it has been closed, of those that the newest report closes."""
 
 
-class BodyReferee:
-    """Finds vehicles and bodies on one cell."""
+class ObstacleReferee:
+    """Finds vehicles and obstacles on one cell."""
 
     def __init__(self, grid: GridSpec) -> None:
         self._grid = grid
@@ -296,32 +297,34 @@ class BodyReferee:
         self._met: Encounters = {}
         self._swept_ns = 0
 
-    def on_body(self, body: Body, now_ns: int) -> None:
+    def on_obstacle(self, obstacle: Obstacle, now_ns: int) -> None:
         """Takes in a report; one that is no news, or that no agent would avoid, changes nothing."""
-        key = body.id, body.incarnation
+        key = obstacle.id, obstacle.incarnation
         record = self._records.get(key)
         if record is None:
-            if len(self._records) >= MOST_BODIES:
+            if len(self._records) >= MOST_OBSTACLES:
                 return
             record = self._records[key] = _Record()
-        elif body.seq <= record.seq and now_ns < record.until_ns:
+        elif obstacle.seq <= record.seq and now_ns < record.until_ns:
             return
-        if body.radius_m > MOST_RADIUS_M or body.speed_m_per_s > MOST_M_PER_S:
+        if obstacle.radius_m > MOST_RADIUS_M or obstacle.speed_m_per_s > MOST_M_PER_S:
             return
-        goes_on = now_ns < record.until_ns and body.lease_s > 0.0
+        goes_on = now_ns < record.until_ns and obstacle.lease_s > 0.0
         left, record.covers = record.covers, {}
         closed_before, record.closed_ns = record.closed_ns if goes_on else {}, {}
-        left_ns, record.until_ns = min(now_ns, record.until_ns), now_ns + int(body.lease_s * NS_PER_S)
-        record.seq = body.seq
-        if body.lease_s > 0.0:
-            closed = capsule_of(body, self._grid, body.speed_m_per_s * REACTION_S).cells(self._grid)
+        left_ns, record.until_ns = min(now_ns, record.until_ns), now_ns + int(obstacle.lease_s * NS_PER_S)
+        record.seq = obstacle.seq
+        if obstacle.lease_s > 0.0:
+            closed = capsule_of(obstacle, self._grid, obstacle.speed_m_per_s * REACTION_S).cells(self._grid)
             record.closed_ns = {cell: closed_before.get(cell, now_ns) for cell in closed}
-            for cell in capsule_of(body, self._grid, 0.0).cells(self._grid):
+            for cell in capsule_of(obstacle, self._grid, 0.0).cells(self._grid):
                 cover = left.pop(cell, None) if goes_on else None
                 if cover is None:
-                    cover = Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0, body.seq, body.seq)
+                    cover = Cover(
+                        obstacle.id, now_ns, record.closed_ns.get(cell, now_ns), 0, obstacle.seq, obstacle.seq
+                    )
                     self._covers.setdefault(cell, []).append(cover)
-                cover.end_ns, cover.seq = record.until_ns, body.seq
+                cover.end_ns, cover.seq = record.until_ns, obstacle.seq
                 record.covers[cell] = cover
         for cover in left.values():
             cover.end_ns = left_ns
@@ -330,19 +333,21 @@ class BodyReferee:
 
     @property
     def covered(self) -> Container[int]:
-        """The cells on which a body was lately; goes on being them."""
+        """The cells on which an obstacle was lately; goes on being them."""
         return self._covers
 
-    def check(self, stay: Stay) -> Iterator[BodyHit]:
+    def check(self, stay: Stay) -> Iterator[ObstacleHit]:
         """Returns violations proven by a vehicle's stay on a cell."""
         for cover in self._covers.get(stay.cell, ()):
             end_ns = min(stay.end_ns, cover.end_ns)
             if end_ns - max(stay.begin_ns, cover.begin_ns) <= _LATE_NS:
                 continue
-            if _is_new(self._met, (stay.vehicle, cover.body), end_ns):
+            if _is_new(self._met, (stay.vehicle, cover.obstacle), end_ns):
                 said_ns = stay.since_ns - cover.closed_ns
                 by_vehicle, evidence = said_ns >= IN_TIME_NS, (replace(stay), replace(cover))
-                yield BodyHit(stay.vehicle, cover.body, stay.cell, end_ns, by_vehicle, said_ns / NS_PER_S, evidence)
+                yield ObstacleHit(
+                    stay.vehicle, cover.obstacle, stay.cell, end_ns, by_vehicle, said_ns / NS_PER_S, evidence
+                )
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""

@@ -13,16 +13,16 @@ from dataclasses import dataclass, field
 from launch_scripts.simulation.world.walks import TrueTerrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import RoverConfig, Scenario, ids_of
-from swarm.wire.messages.vehicles import MOST_M_PER_S, Body
+from swarm.wire.messages.vehicles import MOST_M_PER_S, Obstacle
 
 LEASE_S = 2.0
 TURN_S = 0.6
 """Time of a turn, during which its new heading is published already."""
 _LONGEST_REST_S = 8.0
-"""Rests are drawn from half a second up to this. Vehicles wait for a body at rest for a second and then drive
+"""Rests are drawn from half a second up to this. Vehicles wait for an obstacle at rest for a second and then drive
 around it (docs/design/reported-obstacles.md): both are to happen, the second more often."""
 _TOLD_AGAIN_NS = NS_PER_S // 2
-"""Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every body
+"""Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every obstacle
 (docs/design/reported-obstacles.md), and a report that is lost must not end the lease."""
 _LONGEST_TICK_S = 1.0
 """After a longer pause of its process a rover does not make up for the rest: a leap keeps the old place closed
@@ -77,14 +77,14 @@ class Rovers:
         self._turn(rover)
         return rover
 
-    def note_body(self, body: Body) -> None:
+    def note_obstacle(self, obstacle: Obstacle) -> None:
         """Takes in where the process that leads has moved a rover: one that takes over goes on from there."""
-        rover = self._by_id.get(body.id)
-        if rover is not None and self._passable(body.x_m, body.y_m):
-            rover.x_m, rover.y_m = body.x_m, body.y_m
-            rover.seq = max(rover.seq, body.seq)
+        rover = self._by_id.get(obstacle.id)
+        if rover is not None and self._passable(obstacle.x_m, obstacle.y_m):
+            rover.x_m, rover.y_m = obstacle.x_m, obstacle.y_m
+            rover.seq = max(rover.seq, obstacle.seq)
 
-    def tick(self, time_scale: float, now_ns: int) -> list[Body]:
+    def tick(self, time_scale: float, now_ns: int) -> list[Obstacle]:
         """Moves all rovers by a time (s) on the terrain. Returns what they say now."""
         self._time_scale = time_scale
         passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
@@ -100,7 +100,7 @@ class Rovers:
             rover.told, rover.told_ns = state, now_ns
             rover.seq += 1
             said.append(
-                Body(
+                Obstacle(
                     id=rover.id,
                     group="rovers",
                     incarnation=self.incarnation,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry
+from launch_scripts.simulation.world.referee import Collision, LethalEntry, ObstacleHit
 from launch_scripts.simulation.world.targets import Action, Captured, TargetWorld
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
@@ -21,8 +21,8 @@ from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, TargetPose
-from swarm.wire.messages.vehicles import Body, Fleet
-from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
+from swarm.wire.messages.vehicles import Fleet, Obstacle
+from swarm.wire.topics import COST, FLEET, OBSTACLE, POSE, STATUS, TRUE_POSE, Topic
 
 _MOVED_CELLS = 0.25
 """A share of a cell, which trackers of others are asked for, too (docs/design/zenoh-topology-and-inboxes.md,
@@ -67,8 +67,8 @@ _ASK = "where"
 
 
 class TargetsService:
-    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, bodies
-    that vehicles drove into, and `hit_by_bodies`, the other way round."""
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, obstacles
+    that vehicles drove into, and `hit_by_obstacles`, the other way round."""
 
     def __init__(
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
@@ -97,7 +97,7 @@ class TargetsService:
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places of its targets", lambda: self._world.ready)
         self.counters = self._member.counters
-        for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
+        for name in ("captures", "collisions", "driven_into", "hit_by_obstacles", "lethal_entries", "poses"):
             self.counters.count(name, 0)
 
     def lacks(self) -> list[str]:
@@ -106,7 +106,7 @@ class TargetsService:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._bus.subscribe(FLEET, self._post)
-        self._bus.subscribe(BODY, self._post)
+        self._bus.subscribe(OBSTACLE, self._post)
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
         self._hear_targets()
@@ -127,8 +127,8 @@ class TargetsService:
         match event:
             case Heard(message=Fleet() as fleet):
                 self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
-            case Heard(message=Body() as body):
-                self._world.hear_body(body, now_ns)
+            case Heard(message=Obstacle() as obstacle):
+                self._world.hear_obstacle(obstacle, now_ns)
             case Heard(message=PlannerStatus() as status):
                 self._world.hear_planner(status.target, status.target_cell)
             case Replied(message=CostReply() as reply):
@@ -195,11 +195,11 @@ class TargetsService:
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
                     self._alarm("collision", f"{first} {second}", action.sentence(self._began_ns), cell, now_ns)
-                case Body():
-                    self._bus.publish(BODY, action, id=action.id)
-                case BodyHit(cell=cell, by_vehicle=by_vehicle):
-                    self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
-                    self._alarm("body-collision", action.vehicle, action.sentence(self._began_ns), cell, now_ns)
+                case Obstacle():
+                    self._bus.publish(OBSTACLE, action, id=action.id)
+                case ObstacleHit(cell=cell, by_vehicle=by_vehicle):
+                    self.counters.count("driven_into" if by_vehicle else "hit_by_obstacles")
+                    self._alarm("obstacle-collision", action.vehicle, action.sentence(self._began_ns), cell, now_ns)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
                     self._alarm("lethal-entry", vehicle, action.sentence(self._began_ns), cell, now_ns)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry, Referee
+from launch_scripts.simulation.world.referee import Collision, LethalEntry, ObstacleHit, Referee
 from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.walks import (
     Budget,
@@ -39,8 +39,8 @@ from swarm.runtime.order_book import OrderBook
 from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, VehicleState
-from vehicle_agent.bodies import TargetBodies
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Obstacle, VehicleState
+from vehicle_agent.obstacles import TargetObstacles
 
 LISTEN_NS = NS_PER_S
 """A starting process asks planners where their targets are before it places them itself: it waits so long for a
@@ -51,7 +51,7 @@ JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
 TRACKER = "targets"
-"""The name under which this process and its standbys tell poses: a later life takes over at once."""
+"""The name under which this process and its standbys tell poses: a later generation takes over at once."""
 _WAYS_PER_TICK = 1
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
@@ -64,7 +64,7 @@ class Captured:
     cell: int
 
 
-Action = TargetPose | Captured | Collision | LethalEntry | BodyHit | Body
+Action = TargetPose | Captured | Collision | LethalEntry | ObstacleHit | Obstacle
 
 
 @dataclass(eq=False)
@@ -129,7 +129,7 @@ class TargetWorld:
         self._referee = Referee(
             class_truths(scenario, terrain, truth_s_per_m), terrain.grid, aloft_classes(scenario)
         )
-        self._target_bodies = TargetBodies(scenario, terrain.grid)
+        self._target_obstacles = TargetObstacles(scenario, terrain.grid)
         self._rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Trackers of external targets, and for a standby the leader; and the highest incarnation of a leader.
@@ -256,11 +256,12 @@ class TargetWorld:
         target.placed = True
         self._refer(pose, now_ns)
 
-    def hear_body(self, body: Body, now_ns: int) -> None:
-        """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
+    def hear_obstacle(self, obstacle: Obstacle, now_ns: int) -> None:
+        """Takes where an obstacle is: of anybody's for the referee, of a rover that another leader moves for
+        itself."""
         if not self.leads:
-            self._rovers.note_body(body)
-        self._referee.hear_body(body, now_ns)
+            self._rovers.note_obstacle(obstacle)
+        self._referee.hear_obstacle(obstacle, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         seen = self._referee.on_fleet(fleet)
@@ -296,8 +297,8 @@ class TargetWorld:
         return actions
 
     def _refer(self, pose: TargetPose, now_ns: int) -> None:
-        for body in self._target_bodies.bodies_of(pose, now_ns):
-            self._referee.hear_body(body, now_ns)
+        for obstacle in self._target_obstacles.obstacles_of(pose, now_ns):
+            self._referee.hear_obstacle(obstacle, now_ns)
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
         target.x_m, target.y_m = target.walker.position_m(self._terrain)

@@ -132,8 +132,8 @@ _Stamps = Annotated[bytes, Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_
 
 
 def owner_of(author: str) -> str:
-    """The process that an author is a life of. Its certificate lets it write under any number of lives, so limits
-    and votes are those of processes."""
+    """The process that an author is a generation of. Its certificate lets it write under any number of generations,
+    so limits and votes are those of processes."""
     return author.rpartition(".")[0] or author
 
 

@@ -34,16 +34,16 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     """The run that a process belongs to. `terrain` is a digest of grid, prior pace and cost rules: processes with
     different ones must not share a map.
 
-    rows, cols, resolution_m    of the grid; 0 of a router, which has none
-    west_m, north_m, crs        where its north-west corner is, and in which coordinate system
-    now_ns                      its clock when it answered, as of its last tick; 0 before the first
-    vehicles, crew              how many vehicles the scenario has, and which processes it needs, as `role-id`
-    restarts                    how often the process was started again in this run
-    classes                     the classes of vehicles beside "ground", in the order of their numbers
-    wire_version                of its build. This message is read by builds of all wire versions: it never steps to
-                                another version, so that each can say which the other speaks
-                                (docs/design/wire-format.md)
-    plot_cells                  side of a plot of right of way: two layouts in one run would grant a cell twice
+    rows, cols, resolution_m  of the grid; 0 of a router, which has none
+    west_m, north_m, crs      where its north-west corner is, and in which coordinate system
+    now_ns                    its clock when it answered, as of its last tick; 0 before the first
+    vehicles, crew            how many vehicles the scenario has, and which processes it needs, as `role-id`
+    restarts                  how often the process was started again in this run
+    classes                   the classes of vehicles beside "ground", in the order of their numbers
+    wire_version              of its build. This message is read by builds of all wire versions: it never steps to
+                              another version, so that each can say which the other speaks
+                              (docs/design/wire-format.md)
+    shard_cells               side of a shard of right of way: two layouts in one run would grant a cell twice
     """
 
     run_id: Word
@@ -65,7 +65,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     restarts: Count = 0
     classes: Annotated[list[Id], IDS] = []
     wire_version: Count = 8
-    plot_cells: Count = REGION_CELLS
+    shard_cells: Count = REGION_CELLS
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,7 +111,7 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     web_port: WebPort = 0
 
 
-class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
+class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
     """State of one of several processes with one job, such as a target's planner and its standbys. `ready`: it can
     do the job. `leads`: it does."""
 

@@ -1,4 +1,4 @@
-"""Messages about right of way: what hosts say of their vehicles, and what wardens grant
+"""Messages about right of way: what hosts say of their vehicles, and what leaders grant
 (docs/design/right-of-way.md)."""
 
 from __future__ import annotations
@@ -8,12 +8,12 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS
-from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Plot, VehicleId
+from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS
+from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Shard, VehicleId
 from swarm.wire.messages import Message, schema_of
 
 Stamp = tuple[Natural, Natural]
-"""(epoch, seq): which table of a plot. Later ones compare greater."""
+"""(epoch, seq): which table of a shard. Later ones compare greater."""
 Number = tuple[Cell, Natural, Natural]
 """(cell, epoch, seq): an entry in the order of vehicles for a cell, by the table that added it."""
 Held = Annotated[list[Number], Meta(max_length=64)]
@@ -21,15 +21,15 @@ Held = Annotated[list[Number], Meta(max_length=64)]
 Before = tuple[Natural, Natural, VehicleId]
 """(epoch, seq, vehicle) of another entry of the same cell."""
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
-PlotSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_PLOT_REGIONS * REGION_CELLS, multiple_of=REGION_CELLS)]
+ShardSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_SHARD_REGIONS * REGION_CELLS, multiple_of=REGION_CELLS)]
 """In cells."""
 
 
 class Stand(Part, frozen=True, array_like=True):
-    """One vehicle, as its host tells it to the members of one plot.
+    """One vehicle, as its host tells it to the members of one shard.
 
-    cell    where it stands, and `end` where what it holds ends; both may lie in another plot
-    holds   the entries of this plot that it holds, in driving order
+    cell    where it stands, and `end` where what it holds ends; both may lie in another shard
+    holds   the entries of this shard that it holds, in driving order
     ahead   its next cells after `end`
     wants   where else it could go from its cell, the best first; only while it stands
     better  how many of those are better than to stay; the others serve to make way
@@ -46,21 +46,22 @@ class Stand(Part, frozen=True, array_like=True):
     age_ms: Milliseconds
 
 
-class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing", 9)):
-    """All vehicles of a host that hold or request a cell of one plot, sent to one of its members. The newest
+class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 9)):
+    """All vehicles of a host that hold or request a cell of one shard, sent to one of its members. The newest
     replaces the older.
 
-    life   number of the host's start (glossary: life) that sends this; a later start has a greater number
-    knows  number of the newest table that the host has used. It has left or given back every entry which that
-           table, or an older one, added and which is not listed in `vehicles`
-    dead   numbers of earlier starts of this host that have certainly ended: they had locked the host's file, which
-           this start has locked now
-    ended  this start of the host has stopped driving, for good
+    generation  number of the host's start (glossary: generation) that sends this; a later start has a greater
+                number
+    knows       number of the newest table that the host has used. It has left or given back every entry which that
+                table, or an older one, added and which is not listed in `vehicles`
+    dead        numbers of earlier starts of this host that have certainly ended: they had locked the host's file,
+                which this start has locked now
+    ended       this start of the host has stopped driving, for good
     """
 
-    plot: Plot
+    shard: Shard
     agent: Id
-    life: Natural
+    generation: Natural
     seq: Natural
     knows: Stamp
     vehicles: Annotated[list[Stand], SMALL]
@@ -83,24 +84,24 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Fence(Bounded, frozen=True, array_like=True):
-    """The entries of an earlier life of a host, on which its vehicles may still be."""
+    """The entries of an earlier generation of a host, on which its vehicles may still be."""
 
     agent: Id
-    life: Natural
+    generation: Natural
     entries: Annotated[dict[VehicleId, Held], LARGE]
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
-    """Entries of one plot, for its members. In a publication its author is the plot's warden; in a reply, a member
-    which tells what it has stored. The entries of a cell are in the order of their numbers.
+    """Entries of one shard, for its members. In a publication its author is the shard's leader; in a reply, a
+    member which tells what it has stored. The entries of a cell are in the order of their numbers.
 
-    hosts   agent -> [life, seq] of the newest standing that counts in this table
+    hosts   agent -> [generation, seq] of the newest host state that counts in this table
     grants  vehicle -> its entries in driving order
-    fences  entries of lives that may still drive
-    pushed  vehicle -> the age with which it is to make way into another plot
+    fences  entries of generations that may still drive
+    pushed  vehicle -> the age with which it is to make way into another shard
     """
 
-    plot: Plot
+    shard: Shard
     agent: Id
     epoch: Natural
     seq: Natural
@@ -115,32 +116,32 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
 
 
 class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
-    """A member of a plot has the table of this stamp on file."""
+    """A member of a shard has the table of this stamp on file."""
 
-    plot: Plot
+    shard: Shard
     agent: Id
     epoch: Natural
     seq: Natural
 
 
 class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
-    """Content of a plot's table for one host, once a majority of the plot's members has it on file.
+    """Content of a shard's table for one host, once a majority of the shard's members has it on file.
 
-    agent        the plot's warden
-    epoch, seq   of the table
-    life, heard  the newest standing of the host that counts in the table; 0 if none does
-    grants       vehicle of the host -> its entries, in driving order
-    followed     other host -> entries of this one behind which its vehicles wait
-    pushed       vehicle of the host -> the age with which it is to make way into another plot
-    occupied     of the cells around where vehicles of the host end, those that others hold
+    agent              the shard's leader
+    epoch, seq         of the table
+    generation, heard  the newest host state of the host that counts in the table; 0 if none does
+    grants             vehicle of the host -> its entries, in driving order
+    followed           other host -> entries of this one behind which its vehicles wait
+    pushed             vehicle of the host -> the age with which it is to make way into another shard
+    occupied           of the cells around where vehicles of the host end, those that others hold
     """
 
-    plot: Plot
+    shard: Shard
     host: Id
     agent: Id
     epoch: Natural
     seq: Natural
-    life: Natural
+    generation: Natural
     heard: Natural
     grants: Annotated[dict[VehicleId, Annotated[list[Entry], Meta(min_length=1, max_length=64)]], SMALL] = {}
     followed: Annotated[dict[Id, Annotated[list[Number], SMALL]], IDS] = {}
@@ -162,39 +163,41 @@ class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
-    """A member requests to be warden in this epoch: a member that replies with its stored table promises to store
+    """A member requests to be leader in this epoch: a member that replies with its stored table promises to store
     none of a lower epoch."""
 
     epoch: Natural
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
-    """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
-    a guest's is 0, and is not noted. Only agents of its layer answer: 0 is the ground, 1 the air; an agent is
-    answered only by those whose plots are as large as its own."""
+    """A new generation of an agent or an external vehicle asks all agents what they know of it. `disk` names the
+    file that it keeps; an external vehicle's is 0, and is not noted. Only agents of its layer answer: 0 is the
+    ground, 1 the air; an agent is answered only by those whose shards are as large as its own."""
 
     agent: Id
     disk: Natural
     layer: Annotated[int, Meta(ge=0, le=1)] = 0
-    plot_cells: PlotSide = REGION_CELLS
+    shard_cells: ShardSide = REGION_CELLS
 
 
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     """One agent's record of another.
 
-    agent   who answers
-    disk    the file that it knows as the other's: the first that it received
-    life    the greatest life in any table
-    plots   those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
-    agents  for a guest, which may not know the scenario: the agents of which three are members of each plot
-    lives   for a guest: all lives of it that tables name, so that an operator can say that they have ended
-    plot_cells  side of a plot
+    agent        who answers
+    disk         the file that it knows as the other's: the first that it received
+    generation   the greatest generation in any table
+    shards       those whose tables grant cells to its vehicles, or keep cells of an earlier generation of it shut
+    agents       for an external vehicle, which may not know the scenario: the agents of which three are members of
+                 each shard
+    generations  for an external vehicle: all generations of it that tables name, so that an operator can say that
+                 they have ended
+    shard_cells  side of a shard
     """
 
     agent: Id
     disk: Natural
-    life: Natural
-    plots: Annotated[list[Plot], LARGE]
+    generation: Natural
+    shards: Annotated[list[Shard], LARGE]
     agents: Annotated[list[Id], IDS] = []
-    lives: Annotated[list[Natural], Meta(max_length=32)] = []
-    plot_cells: PlotSide = REGION_CELLS
+    generations: Annotated[list[Natural], Meta(max_length=32)] = []
+    shard_cells: ShardSide = REGION_CELLS

@@ -157,15 +157,16 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
         check_legs([len(self.directions)], self.legs)
 
 
-LONGEST_BODY_LEASE_S = 10.0
+LONGEST_OBSTACLE_LEASE_S = 10.0
 MOST_RADIUS_M = 100.0
 MOST_M_PER_S = 340.0
-"""Anything faster than sound is no vehicle, as for marks. A receiver of a faster body reports it and goes on."""
+"""Anything faster than sound is no vehicle, as for marks. A receiver of a faster obstacle reports it and goes
+on."""
 Heading = Annotated[float, Meta(ge=-2 * math.tau, le=2 * math.tau)]
 Speed = Annotated[float, Meta(ge=0, le=1e6)]
 
 
-class Body(Message, frozen=True, kw_only=True, tag=schema_of("body")):
+class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     """Position of an obstacle that vehicles must not drive into: a disc on the map. The newest replaces the older.
 
     group          whose it is, for those who watch
@@ -176,7 +177,7 @@ class Body(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     heading_rad    clockwise from north; None if it may go any way
     speed_m_per_s  by the wall clock
     radius_m       around the place
-    lease_s        the body is forgotten so long after this message was heard; 0 takes it away at once
+    lease_s        the obstacle is forgotten so long after this message was heard; 0 takes it away at once
     """
 
     id: VehicleId
@@ -189,7 +190,7 @@ class Body(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     heading_rad: Heading | None = None
     speed_m_per_s: Speed = 0.0
     radius_m: Distance
-    lease_s: Annotated[float, Meta(ge=0, le=LONGEST_BODY_LEASE_S)] = 1.0
+    lease_s: Annotated[float, Meta(ge=0, le=LONGEST_OBSTACLE_LEASE_S)] = 1.0
 
 
 class RemoveVehicles(Message, frozen=True, kw_only=True, tag=schema_of("remove-vehicles")):

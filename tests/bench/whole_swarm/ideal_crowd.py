@@ -1,6 +1,6 @@
 """The bound that crowds are compared with: PIBT in lockstep, which knows everything at once and sends no messages.
 
-Vehicles of the same worlds step at the same instant to one of four neighbours, by the core with which wardens plan.
+Vehicles of the same worlds step at the same instant to one of four neighbours, by the core with which leaders plan.
 One may follow another into its cell; none go around in a ring. Four targets walk a cell in five steps, and jump
 when they are captured.
 """

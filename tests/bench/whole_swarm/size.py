@@ -32,7 +32,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     side       cells a side of the square map
     tick_hz    of agents and planners
     time_scale seconds on the terrain per second
-    plot_regions  `map.plot_regions`
+    shard_regions  `map.shard_regions`
     """
 
     vehicles: int
@@ -43,7 +43,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     tick_hz: float
     seed: int
     time_scale: float = 2.0
-    plot_regions: int = 1
+    shard_regions: int = 1
 
 
 def size_of(
@@ -96,7 +96,7 @@ def size_of(
         tick_hz=tick_hz,
         time_scale=time_scale,
         seed=seed,
-        plot_regions=fitting_regions(side, side, hosts),
+        shard_regions=fitting_regions(side, side, hosts),
     )
 
 

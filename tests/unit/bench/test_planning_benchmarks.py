@@ -86,7 +86,7 @@ def test_an_array_that_is_no_field_is_refused(tmp_path: Path, array: Any, compla
 # --- chases ------------------------------------------------------------------------------------------------------
 
 
-def test_full_growths_have_no_gap_and_no_strategy_beats_the_optimum() -> None:
+def test_full_growths_have_no_gap_and_no_strategy_heartbeats_the_optimum() -> None:
     report = bench("gap", "--dem", "uniform", "--frames", "6", "--runs", "1", "--walk", "random,evade")
     assert [(row["walk"], row["strategy"]) for row in report["rows"]] == [
         (walk, strategy) for walk in ("random", "evade") for strategy in STRATEGIES

@@ -56,11 +56,11 @@ processes = st.builds(
 
 @given(st.lists(processes, max_size=5))
 def test_a_machine_is_well_exactly_if_each_of_its_processes_is(seen: list[Process]) -> None:
-    lives, ready = verdict(HEALTHY, seen, _NOW_NS), verdict(READY, seen, _NOW_NS)
-    assert lives.ok == all(verdict(HEALTHY, [each], _NOW_NS).ok for each in seen)
+    generations, ready = verdict(HEALTHY, seen, _NOW_NS), verdict(READY, seen, _NOW_NS)
+    assert generations.ok == all(verdict(HEALTHY, [each], _NOW_NS).ok for each in seen)
     assert ready.ok == all(verdict(READY, [each], _NOW_NS).ok for each in seen)
-    assert lives.ok or not ready.ok, "what hangs is not ready"
-    for found in (lives, ready):
+    assert generations.ok or not ready.ok, "what hangs is not ready"
+    for found in (generations, ready):
         assert found.body.isascii()
         told = json.loads(found.body)
         assert told["status"] in ("healthy", "not healthy", "ready", "not ready")
@@ -437,7 +437,7 @@ def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
         assert not is_ready(swarm)
         assert verdict(HEALTHY, swarm.seen(), time.monotonic_ns()).ok, "the launcher starts it again"
         eventually(
-            lambda: endings.extend(swarm.poll()) or (swarm.restarts and is_ready(swarm)), 60, "its next life"
+            lambda: endings.extend(swarm.poll()) or (swarm.restarts and is_ready(swarm)), 60, "its next generation"
         )
     finally:
         swarm.kill()

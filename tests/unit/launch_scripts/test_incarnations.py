@@ -12,7 +12,7 @@ from launch_scripts.launcher.options import next_incarnation
 from swarm.errors import StoreError
 
 
-def test_every_start_is_a_later_life_though_the_clock_goes_back_forward_and_to_1970(
+def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_and_to_1970(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hour_ns, now_ns = 3600 * 10**9, 1_800_000_000 * 10**9

@@ -240,7 +240,7 @@ def test_refusals_far_apart_never_end_a_run(tmp_path: Path, monkeypatch: pytest.
     for _ in range(30):
         assert refused(swarm, ran_s=80_000.0) == 0.2
         now_s[0] += 86_400
-    assert refused(swarm, ran_s=80_000.0, restarts=0) == 0.2  # its first life was a good one
+    assert refused(swarm, ran_s=80_000.0, restarts=0) == 0.2  # its first generation was a good one
 
 
 def test_five_refusals_within_a_minute_and_a_refused_first_start_are_final(tmp_path: Path) -> None:

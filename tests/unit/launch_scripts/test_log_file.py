@@ -56,9 +56,9 @@ def test_a_log_and_what_is_printed_into_it_stay_within_twice_the_bound(tmp_path:
     assert re.findall(r"native (\d+)", text)[-5:] == ["995", "996", "997", "998", "999"]
 
 
-def test_a_later_life_of_the_process_appends(tmp_path: Path) -> None:
-    for life in ("first", "second"):
-        write(tmp_path / "a.log", f"log.info('{life}')")
+def test_a_later_generation_of_the_process_appends(tmp_path: Path) -> None:
+    for generation in ("first", "second"):
+        write(tmp_path / "a.log", f"log.info('{generation}')")
     assert [line.split()[-1] for line in (tmp_path / "a.log").read_text().splitlines()] == ["first", "second"]
 
 

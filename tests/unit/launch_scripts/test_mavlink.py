@@ -63,7 +63,7 @@ def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> 
     assert not of(world, Follow)
 
 
-def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_back() -> None:
+def test_one_that_drives_stays_an_obstacle_when_its_link_is_lost_and_gets_its_target_back() -> None:
     world = driving(MISSION)
     world.speaks = False
     said = world.run(8.0)

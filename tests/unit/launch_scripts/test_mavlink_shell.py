@@ -18,8 +18,8 @@ from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
 from swarm.client.session import Session
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Body
-from swarm.wire.topics import BODY
+from swarm.wire.messages.vehicles import Obstacle
+from swarm.wire.topics import OBSTACLE
 
 LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
 
@@ -57,8 +57,8 @@ class PlayedLink:
 class Rig:
     def __init__(self, wishes: Wishes) -> None:
         self.world = SwarmModel()
-        self.bodies: list[Body] = []
-        self.world.bus("ear").subscribe(BODY, self._hear)
+        self.obstacles: list[Obstacle] = []
+        self.world.bus("ear").subscribe(OBSTACLE, self._hear)
         bus = self.world.bus("adapter")
         self.session = Session(bus, keeper_info(GRID), self.world.scheduler.clock)
         self.link = PlayedLink()
@@ -76,8 +76,8 @@ class Rig:
 
     def _hear(self, event: Any) -> None:
         assert isinstance(event, Heard)
-        assert isinstance(event.message, Body)
-        self.bodies.append(event.message)
+        assert isinstance(event.message, Obstacle)
+        self.obstacles.append(event.message)
 
     def vehicle_says(self, autopilot: int, type: int, mode: int = 0, base: int = 1) -> None:
         lat, lon = round(LAT_DEG * 1e7), round(LON_DEG * 1e7)
@@ -97,8 +97,8 @@ def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None
     rig.link.flood = Sender(9).bytes_of(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     rig.turns(2.2)
     assert len(rig.link.heard("HEARTBEAT")) == 3
-    assert rig.bodies[0].id == "mav4"
-    assert FRAME.cell(rig.bodies[0].x_m, rig.bodies[0].y_m) == START
+    assert rig.obstacles[0].id == "mav4"
+    assert FRAME.cell(rig.obstacles[0].x_m, rig.obstacles[0].y_m) == START
     assert rig.link.answered == 2, "who floods is not answered"
 
 
@@ -138,16 +138,16 @@ def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error
     assert holds[-3:] == [(176, 4.0, 3.0)] * 3, "nobody answers last words, so they are said three times"
 
 
-def test_what_flies_is_gone_when_its_link_is_lost_and_another_life_when_it_is_back() -> None:
+def test_what_flies_is_gone_when_its_link_is_lost_and_another_generation_when_it_is_back() -> None:
     rig = Rig(Wishes(lost_s=0.3))
     rig.vehicle_says(12, 2)
     rig.turns(0.5)
-    assert rig.bodies[-1].lease_s == 0
+    assert rig.obstacles[-1].lease_s == 0
     assert rig.told[-1] == "no heartbeat for 0.3 s: the vehicle is left to its own fail-safe"
     rig.vehicle_says(12, 2)
     rig.turns(0.1)
-    assert rig.bodies[-1].lease_s > 0
-    assert rig.bodies[-1].incarnation > rig.bodies[0].incarnation
+    assert rig.obstacles[-1].lease_s > 0
+    assert rig.obstacles[-1].incarnation > rig.obstacles[0].incarnation
 
 
 def test_ground_without_coordinates_is_refused() -> None:

@@ -35,8 +35,8 @@ from swarm.wire.topics import RUN, STATS, STATUS
 _BEGAN_NS = 1_790_000_000 * NS_PER_S
 
 
-def _stats(role: str, id: str, counters: Counters, life: int = _BEGAN_NS) -> Stats:
-    return stats(role, id, counters, incarnation=life, stamp_ns=life + NS_PER_S)
+def _stats(role: str, id: str, counters: Counters, generation: int = _BEGAN_NS) -> Stats:
+    return stats(role, id, counters, incarnation=generation, stamp_ns=generation + NS_PER_S)
 
 
 def _status(target: str) -> PlannerStatus:

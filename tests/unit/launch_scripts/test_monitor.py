@@ -43,7 +43,7 @@ from swarm.wire.fields import pack_column
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Body, Followed
+from swarm.wire.messages.vehicles import Followed, Obstacle
 from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
 
@@ -191,15 +191,15 @@ SEEN = Sighted(
     author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
     cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
 )  # fmt: skip
-BODY = Body(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, lease_s=0.7)
+OBSTACLE = Obstacle(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, lease_s=0.7)
 BELIEVED = Believed(
     target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
 )
 SENT = GoalState(name="a0-00", stamp_ns=1, done=0, state="underway", cell=9)
 DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]]] = {
     "a sighting ends": ([(NS_PER_S // 2, SEEN)], "targets/sighted", "strips", [0, 1, 0]),
-    "a body moves, and its lease ends": (
-        [(NS_PER_S // 2, BODY), (NS_PER_S, msgspec.structs.replace(BODY, seq=2, x_m=130.0))],
+    "an obstacle moves, and its lease ends": (
+        [(NS_PER_S // 2, OBSTACLE), (NS_PER_S, msgspec.structs.replace(OBSTACLE, seq=2, x_m=130.0))],
         "bodies", "centers", [0, 1, 1, 0],
     ),
     "a belief ends, and its planner is silent after another": (

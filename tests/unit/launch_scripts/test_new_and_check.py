@@ -18,7 +18,7 @@ from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import places, plots, traps
+from launch_scripts.check.scenario_check import places, shards, traps
 from launch_scripts.commands.scenario_commands import Choices, _asked
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
@@ -201,17 +201,17 @@ def test_check_says_all_at_once_in_the_order_of_weight(
     assert told["findings"][0]["level"] == "failure"
 
 
-def test_more_plots_than_agents_have_use_for_are_a_warning_with_what_to_set() -> None:
+def test_more_shards_than_agents_have_use_for_are_a_warning_with_what_to_set() -> None:
     grid = GridSpec(4096, 4096, 20.0)
     text = "[terrain]\nsource = 'synthetic'\n[[targets]]\n[[groups]]\nvehicles = 100\n"
-    (found,) = plots(parse_scenario(text), grid)
+    (found,) = shards(parse_scenario(text), grid)
     assert found.sentence == (
-        "map.plot_regions: 4 agents share 256 plots of right of way, and speak of each in which vehicles drive"
+        "map.shard_regions: 4 agents share 256 shards of right of way, and speak of each in which vehicles drive"
         " 10 times a second; set it to 4, for larger ones"
     )
-    assert list(plots(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have no third
-    assert list(plots(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
-    assert list(plots(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
+    assert list(shards(parse_scenario(text.replace("100", "50")), grid)) == []  # two agents have no third
+    assert list(shards(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
+    assert list(shards(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 
 
 def test_all_keys_that_are_wrong_are_named_each_once() -> None:

@@ -19,13 +19,13 @@ from swarm.liveness import Peer
 from swarm.wire.messages.processes import Stats
 
 
-def told(id: str, at_s: float, cpu_s: float, late: int, life: int = 1, role: str = "agent") -> Stats:
-    gauges = {"cpu_s": cpu_s, "rss_bytes": 90e6, "messages_per_s": 1234.0, "restarts": float(life - 1)}
+def told(id: str, at_s: float, cpu_s: float, late: int, generation: int = 1, role: str = "agent") -> Stats:
+    gauges = {"cpu_s": cpu_s, "rss_bytes": 90e6, "messages_per_s": 1234.0, "restarts": float(generation - 1)}
     stamp_ns = int(at_s * NS_PER_S)
-    return stats(role, id, incarnation=life, stamp_ns=stamp_ns, counts={"ticks_late": late}, gauges=gauges)
+    return stats(role, id, incarnation=generation, stamp_ns=stamp_ns, counts={"ticks_late": late}, gauges=gauges)
 
 
-def test_rates_are_of_the_last_two_words_of_one_life() -> None:
+def test_rates_are_of_the_last_two_words_of_one_generation() -> None:
     loads = ProcessLoads()
     loads.on_stats(told("a0", 1.0, 5.0, 10))
     (line,) = loads.lines({("agent", "a0")})
@@ -36,8 +36,8 @@ def test_rates_are_of_the_last_two_words_of_one_life() -> None:
     loads.on_stats(told("a0", 3.1, 9.0, 99))  # too soon for a rate
     loads.on_stats(told("a0", 2.0, 0.0, 0))  # late
     assert loads.lines({("agent", "a0")}) == [line]
-    loads.on_stats(told("a0", 9.0, 0.1, 0, life=2))
-    loads.on_stats(told("a0", 10.0, 7.0, 20))  # the last word of the life before
+    loads.on_stats(told("a0", 9.0, 0.1, 0, generation=2))
+    loads.on_stats(told("a0", 10.0, 7.0, 20))  # the last word of the generation before
     (line,) = loads.lines(())
     assert (line.cpu_percent, line.restarts, line.alive) == (None, 1, False)
 

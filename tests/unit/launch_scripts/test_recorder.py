@@ -30,7 +30,7 @@ from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
-from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
+from swarm.wire.messages.processes import Alarm, Heartbeat, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
@@ -130,7 +130,7 @@ def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_n
     assert report["restarts"] == 3
 
 
-def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
+def test_a_generation_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
     """A recorder of all incarnations has the same sums as a recorder of the last only."""
     first = stats("agent", "a0", 1, 2.0, {"marks": 7})
     second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
@@ -139,7 +139,7 @@ def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(r
     hear(recorder, first, second)
     hear(late, second)
     assert recorder.report()["marks"] == late.report()["marks"] == 9
-    hear(recorder, other)  # one that was started by hand knows of no other life
+    hear(recorder, other)  # one that was started by hand knows of no other generation
     assert recorder.report()["marks"] == 109
 
 
@@ -235,8 +235,8 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     def titles() -> list[str]:
         return [line.title for line in recorder.summary(0).targets]
 
-    def beat(id: str, leads: bool) -> Beat:
-        return Beat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
+    def heartbeat(id: str, leads: bool) -> Heartbeat:
+        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
     begun = Recorder(standing_by, GRID, 1)
@@ -244,12 +244,12 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     assert begun.summary(31 * NS_PER_S).targets[0].title == "t0 (planner down)"
     for id in ("t0", "t0.r1", "t1"):
         recorder.alive(Peer("planner", id, 1), True, 0)
-    hear(recorder, beat("t0", True), beat("t0.r1", False), beat("t1", True))
+    hear(recorder, heartbeat("t0", True), heartbeat("t0.r1", False), heartbeat("t1", True))
     assert titles() == ["t0", "t1"]
     recorder.alive(Peer("planner", "t0", 1), False, 0)
-    hear(recorder, beat("t0.r1", True))
+    hear(recorder, heartbeat("t0.r1", True))
     assert titles() == ["t0 (standby 1)", "t1"]
-    hear(recorder, beat("t0.r1", False), beat("t0", True))
+    hear(recorder, heartbeat("t0.r1", False), heartbeat("t0", True))
     assert titles() == ["t0", "t1"]
 
 

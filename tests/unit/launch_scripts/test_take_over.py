@@ -1,4 +1,5 @@
-"""A launcher that takes over: successors are ready before anybody is asked to end; no two lives write one file."""
+"""A launcher that takes over: successors are ready before anybody is asked to end; no two generations write one
+file."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.runtime.health import BOARD_BYTES, LIFE_BEFORE, Board, Health
+from swarm.runtime.health import BOARD_BYTES, GENERATION_BEFORE, Board, Health
 
 LAUNCHER = 100
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
@@ -46,7 +47,7 @@ class Machine:
         self.said: list[str] = []
         self.now_s = 50.0
         self.predecessors = dict(PREDECESSORS)
-        """Name -> pid of the newest life that the launcher before has started."""
+        """Name -> pid of the newest generation that the launcher before has started."""
         patch.setattr(
             takeover,
             "processes",
@@ -89,7 +90,7 @@ class Machine:
             case "agent starts":
                 self.says("agent-a0", lambda health: health.starts("its start"))
             case "agent waits":
-                self.says("agent-a0", lambda health: health.starts(LIFE_BEFORE))
+                self.says("agent-a0", lambda health: health.starts(GENERATION_BEFORE))
             case "ten seconds pass":
                 self.now_s += 10.0
             case "one ends":
@@ -112,7 +113,9 @@ EVENTS = (
 
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(st.sampled_from(EVENTS), max_size=30))
-def test_nobody_is_asked_before_successors_are_ready_and_no_two_lives_write_one_file(history: list[str]) -> None:
+def test_nobody_is_asked_before_successors_are_ready_and_no_two_generations_write_one_file(
+    history: list[str],
+) -> None:
     with pytest.MonkeyPatch.context() as patch:
         machine = Machine(patch)
         seen: set[str] = set()
@@ -168,7 +171,7 @@ def test_who_crashed_before_is_begun_once_the_launcher_before_starts_it_no_more(
     assert machine.one("keeper-0").alive
 
 
-def test_an_agent_whose_life_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = Machine(monkeypatch)
     for what in ("t0 answers", "t1 answers"):
         machine.happens(what)

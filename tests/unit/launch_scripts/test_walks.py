@@ -35,8 +35,8 @@ from swarm.config.scenario import Scenario, TargetConfig
 from swarm.config.setting_types import Walk
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Body
-from vehicle_agent.bodies import REACTION_S, capsule_of
+from swarm.wire.messages.vehicles import Obstacle
+from vehicle_agent.obstacles import REACTION_S, capsule_of
 
 NOBODY = np.empty(0, np.int64)
 
@@ -238,12 +238,12 @@ def scenario() -> Scenario:
     return parse_scenario(TEXT)
 
 
-def driven(rovers: Rovers, seconds: float, time_scale: float = 2.0) -> list[dict[str, Body]]:
+def driven(rovers: Rovers, seconds: float, time_scale: float = 2.0) -> list[dict[str, Obstacle]]:
     """The last pose of each rover, tick by tick."""
-    told: dict[str, Body] = {}
+    told: dict[str, Obstacle] = {}
     ticks = []
     for tick in range(int(seconds * 10)):
-        told |= {body.id: body for body in rovers.tick(time_scale, tick * TICK)}
+        told |= {obstacle.id: obstacle for obstacle in rovers.tick(time_scale, tick * TICK)}
         ticks.append(dict(told))
     return ticks
 
@@ -252,13 +252,13 @@ def test_a_rover_is_always_where_its_last_word_said_that_it_would_be(scenario: S
     ticks = driven(Rovers(scenario, ground(), 1), 60.0)
     moved = 0
     for before, after in itertools.pairwise(ticks):
-        for id, body in after.items():
+        for id, obstacle in after.items():
             said = before[id]
             reach = capsule_of(said, GRID, said.speed_m_per_s * REACTION_S, margin_m=0.01)
-            far_m = math.hypot(body.x_m - said.x_m, body.y_m - said.y_m)
+            far_m = math.hypot(obstacle.x_m - said.x_m, obstacle.y_m - said.y_m)
             moved += far_m > 0
             assert far_m <= math.hypot(reach.east_m, reach.north_m) + 1e-6
-            along = (body.x_m - said.x_m) * reach.north_m - (body.y_m - said.y_m) * reach.east_m
+            along = (obstacle.x_m - said.x_m) * reach.north_m - (obstacle.y_m - said.y_m) * reach.east_m
             assert abs(along) < 1e-6 * max(far_m, 1.0) * max(math.hypot(reach.east_m, reach.north_m), 1.0)
     assert moved > 1000
 
@@ -266,27 +266,29 @@ def test_a_rover_is_always_where_its_last_word_said_that_it_would_be(scenario: S
 def test_rovers_keep_to_the_ground_and_stop_at_times(scenario: Scenario) -> None:
     terrain = ground()
     ticks = driven(Rovers(scenario, terrain, 1), 60.0)
-    bodies = [body for told in ticks for body in told.values()]
-    assert not any(terrain.lethal(int(-body.y_m // 10) * 30 + int(body.x_m // 10)) for body in bodies)
-    assert {body.speed_m_per_s for body in bodies} == {0.0, 6.0}
+    obstacles = [obstacle for told in ticks for obstacle in told.values()]
+    assert not any(
+        terrain.lethal(int(-obstacle.y_m // 10) * 30 + int(obstacle.x_m // 10)) for obstacle in obstacles
+    )
+    assert {obstacle.speed_m_per_s for obstacle in obstacles} == {0.0, 6.0}
 
 
 def test_one_that_takes_over_goes_on_from_where_the_other_was(scenario: Scenario) -> None:
     ticks = driven(Rovers(scenario, ground(), 1), 20.0)
     second = Rovers(scenario, ground(), 2)
-    for body in ticks[-1].values():
-        second.note_body(body)
-    second.note_body(msgspec.structs.replace(ticks[-1]["r0"], id="nobody"))
-    for id, body in driven(second, 0.1)[0].items():
+    for obstacle in ticks[-1].values():
+        second.note_obstacle(obstacle)
+    second.note_obstacle(msgspec.structs.replace(ticks[-1]["r0"], id="nobody"))
+    for id, obstacle in driven(second, 0.1)[0].items():
         last = ticks[-1][id]
-        assert (body.x_m, body.y_m) == (last.x_m, last.y_m)
-        assert (body.incarnation, body.seq) == (2, last.seq + 1)
+        assert (obstacle.x_m, obstacle.y_m) == (last.x_m, last.y_m)
+        assert (obstacle.incarnation, obstacle.seq) == (2, last.seq + 1)
 
 
 def test_rovers_stand_while_the_run_is_paused(scenario: Scenario) -> None:
     ticks = driven(Rovers(scenario, ground(), 1), 3.0, time_scale=0.0)
-    assert {(body.x_m, body.y_m, body.speed_m_per_s) for body in ticks[-1].values()} == {
-        (body.x_m, body.y_m, 0.0) for body in ticks[0].values()
+    assert {(obstacle.x_m, obstacle.y_m, obstacle.speed_m_per_s) for obstacle in ticks[-1].values()} == {
+        (obstacle.x_m, obstacle.y_m, 0.0) for obstacle in ticks[0].values()
     }
 
 

@@ -7,7 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from support.plot_tables import grants_of
+from support.shard_tables import grants_of
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -22,7 +22,7 @@ from swarm.config.setting_types import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from vehicle_agent.agent import Agent, AskRoutes
@@ -150,15 +150,15 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     text = f"[[groups]]\nvehicles = 1\ncells = [[{row}, {col}]]\n[vehicles]\ncapture_range_m = 1\n"
     scenario = parse_scenario(text)
     local_map = LocalMap(grid, level, level, level, level, climb)
-    plots, plan = Plots(grid, ["a0"]), plan_agents(scenario)[0]
-    holdings = Holdings(plots, plan.id, plan.vehicle_ids)
+    shards, plan = Shards(grid, ["a0"]), plan_agents(scenario)[0]
+    holdings = Holdings(shards, plan.id, plan.vehicle_ids)
     holdings.begin(1, [])
     agent = Agent(plan, scenario, local_map, TruthSensor(grid, level, 20.0), holdings)
 
     def grant(seq: int, cells: list[int]) -> None:
-        """Acts as the warden of the only plot, which has no other host to consider."""
-        warden, grants = plots.warden(0, 1), grants_of(holdings, seq, {"a0-00": cells})
-        granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+        """Acts as the leader of the only shard, which has no other host to consider."""
+        leader, grants = shards.leader(0, 1), grants_of(holdings, seq, {"a0-00": cells})
+        granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
         agent.place(holdings.hear_granted(granted, seq))
 
     grant(1, [start])

@@ -45,16 +45,16 @@ class World(SwarmModel):
         self.ground: Terrain = build_terrain(scenario)
         super().__init__(terrain=self.ground, scenario=scenario)
         self.ear = Ear(self)
-        self.life = 0
+        self.generation = 0
         self.service = self.restart()
 
     def restart(self) -> PlannerService:
         """A planner that knows nothing of the one before."""
-        self.life += 1
-        setup = self.setup("planner", "h", self.life)
+        self.generation += 1
+        setup = self.setup("planner", "h", self.generation)
         worker = InlineWorker(self.scheduler)
         return self.start(
-            f"planner-h{self.life}",
+            f"planner-h{self.generation}",
             lambda bus, post: PlannerService(setup, self.ground, bus, post, worker),
             phase_ns=0,
         )

@@ -230,7 +230,7 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
     assert plan.take_due(9, 119) == [3, 0]
 
 
-def test_a_tile_is_due_when_an_author_dies_or_turns_out_to_live_and_when_an_earlier_life_dropped_something() -> (
+def test_a_tile_is_due_when_an_author_dies_or_turns_out_to_live_and_when_an_earlier_generation_dropped_something() -> (
     None
 ):
     replica = MapReplica(GRID)

@@ -140,7 +140,7 @@ def test_the_merge_rule_cell_by_cell() -> None:
         zone("rough", 3, 4),
     )
     paint_zones(pace, zones, grid, cost, void=np.isnan(grades))
-    # rough doubles; forbidden beats later paint; a road bridges water and cliffs, never a void
+    # rough doubles; forbidden heartbeats later paint; a road bridges water and cliffs, never a void
     np.testing.assert_allclose(pace, [[0.2, inf, 0.05, 0.1, 0.05, 0.05, inf, 0.05]])
 
 

@@ -162,7 +162,7 @@ def test_what_is_no_word_changes_nothing() -> None:
         replace(word, paces=np.full(3, np.nan, "<f4").tobytes()).check()
 
 
-def test_a_process_has_one_voice_however_many_lives_it_writes_under() -> None:
+def test_a_process_has_one_voice_however_many_generations_it_writes_under() -> None:
     right, lie = {0: Measurement(400, 0, ONE // 10)}, {0: THRICE}
     honest = [each for n in range(5) for each in sets_of(f"all.a{n}.1", right)]
     replica, cost_map = replica_of(None, GROUND)

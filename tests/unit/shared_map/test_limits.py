@@ -74,11 +74,11 @@ def test_budgets_that_are_full_again_are_forgotten() -> None:
     assert quota._owners == {}
 
 
-def test_a_process_gains_nothing_by_writing_under_many_lives() -> None:
+def test_a_process_gains_nothing_by_writing_under_many_generations() -> None:
     quota = Quota(author_marks_per_s=10, total_marks_per_s=100)
-    for life in range(4):
-        assert quota.admits(set_of(f"all.a0.{life}", 0, 1, {}), 0)
-        quota.charge(f"all.a0.{life}", 30, 0)
+    for generation in range(4):
+        assert quota.admits(set_of(f"all.a0.{generation}", 0, 1, {}), 0)
+        quota.charge(f"all.a0.{generation}", 30, 0)
     assert not quota.admits(set_of("all.a0.9", 0, 1, {}), 0)
     assert not quota.admits(set_of("all.a0.8", 0, 1, {}), 0)
     assert quota.throttled == ["all.a0"]
@@ -88,12 +88,12 @@ def test_a_process_gains_nothing_by_writing_under_many_lives() -> None:
         set_of("all.a0.9", 0, 1, {}), set_of("all.a0.8", 0, 1, {}), None,
     ]  # fmt: skip
     capacity = Capacity(max_sets=8, max_marks=100)
-    taken = [capacity.take(set_of(f"all.a0.{life}", life, 1, {}), None) for life in range(8)]
+    taken = [capacity.take(set_of(f"all.a0.{generation}", generation, 1, {}), None) for generation in range(8)]
     assert taken == [True, True] + 6 * [False]
     assert capacity.full_for("all.a0.99")
     assert capacity.take(set_of("all.a1.1", 0, 1, {}), None)
-    for life in range(2):
-        capacity.free(set_of(f"all.a0.{life}", life, 1, {}))
+    for generation in range(2):
+        capacity.free(set_of(f"all.a0.{generation}", generation, 1, {}))
     assert capacity.take(set_of("all.a0.9", 0, 1, {}), None)
 
 

@@ -34,24 +34,24 @@ from swarm.grid import GridSpec
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 from swarm.wire.messages.processes import Note, RunInfo
-from swarm.wire.messages.vehicles import Body
+from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.route_columns import Route as WireRoute
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import BODY, FLEET, NOTE, POSE, RUN
+from swarm.wire.topics import FLEET, NOTE, OBSTACLE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE
 NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5.0), (500.1, -5.0), (5.0, -400.1)]
 
 
-class Bodies(list[Body]):
+class Obstacles(list[Obstacle]):
     """All puts on BODY."""
 
     def __init__(self, world: SwarmModel) -> None:
-        world.bus("ear-of-bodies").subscribe(BODY, self._hear)
+        world.bus("ear-of-obstacles").subscribe(OBSTACLE, self._hear)
 
     def _hear(self, event: Any) -> None:
         assert isinstance(event, Heard)
-        assert isinstance(event.message, Body)
+        assert isinstance(event.message, Obstacle)
         self.append(event.message)
 
 
@@ -67,21 +67,23 @@ def world() -> Swarm:
 
 
 def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_leaves(world: Swarm) -> None:
-    bodies, program = Bodies(world), Program(world)
+    obstacles, program = Obstacles(world), Program(world)
     with program.swarm.vehicle("rover", radius_m=2.0, lease_s=1.0) as rover:
         rover.at(105.0, -55.0, heading_rad=1.0, speed_m_per_s=3.0)
         world.run(0.01)
-        assert [(b.x_m, b.y_m, b.heading_rad, b.speed_m_per_s, b.radius_m) for b in bodies] == [(105, -55, 1, 3, 2)]
+        assert [(b.x_m, b.y_m, b.heading_rad, b.speed_m_per_s, b.radius_m) for b in obstacles] == [
+            (105, -55, 1, 3, 2)
+        ]
         world.run(3.0)
-        stamps = [body.stamp_ns for body in bodies]
+        stamps = [obstacle.stamp_ns for obstacle in obstacles]
         assert max(b - a for a, b in pairwise(stamps)) < 0.35e9, "well within the lease"
-        assert len(bodies) <= 13, "and no more often than every quarter of it"
-        assert [body.seq for body in bodies] == list(range(1, len(bodies) + 1))
+        assert len(obstacles) <= 13, "and no more often than every quarter of it"
+        assert [obstacle.seq for obstacle in obstacles] == list(range(1, len(obstacles) + 1))
     world.run(0.01)
-    assert bodies[-1].lease_s == 0
-    many = len(bodies)
+    assert obstacles[-1].lease_s == 0
+    many = len(obstacles)
     world.run(2.0)
-    assert len(bodies) == many
+    assert len(obstacles) == many
     rover.leave()
 
 
@@ -89,7 +91,7 @@ def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_le
 def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(
     world: Swarm, x_m: float, y_m: float
 ) -> None:
-    bodies, program = Bodies(world), Program(world)
+    obstacles, program = Obstacles(world), Program(world)
     with program.swarm as swarm:
         rover, target = swarm.vehicle("rover"), swarm.target("t9")
         rover.at(5.0, -5.0)
@@ -101,8 +103,8 @@ def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(
             assert "\n" not in str(caught.value)
         assert swarm.counts["refused"] == 2
         world.run(1.2)
-        assert {(body.x_m, body.y_m) for body in bodies} == {(5.0, -5.0)}
-        assert len(bodies) >= 2
+        assert {(obstacle.x_m, obstacle.y_m) for obstacle in obstacles} == {(5.0, -5.0)}
+        assert len(obstacles) >= 2
 
 
 @pytest.mark.parametrize(
@@ -532,7 +534,7 @@ def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(
 
 
 def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
-    bodies, program = Bodies(world), Program(world)
+    obstacles, program = Obstacles(world), Program(world)
     rover = program.swarm.vehicle("rover", lease_s=10.0)
     rover.at(5.0, -5.0)
     world.run(0.1)
@@ -541,11 +543,11 @@ def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> N
     assert not program.swarm.connected
     rover.at(15.0, -5.0)
     world.run(0.1)
-    assert {body.x_m for body in bodies} == {5.0}
+    assert {obstacle.x_m for obstacle in obstacles} == {5.0}
     world.heal(program.bus)
     world.run(0.1)
     assert program.swarm.connected
-    assert bodies[-1].x_m == 15.0
+    assert obstacles[-1].x_m == 15.0
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -568,13 +570,13 @@ def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Sw
 
 
 def test_a_closed_connection_takes_everything_away_and_says_so(world: Swarm) -> None:
-    bodies, program = Bodies(world), Program(world)
+    obstacles, program = Obstacles(world), Program(world)
     with program.swarm as swarm:
         rover = swarm.vehicle("rover")
         rover.at(5.0, -5.0)
         asked = rover.route_soon("t")
     world.run(0.1)
-    assert bodies[-1].lease_s == 0
+    assert obstacles[-1].lease_s == 0
     with pytest.raises(BusError, match="closed"):
         asked.result(0)
     with pytest.raises(BusError, match="closed"):

@@ -1,13 +1,13 @@
-"""The cells that a host holds by the grants of wardens, and its requests."""
+"""The cells that a host holds by the grants of leaders, and its requests."""
 
 from __future__ import annotations
 
 import msgspec
 import pytest
-from support.plot_tables import (
+from support.shard_tables import (
     GRID,
     MEMBERS,
-    PLOTS,
+    SHARDS,
     S,
     granted_of,
     hear,
@@ -16,14 +16,14 @@ from support.plot_tables import (
 )
 
 from swarm.right_of_way.holdings import Wish
-from swarm.right_of_way.incarnations import BEAT_NS
+from swarm.right_of_way.incarnations import HEARTBEAT_NS
 from swarm.wire.messages.traffic import Entry, Left
-from swarm.wire.topics import STANDING
+from swarm.wire.topics import HOST_STATE
 
 
-def test_no_word_of_one_life_hides_that_of_another() -> None:
+def test_no_word_of_one_generation_hides_that_of_another() -> None:
     """Both are heard under one key; no other message tells that an older one has ended."""
-    assert not STANDING.newest
+    assert not HOST_STATE.newest
 
 
 def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
@@ -37,9 +37,9 @@ def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     assert (list(holdings.path("a0-00")), holdings.heard_ns(0)) == ([9], 2 * S)
 
 
-def test_a_life_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
+def test_a_generation_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
     holdings = holdings_of()
-    younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), life=2)
+    younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), generation=2)
     holdings.hear_granted(younger, S)
     assert holdings.replaced
     hear(holdings, table_of(1, 2, a0=[9]), S)
@@ -61,7 +61,9 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     holdings.give_back("a0-00")
     (told,) = holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S)
     said = told.standing
-    assert holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + BEAT_NS - 1) == []
+    assert (
+        holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + HEARTBEAT_NS - 1) == []
+    )
     assert (said.vehicles[0].holds, said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
     hear(holdings, table_of(1, 3, a0=[9, 10, 11]))  # it has not heard that yet
     assert list(holdings.path("a0-00")) == [9]
@@ -96,12 +98,12 @@ def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it
     assert holdings.lefts(S) == []
     holdings.moved("a0-00", 10)
     word = Left(agent="a0", host="a3", entries=[(9, 1, 1)])
-    assert [holdings.lefts(now_ns) for now_ns in (S, S + 1, S + BEAT_NS)] == [[word], [], [word]]
+    assert [holdings.lefts(now_ns) for now_ns in (S, S + 1, S + HEARTBEAT_NS)] == [[word], [], [word]]
     hear(holdings, table_of(1, 3, a0=[10]))
     assert holdings.lefts(9 * S) == []
 
 
-def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
+def test_the_older_of_two_generations_learns_that_it_is_replaced() -> None:
     holdings = holdings_of()
     table = table_of(1, 1, a0=[9])
     table.hosts["a0"] = (2, 1)
@@ -111,13 +113,13 @@ def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
     assert all(told.standing.ended for told in holdings.standings({}, S))
 
 
-def test_a_host_speaks_to_the_warden_that_it_hears_and_else_to_all_members() -> None:
+def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members() -> None:
     holdings = holdings_of()
     assert [told.members for told in holdings.standings({}, S)] == [MEMBERS]
     hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
-    assert [told.members for told in holdings.standings({}, 2 * S)] == [(PLOTS.warden(0, 1),)]
+    assert [told.members for told in holdings.standings({}, 2 * S)] == [(SHARDS.leader(0, 1),)]
     hear(holdings, table_of(1, 1, a0=[9]), 3 * S)  # told again
-    assert [told.members for told in holdings.standings({}, 3 * S)] == [(PLOTS.warden(0, 1),)]
+    assert [told.members for told in holdings.standings({}, 3 * S)] == [(SHARDS.leader(0, 1),)]
     assert [told.members for told in holdings.standings({}, 4 * S)] == [MEMBERS]
     hear(holdings, table_of(0, 9, a0=[9]), 5 * S)  # of one that was replaced
     assert [told.members for told in holdings.standings({}, 5 * S)] == [MEMBERS]
@@ -131,11 +133,11 @@ def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
     assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
 
 
-def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_warden_knows_it() -> None:
+def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_leader_knows_it() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
     assert not holdings.gone
-    holdings.plots.clear()
+    holdings.shards.clear()
     assert not holdings.gone, "a vehicle still has a path"
     holdings.leave("a0-00")
     assert holdings.gone

@@ -74,8 +74,8 @@ def test_members_of_one_run_get_along(members):
             "planner t1 speaks wire version 10, but planner t0 speaks 8: only neighbouring versions share a run",
         ),
         (
-            {"plot_cells": 1024},
-            "planner t1 has plots of right of way of 1024 cells a side, but planner t0 has 256: map.plot_regions ",
+            {"shard_cells": 1024},
+            "planner t1 has shards of right of way of 1024 cells a side, but planner t0 has 256: map.shard_regions ",
         ),
         (
             {"classes": ["truck", "walker"]},

@@ -93,9 +93,9 @@ def test_values_added_together_are_counted_as_one_by_one_the_positive_ones_first
     assert list(together.buckets.items()) == list(histogram(finite).buckets.items())
 
 
-def test_a_later_life_counts_on_and_says_since_when_the_first_has_counted() -> None:
-    def life(incarnation: int, marks: int) -> Stats:
+def test_a_later_generation_counts_on_and_says_since_when_the_first_has_counted() -> None:
+    def generation(incarnation: int, marks: int) -> Stats:
         return stats(incarnation=incarnation, counts={"marks": marks})
 
-    third = carried(carried(life(10, 2), life(20, 3)), life(30, 4))
+    third = carried(carried(generation(10, 2), generation(20, 3)), generation(30, 4))
     assert (third.incarnation, third.since, third.counts) == (30, 10, {"marks": 9})

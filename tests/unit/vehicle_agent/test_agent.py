@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.plot_tables import grants_of
+from support.shard_tables import grants_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -20,7 +20,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.traffic import Granted
@@ -52,16 +52,16 @@ S = 1_000_000_000
 def agent_of(scenario: Scenario, index: int = 0) -> Agent:
     ground = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
     plan = plan_agents(scenario)[index]
-    holdings = Holdings(Plots(GRID, ["a0", "a1"]), plan.id, plan.vehicle_ids)
+    holdings = Holdings(Shards(GRID, ["a0", "a1"]), plan.id, plan.vehicle_ids)
     holdings.begin(1, [])
     return Agent(plan, scenario, ground, TruthSensor(GRID, LEVEL, 20.0), holdings)
 
 
 def grant(agent: Agent, seq: int, **cells: list[int]) -> None:
-    """The warden of a plot grants cells to a0-00 and a0-01, named by their last digit."""
-    warden = Plots(GRID, ["a0", "a1"]).warden(0, 1)
+    """The leader of a shard grants cells to a0-00 and a0-01, named by their last digit."""
+    leader = Shards(GRID, ["a0", "a1"]).leader(0, 1)
     grants = grants_of(agent.holdings, seq, {f"a0-0{name[1:]}": each for name, each in cells.items()})
-    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+    granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants)
     agent.place(agent.holdings.hear_granted(granted, seq))
 
 

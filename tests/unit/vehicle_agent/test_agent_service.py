@@ -8,8 +8,8 @@ from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
 from swarm.errors import ConfigError
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Body, VehicleState
-from swarm.wire.topics import BODY, STATS
+from swarm.wire.messages.vehicles import Obstacle, VehicleState
+from swarm.wire.topics import OBSTACLE, STATS
 
 
 def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() -> None:
@@ -18,7 +18,7 @@ def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() ->
     world.start_all()
     took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
     # 9 cells of 10 m at 0.1 s/m to come within 10 m of the target, and at most a second to get going.
-    assert 8.5 <= took_s <= 11.5  # with a second in which it listens for bodies
+    assert 8.5 <= took_s <= 11.5  # with a second in which it listens for obstacles
     assert world.where() == {"a0-00": (10, 11)}
     world.assert_lawful()
 
@@ -46,7 +46,7 @@ def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> No
     assert not np.isfinite(world.planners["t"].pace[1, 7])
 
 
-def test_a_vehicle_that_a_body_shuts_in_raises_an_alarm_until_the_body_leaves() -> None:
+def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_leaves() -> None:
     world = AgentWorld(scenario(1, [(1, 1)]), pace_of(["#" * 9, "#.......#", "#" * 9]))
     world.put_target("t", 1, 7)
     person, (x_m, y_m) = world.bus("person"), world.terrain.grid.centre_m(world.terrain.grid.cell(1, 2))
@@ -54,8 +54,8 @@ def test_a_vehicle_that_a_body_shuts_in_raises_an_alarm_until_the_body_leaves() 
     world.bus("observer").subscribe(STATS, lambda event: stats.append(event.message))  # type: ignore[union-attr, arg-type]
 
     def tell(seq: int, lease_s: float) -> None:
-        body = Body(id="p", incarnation=1, seq=seq, x_m=x_m, y_m=y_m, radius_m=1.0, lease_s=lease_s)
-        person.publish(BODY, body, id="p")
+        obstacle = Obstacle(id="p", incarnation=1, seq=seq, x_m=x_m, y_m=y_m, radius_m=1.0, lease_s=lease_s)
+        person.publish(OBSTACLE, obstacle, id="p")
 
     def alarms() -> list[tuple[str, int | None, bool]]:
         told = stats[-1].alarms if stats else []

@@ -12,9 +12,9 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Wish
-from swarm.wire.messages.vehicles import Body
-from vehicle_agent.bodies import Bodies
+from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
+from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.steering import Steering
 
@@ -43,15 +43,15 @@ class Place:
         self.now_ns = self.chance.randrange(10 * NS_PER_S)
         self.pace = np.full((GRID.rows, GRID.cols), 0.1, np.float32)
         self.held = Held()
-        self.bodies = Bodies(GRID, 2.0)
-        self.bodies.tick(self.now_ns)
-        self.steering = Steering(GRID, self.pace, PlannerConfig(), RESERVE, self.bodies)
+        self.obstacles = Obstacles(GRID, 2.0)
+        self.obstacles.tick(self.now_ns)
+        self.steering = Steering(GRID, self.pace, PlannerConfig(), RESERVE, self.obstacles)
         self.target = GRID.cell(12, 12)
         self.wishes = CellRequests(
             GRID,
             self.steering,
             self.held,  # type: ignore[arg-type]
-            self.bodies,
+            self.obstacles,
             RESERVE + 2,
             lambda target: self.target,
             lambda target, cell: GRID.distance_cells(cell, self.target) < 3,
@@ -96,10 +96,10 @@ class Place:
         self.pace[row, col] = self.chance.choice((0.1, np.inf, 0.4))
         self.wishes.ground_changed([Window(row, col, row + 1, col + 1)])
 
-    def body(self) -> None:
+    def obstacle(self) -> None:
         x_m, y_m = GRID.centre_m(self.chance.choice(self.vehicles).cell)
         self.seq += 1
-        report = Body(
+        report = Obstacle(
             id=f"b{self.chance.randrange(3)}",
             incarnation=1,
             seq=self.seq,
@@ -111,7 +111,7 @@ class Place:
             radius_m=self.chance.uniform(1.0, 9.0),
             lease_s=self.chance.choice((0.3, 2.0)),
         )
-        self.bodies.take_report(report, self.now_ns)
+        self.obstacles.take_report(report, self.now_ns)
 
     def push(self) -> None:
         self.held.pushed[self.chance.choice(self.vehicles).id] = self.chance.choice((0, 900))
@@ -130,12 +130,12 @@ class Place:
 
     def wait(self) -> None:
         self.now_ns += TICK_NS
-        self.bodies.tick(self.now_ns)
+        self.obstacles.tick(self.now_ns)
 
     @property
     def changes(self) -> list[Callable[[], None]]:
-        some = [self.grant, self.route, self.pass_a_cell, self.others, self.ground, self.body]
-        return [*some, self.push, self.reach, self.move_target, self.zone, *[self.wait] * 12, *[self.body] * 3]
+        some = [self.grant, self.route, self.pass_a_cell, self.others, self.ground, self.obstacle]
+        return [*some, self.push, self.reach, self.move_target, self.zone, *[self.wait] * 12, *[self.obstacle] * 3]
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -1,95 +1,95 @@
-"""A member of a plot: what it promises and stores, and how it becomes warden."""
+"""A member of a shard: what it promises and stores, and how it becomes leader."""
 
 from __future__ import annotations
 
 import msgspec
-from support.plot_tables import (
+from support.shard_tables import (
     MEMBERS,
-    PLOTS,
+    SHARDS,
     S,
     near_members,
     standing,
     table_of,
 )
 
-from swarm.right_of_way.incarnations import BEAT_NS
+from swarm.right_of_way.incarnations import HEARTBEAT_NS
 from swarm.wire.messages.traffic import Granted, Stand, Stored, Table
 from vehicle_agent.traffic.member import Member, Refused, Save
 
 
 def member_of(promised: int = 0) -> Member:
-    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), {}, 0, near_members())
+    return Member(SHARDS, MEMBERS[0], promised, table_of(0, 0), {}, 0, near_members())
 
 
 def test_after_a_promise_nothing_older_is_stored() -> None:
     member = member_of()
     assert isinstance(member.hear_table(table_of(1, 1), 0)[0], Save)
-    assert member.on_file == Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=1)
-    assert member.hear_claim(5, S // 10) == []  # the warden was heard just now
+    assert member.on_file == Stored(shard=0, agent=MEMBERS[0], epoch=1, seq=1)
+    assert member.hear_claim(5, S // 10) == []  # the leader was heard just now
     assert isinstance(member.hear_claim(5, 2 * S)[0], Save)
     assert member.hear_claim(5, 9 * S) == []
-    assert member.hear_table(table_of(1, 2), 2 * S) == [Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=0)]
+    assert member.hear_table(table_of(1, 2), 2 * S) == [Stored(shard=0, agent=MEMBERS[0], epoch=5, seq=0)]
     assert member.stored.stamp == (1, 1)
-    assert member.hear_table(table_of(5, 1), 2 * S)[-1] == Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=1)
+    assert member.hear_table(table_of(5, 1), 2 * S)[-1] == Stored(shard=0, agent=MEMBERS[0], epoch=5, seq=1)
 
 
-def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_beat() -> None:
+def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_heartbeat() -> None:
     first, second = (
-        Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
+        Member(SHARDS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
     )  # of epoch 1
     said = first.hear_table(table_of(1, 1), S)
     assert [type(action) for action in said] == [Save, Stored]
     assert [type(action) for action in second.hear_table(table_of(1, 1), S)] == [Save]
     assert second.tick(S) == [second.on_file]  # it has not heard the first
     second.hear_table(table_of(1, 2), S)
-    second.hear_stored(Stored(plot=0, agent=MEMBERS[2], epoch=1, seq=2), S)
+    second.hear_stored(Stored(shard=0, agent=MEMBERS[2], epoch=1, seq=2), S)
     assert second.tick(S) == []
-    assert second.tick(S + BEAT_NS) == [Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=2)]
+    assert second.tick(S + HEARTBEAT_NS) == [Stored(shard=0, agent=MEMBERS[0], epoch=1, seq=2)]
     assert second.tick(2 * S) == []
-    second.hear_table(table_of(1, 2), 2 * S)  # the warden tells it again
+    second.hear_table(table_of(1, 2), 2 * S)  # the leader tells it again
     assert second.tick(2 * S) == [second.on_file]
 
 
-def warden_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
-    """A member that has just become warden, and the table that it sent, which no member has stored yet."""
-    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
-    member.hear_standing(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
+def leader_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
+    """A member that has just become leader, and the table that it sent, which no member has stored yet."""
+    member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
+    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    member.hear_standing(standing("a0", [(9, 0, 1)], seq=2), 2 * S)
+    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
     return member, table
 
 
 def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_it() -> None:
-    member, table = warden_that_told({"a0": ["a0-00"]})
+    member, table = leader_that_told({"a0": ["a0-00"]})
     now_ns = 2 * S
-    number = Stored(plot=0, agent=MEMBERS[0], epoch=table.epoch, seq=table.seq)
+    number = Stored(shard=0, agent=MEMBERS[0], epoch=table.epoch, seq=table.seq)
     for stored, told in (
         ((table.seq, None), table),  # the second has not said anything
         ((table.seq, table.seq), number),
         ((table.seq, table.seq - 1), table),  # it has lost its table, or its word was late: the whole does no harm
         ((None, table.seq), number),
     ):
-        now_ns += BEAT_NS
-        member.hear_standing(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
+        now_ns += HEARTBEAT_NS
+        member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
         for other, seq in zip(MEMBERS[1:], stored, strict=True):
             if seq is not None:
-                member.hear_stored(Stored(plot=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
+                member.hear_stored(Stored(shard=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
         assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
-    now_ns += 2 * BEAT_NS
-    member.hear_standing(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
+    now_ns += 2 * HEARTBEAT_NS
+    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
     assert member.tick(now_ns) == [table]  # no member has answered the number
 
 
 def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
     first, second = (
-        Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
+        Member(SHARDS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
     )  # of epoch 1
-    same = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=4)
-    lags = [Stored(plot=0, agent=MEMBERS[2], epoch=0, seq=0)]
+    same = Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=4)
+    lags = [Stored(shard=0, agent=MEMBERS[2], epoch=0, seq=0)]
     assert first.hear_stored(same, S) == lags  # it needs the whole table
     assert [first.hear_table(table_of(1, 4), S)[-1]] == first.hear_stored(same, S) == [first.on_file]
     second.hear_table(table_of(1, 4), S)
@@ -97,57 +97,59 @@ def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
     second.hear_stored(first.on_file, 2 * S)
     assert second.hear_stored(same, 2 * S) == []
     assert second.tick(2 * S) == [second.on_file]
-    assert second.hear_claim(2, 2 * S + BEAT_NS) == []  # the sender of a number leads, too
-    assert first.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # the table came late
+    assert second.hear_claim(2, 2 * S + HEARTBEAT_NS) == []  # the sender of a number leads, too
+    assert first.hear_stored(Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # the table came late
 
 
-def test_a_number_of_a_later_epoch_ends_a_warden_and_one_of_an_earlier_epoch_is_told_so() -> None:
-    member, table = warden_that_told({"a0": ["a0-00"]})
-    later = next(epoch for epoch in range(table.epoch + 1, table.epoch + 3) if PLOTS.warden(0, epoch) == MEMBERS[1])
-    assert member.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=later, seq=7), 2 * S) == [member.on_file]
-    assert member.warden is None
+def test_a_number_of_a_later_epoch_ends_a_leader_and_one_of_an_earlier_epoch_is_told_so() -> None:
+    member, table = leader_that_told({"a0": ["a0-00"]})
+    later = next(
+        epoch for epoch in range(table.epoch + 1, table.epoch + 3) if SHARDS.leader(0, epoch) == MEMBERS[1]
+    )
+    assert member.hear_stored(Stored(shard=0, agent=MEMBERS[1], epoch=later, seq=7), 2 * S) == [member.on_file]
+    assert member.leader is None
     member = member_of(promised=5)
-    old = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=7)
-    assert member.hear_stored(old, S) == [Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=0)]
+    old = Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=7)
+    assert member.hear_stored(old, S) == [Stored(shard=0, agent=MEMBERS[0], epoch=5, seq=0)]
 
 
-def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
+def test_an_epoch_has_one_leader_only_though_a_promise_comes_twice() -> None:
     member = member_of()
-    member.hear_standing(standing("a1", [(9, 0, 1)], seq=1), 2 * S)
+    member.hear_host_state(standing("a1", [(9, 0, 1)], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
     assert isinstance(save, Save)
     member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
-    assert member.warden is None
+    assert member.leader is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
-    first = member.warden
+    first = member.leader
     assert first is not None
-    member.hear_standing(standing("a1", [(9, 0, 1)], seq=3), 3 * S)
+    member.hear_host_state(standing("a1", [(9, 0, 1)], seq=3), 3 * S)
     member.tick(3 * S)  # no member has acknowledged anything: it resigns
-    assert member.warden is None
+    assert member.leader is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 3 * S)
-    assert member.warden is None
+    assert member.leader is None
 
 
 def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     member = member_of()
     assert isinstance(member.hear_claim(1 << 60, S)[0], Refused)
-    far = next(epoch for epoch in range(1 << 60, (1 << 60) + 3) if PLOTS.warden(0, epoch) != MEMBERS[0])
+    far = next(epoch for epoch in range(1 << 60, (1 << 60) + 3) if SHARDS.leader(0, epoch) != MEMBERS[0])
     assert isinstance(member.hear_table(table_of(far, 1), S)[0], Refused)
     assert member.promised == 0
 
 
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
-    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
-    member.hear_standing(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
+    member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
+    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
     wants = [Stand("a0-00", 9, 9, [(9, 0, 1)], [], [18, 10], 2, 0)]
-    member.hear_standing(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
+    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
-    stored = Stored(plot=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
+    stored = Stored(shard=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
     for too_old in (msgspec.structs.replace(stored, seq=0), msgspec.structs.replace(stored, epoch=0)):
         assert member.hear_stored(too_old, 2 * S) == []
     (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
@@ -156,4 +158,4 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     assert [entry.cell for entry in granted.grants["a0-00"]] == [9, 10]
     assert granted.occupied == [18]
     assert member.hear_stored(stored, 2 * S) == []  # told just now
-    assert [type(each) for each in member.hear_stored(stored, 2 * S + BEAT_NS)] == [Granted]
+    assert [type(each) for each in member.hear_stored(stored, 2 * S + HEARTBEAT_NS)] == [Granted]

@@ -1,4 +1,4 @@
-"""Vehicles of an added agent enter the map on free cells: no body, and no zone."""
+"""Vehicles of an added agent enter the map on free cells: no obstacle, and no zone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from vehicle_agent.placement import Spawning
 
 
 class Held:
-    """Holdings of which wardens grant nothing by themselves."""
+    """Holdings of which leaders grant nothing by themselves."""
 
     def __init__(self) -> None:
-        self.life, self.replaced = 1, False
+        self.generation, self.replaced = 1, False
         self.asked: list[tuple[str, int]] = []
         self.paths: dict[str, list[int]] = {}
 
@@ -45,7 +45,7 @@ def test_a_cell_that_is_closed_while_it_is_asked_for_is_not_taken_and_another_is
     assert made.may_stand("v", 2)
 
 
-def test_who_is_found_where_an_earlier_life_left_it_stands_there_whatever_closes_the_cell() -> None:
+def test_who_is_found_where_an_earlier_generation_left_it_stands_there_whatever_closes_the_cell() -> None:
     made, _ = entering({7})
     assert made.may_stand("v", 7)
 

@@ -22,14 +22,14 @@ from vehicle_agent.promise_store import FilePromiseStore
 from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 
-def table(plot: int, seq: int) -> Table:
-    return Table(plot=plot, agent="a0", epoch=3, seq=seq, hosts={}, grants={"a0-00": [(seq, 3, seq)]})
+def table(shard: int, seq: int) -> Table:
+    return Table(shard=shard, agent="a0", epoch=3, seq=seq, hosts={}, grants={"a0-00": [(seq, 3, seq)]})
 
 
 def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     store = FilePromiseStore(tmp_path / "run" / "promises-a0")
     disk = store.own.disk
-    own = OwnRecord(disk=disk, lives=[7], noted={"a1": 5}, noted_by=["a1"])
+    own = OwnRecord(disk=disk, generations=[7], noted={"a1": 5}, noted_by=["a1"])
     store.save_own(own)
     for seq in range(3):
         store.save(3, table(0, seq))
@@ -57,10 +57,10 @@ def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int
     path.write_bytes(after[:cut] + before[cut:])
     again = FilePromiseStore(path)
     assert again.saved == {0: (3, table(0, 1))}
-    again.save(4, Table(plot=1, agent="a0", epoch=4, seq=1, hosts={}, grants={}))  # a shorter one
+    again.save(4, Table(shard=1, agent="a0", epoch=4, seq=1, hosts={}, grants={}))  # a shorter one
     again.close()
     third = FilePromiseStore(path)
-    assert {plot: promised for plot, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
+    assert {shard: promised for shard, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
     third.close()
 
 
@@ -86,9 +86,9 @@ from vehicle_agent.promise_store import FilePromiseStore
 store = FilePromiseStore(Path(sys.argv[1]))
 start = max((promised for promised, _ in store.saved.values()), default=0)
 for promised in itertools.count(start + 1):
-    for plot in range(3):
+    for shard in range(3):
         grants = {f"a0-{n}": [(n, promised, n)] for n in range(40)}
-        store.save(promised, Table(plot=plot, agent="a0", epoch=promised, seq=1, hosts={}, grants=grants))
+        store.save(promised, Table(shard=shard, agent="a0", epoch=promised, seq=1, hosts={}, grants=grants))
     store.sync()
     print(promised, flush=True)
 """
@@ -110,7 +110,7 @@ def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path)
         store.close()
 
 
-def test_one_that_waits_goes_on_with_what_the_life_before_has_left(tmp_path: Path) -> None:
+def test_one_that_waits_goes_on_with_what_the_generation_before_has_left(tmp_path: Path) -> None:
     path = tmp_path / "promises-a0"
     first = FilePromiseStore(path)
     found: list[FilePromiseStore] = []
@@ -142,7 +142,7 @@ def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None
 
 def test_a_file_from_before_journals_is_read_once(tmp_path: Path) -> None:
     path = tmp_path / "promises-a0"
-    own = OwnRecord(disk=7, lives=[5])
+    own = OwnRecord(disk=7, generations=[5])
     bodies = [encode([own]), encode([None, 3, table(0, 1)]), encode([None, 4, table(0, 2)])]
     older = b"".join(len(body).to_bytes(4, "little") + body for body in bodies) + bytes(1000)
     path.write_bytes(older)
@@ -166,7 +166,7 @@ def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest
         assert store.ready
     store.close()
     again = FilePromiseStore(path)
-    assert {plot: saved.seq for plot, (_, saved) in again.saved.items()} == {0: 198, 1: 199, 2: 197}
+    assert {shard: saved.seq for shard, (_, saved) in again.saved.items()} == {0: 198, 1: 199, 2: 197}
     again.close()
 
 
@@ -175,12 +175,12 @@ def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(
 ) -> None:
     monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
     store = FilePromiseStore(tmp_path / "promises-a0")
-    for plot in range(300):
-        store.save(3, table(plot, plot))
+    for shard in range(300):
+        store.save(3, table(shard, shard))
         assert store.ready
     store.close()
     again = FilePromiseStore(tmp_path / "promises-a0")
-    assert {plot: saved.seq for plot, (_, saved) in again.saved.items()} == {n: n for n in range(300)}
+    assert {shard: saved.seq for shard, (_, saved) in again.saved.items()} == {n: n for n in range(300)}
     again.close()
 
 
@@ -216,7 +216,7 @@ def test_on_a_full_disk_promises_are_kept_until_the_space_is_used_up_and_again_w
     store.save(3, table(0, seq))  # what one event still brings
     assert not path.with_name("promises-a0.spare").exists(), "nobody else's space is taken for nothing"
     store.close()
-    again = FilePromiseStore(path)  # a life that begins meanwhile
+    again = FilePromiseStore(path)  # a generation that begins meanwhile
     assert again.saved[0][1].seq == seq
     assert not again.ready
     disk.full = False

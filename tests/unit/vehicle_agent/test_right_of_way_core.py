@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 import msgspec
-from support.plot_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
+from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
 
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Fence, Known, KnownRequest, Table
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 THREE = ["a0", "a1", "a2"]
-PLOTS_OF_THREE = Plots(GridSpec(8, 8, 1.0), THREE)
+SHARDS_OF_THREE = Shards(GridSpec(8, 8, 1.0), THREE)
 SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(THREE)}
 
 
 def member() -> RightOfWay:
-    own = OwnRecord(disk=1, lives=[1], noted_by=[agent for agent in THREE if agent != "a0"])
-    return RightOfWay("a0", PLOTS_OF_THREE, SPAWNS, own, {})
+    own = OwnRecord(disk=1, generations=[1], noted_by=[agent for agent in THREE if agent != "a0"])
+    return RightOfWay("a0", SHARDS_OF_THREE, SPAWNS, own, {})
 
 
 def test_a_silent_member_says_nothing_and_remembers_nothing_that_is_not_on_file() -> None:
     rights = member()
     rights.silent = True
-    epoch = next(n for n in range(1, 9) if PLOTS_OF_THREE.warden(0, n) == "a1")
-    table = Table(plot=0, agent="a1", epoch=epoch, seq=1, hosts={}, grants={})
+    epoch = next(n for n in range(1, 9) if SHARDS_OF_THREE.leader(0, n) == "a1")
+    table = Table(shard=0, agent="a1", epoch=epoch, seq=1, hosts={}, grants={})
     assert rights.hear_claim(0, epoch, 5 * S) == []
     assert rights.hear_table(table, 5 * S) == []
     assert rights.answer_known(KnownRequest(agent="a1", disk=7)) == []
-    assert rights.hear_known(Known(agent="a1", disk=1, life=0, plots=[])) == []
+    assert rights.hear_known(Known(agent="a1", disk=1, generation=0, shards=[])) == []
     assert rights.tick({}, 9 * S) == []
     assert rights.own == member().own
     rights.silent = False
@@ -40,7 +40,7 @@ def test_a_silent_member_says_nothing_and_remembers_nothing_that_is_not_on_file(
     assert len(rights.answer_known(KnownRequest(agent="a1", disk=7))) == 2
 
 
-def test_a_silent_warden_sends_no_table_and_its_host_still_tells_where_its_vehicles_stand() -> None:
+def test_a_silent_leader_sends_no_table_and_its_host_still_tells_where_its_vehicles_stand() -> None:
     rights = member()
     rights.begin(1)
     rights.holdings.watch([0])
@@ -59,40 +59,42 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
         for action in rights.tick({}, tick * S // 10):
             said.append(action)
             if isinstance(action, Tell):
-                rights.hear_standing(action.standing, tick * S // 10)
+                rights.hear_host_state(action.standing, tick * S // 10)
     return said
 
 
-def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
-    """No other process can: the later incarnation has another file. It had left that plot long ago."""
+def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> (
+    None
+):
+    """No other process can: the later incarnation has another file. It had left that shard long ago."""
     table = msgspec.structs.replace(table_of(1, 1), fences=[Fence("a4", 1 << 32, {"a4-00": [(9, 1, 1)]})])
     member = rights_of(MEMBERS[0], {0: (1, table)})
     (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
     assert isinstance(known, Known)
-    assert known.plots == [0]
+    assert known.shards == [0]
     older = rights_of("a4")
     older.begin(0)
     for name in AGENTS[:4]:
-        older.hear_known(Known(agent=name, disk=7, life=0, plots=[]))
+        older.hear_known(Known(agent=name, disk=7, generation=0, shards=[]))
     assert older.settled
-    older.holdings.plots.clear()
+    older.holdings.shards.clear()
     older.holdings.replaced = True
     assert not older.settled  # the question about it is repeated
     older.hear_known(known)
     (told,) = older.tick({}, S)
     assert isinstance(told, Tell)
     said = told.standing
-    assert (said.plot, said.ended) == (0, True)
+    assert (said.shard, said.ended) == (0, True)
 
 
-def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
+def test_whoever_waits_in_a_shard_without_a_leader_says_so() -> None:
     rights = rights_of("a0")
     rights.begin(0)
-    life = rights.holdings.life
+    generation = rights.holdings.generation
 
     def hear(seq: int, now_ns: int) -> None:
         table = table_of(1, seq, a0=[0])
-        table.hosts["a0"] = (life, 1)
+        table.hosts["a0"] = (generation, 1)
         rights.host.hear_granted(granted_of(table), now_ns)
 
     assert rights.host.unled(S) == {}

@@ -287,7 +287,7 @@ def test_a_target_that_nobody_can_reach_is_left_out_and_one_that_only_others_kno
     assert two.chased("a0") == ["t0", "t0"]
 
 
-def test_of_two_lives_of_an_agent_the_one_that_spoke_last_counts_and_none_speaks_for_another() -> None:
+def test_of_two_generations_of_an_agent_the_one_that_spoke_last_counts_and_none_speaks_for_another() -> None:
     costs = GroupCosts("all.a0.1", "all", "a0")
     costs.receive(told("all.a1.1", 5.0, stamp_ns=20), 20)
     costs.receive(told("all.a1.2", 6.0, stamp_ns=30), 30)

@@ -16,12 +16,12 @@ from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
-from swarm.wire.messages.vehicles import Body
+from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
+from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.steering import Steering
 
 GRID = GridSpec(8, 8, 10.0)
@@ -36,7 +36,7 @@ def climb_on(elevation_m: np.ndarray) -> Climb:
 
 
 def steering_on(climb: Climb | None, pace: np.ndarray = LEVEL, corners: bool = False) -> Steering:
-    return Steering(GRID, pace, PlannerConfig(corner_cutting=corners), 4, Bodies(GRID), climb)
+    return Steering(GRID, pace, PlannerConfig(corner_cutting=corners), 4, Obstacles(GRID), climb)
 
 
 @given(st.integers(0, 1 << 32), st.floats(0.0, 0.4), st.booleans(), st.booleans())
@@ -166,20 +166,20 @@ def test_one_that_stands_though_its_route_goes_on_is_blocked_and_one_that_moves_
     assert steering.waiting_ns == {}
 
 
-def test_one_that_bodies_leave_no_step_is_shut_in_until_one_of_them_moves() -> None:
-    bodies, corner = Bodies(GRID), Vehicle("v", GRID, 0)
-    steering = Steering(GRID, LEVEL, PlannerConfig(), 4, bodies, None)
-    bodies.listen_anew(0)
+def test_one_that_obstacles_leave_no_step_is_shut_in_until_one_of_them_moves() -> None:
+    obstacles, corner = Obstacles(GRID), Vehicle("v", GRID, 0)
+    steering = Steering(GRID, LEVEL, PlannerConfig(), 4, obstacles, None)
+    obstacles.listen_anew(0)
     corner.assign("t", 0)
     corner.give_route(GivenRoute("t", (0, 1, 2), 1.0, 1.0, partial=False), [0], 0)
     expected: dict[int, set[str]] = {20: set(), 59: {"v"}, 119: set()}
     for tenth in range(120):
-        bodies.tick(tenth * 10**8)
+        obstacles.tick(tenth * 10**8)
         places = (1, 8) if tenth < 60 else (30, 8)
         for id, cell in zip("ab", places, strict=True):
             x_m, y_m = GRID.centre_m(cell)
-            body = Body(id=id, incarnation=1, seq=tenth, x_m=x_m, y_m=y_m, radius_m=1.0)
-            bodies.take_report(body, tenth * 10**8)
+            obstacle = Obstacle(id=id, incarnation=1, seq=tenth, x_m=x_m, y_m=y_m, radius_m=1.0)
+            obstacles.take_report(obstacle, tenth * 10**8)
         steering.blocked(corner, tenth * 10**8)
         if tenth in expected:
             assert steering.shut_in == expected[tenth]

@@ -9,8 +9,8 @@ from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event, Replied
 from swarm.wire.messages.orders import ZoneOrder, Zones
-from swarm.wire.messages.vehicles import Body, VehicleState
-from swarm.wire.topics import BODY, ZONES
+from swarm.wire.messages.vehicles import Obstacle, VehicleState
+from swarm.wire.topics import OBSTACLE, ZONES
 
 
 class ClosedWorld(AgentWorld):
@@ -103,7 +103,7 @@ def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None
     world.assert_lawful()
 
 
-def test_a_way_out_leads_around_a_body_that_stands_on_the_nearest() -> None:
+def test_a_way_out_leads_around_an_obstacle_that_stands_on_the_nearest() -> None:
     world = ClosedWorld(scenario(1, [(10, 10)], per_agent=1), pace_of(OPEN))
     world.put_target("t", 10, 10)
     world.start_all()
@@ -113,8 +113,10 @@ def test_a_way_out_leads_around_a_body_that_stands_on_the_nearest() -> None:
     seq = iter(range(1, 1000))
 
     def report() -> None:
-        body = Body(id="r", incarnation=1, seq=next(seq), x_m=x_m, y_m=y_m, radius_m=0.3 * side_m, lease_s=1.0)
-        world._watch.publish(BODY, body, id="r")
+        obstacle = Obstacle(
+            id="r", incarnation=1, seq=next(seq), x_m=x_m, y_m=y_m, radius_m=0.3 * side_m, lease_s=1.0
+        )
+        world._watch.publish(OBSTACLE, obstacle, id="r")
 
     for _ in range(10):
         report()

@@ -1,8 +1,8 @@
-"""Guests in right of way, under the same faults: robots come, crash, come back and leave; agents join while the
-swarm runs; operators say that a robot has left. No two vehicles meet, and none is lost. Each rule that
+"""External vehicles in right of way, under the same faults: robots come, crash, come back and leave; agents join
+while the swarm runs; operators say that a robot has left. No two vehicles meet, and none is lost. Each rule that
 docs/design/external-vehicles.md needs is taken out in turn, and the law must notice.
 
-More histories: `pytest tests/laws/test_guests.py -m seeds --seeds 0:2000`.
+More histories: `pytest tests/laws/test_external_vehicles.py -m seeds --seeds 0:2000`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from support.guest_world import GuestProcess, GuestWorld
+from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
 from swarm.config.agents import agent_of
 from swarm.right_of_way.entries import HostEntries
-from swarm.right_of_way.guest import Guest
+from swarm.right_of_way.external_vehicle import ExternalVehicle
 from swarm.right_of_way.host import Host
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.warden import SILENT_NS, Warden
+from vehicle_agent.traffic.shard_leader import SILENT_NS, Leader
 
 QUIET_S = 12.0
 SHAPES = (
@@ -31,24 +31,26 @@ SHAPES = (
     (5, 4, 12, 4, 4, 1),
     (1, 5, 7, 4, 2, 1),
 )
-"""(agents, vehicles each, side of the map, side of a plot, robots, added agents)."""
+"""(agents, vehicles each, side of the map, side of a shard, robots, added agents)."""
 
 
-def world_of(seed: int, twins: bool = True) -> GuestWorld:
+def world_of(seed: int, twins: bool = True) -> ExternalWorld:
     chance = random.Random(f"guests/{seed}")
     shape, faults = chance.choice(SHAPES), random_faults(chance, QUIET_S)
     agents, each, size, side, robots, added = shape
-    return GuestWorld(seed, agents, each, size, side, faults if twins else replace(faults, twins=0), robots, added)
+    return ExternalWorld(
+        seed, agents, each, size, side, faults if twins else replace(faults, twins=0), robots, added
+    )
 
 
-def borders_of(seed: int) -> GuestWorld:
-    """Nine plots of three by three cells, and a network that repeats half of all and delays much for seconds."""
+def borders_of(seed: int) -> ExternalWorld:
+    """Nine shards of three by three cells, and a network that repeats half of all and delays much for seconds."""
     faults = Faults(repeat=0.5, late=0.3, delay_ms=50, crashes=1, twins=0.3, quiet_s=QUIET_S)
-    return GuestWorld(seed, 4, 3, 9, 3, faults, 5, 1)
+    return ExternalWorld(seed, 4, 3, 9, 3, faults, 5, 1)
 
 
-def test_guests_come_and_go_where_nothing_fails() -> None:
-    world = GuestWorld(1, 4, 3, 12, 6, Faults(quiet_s=30), 5, 2)
+def test_external_vehicles_come_and_go_where_nothing_fails() -> None:
+    world = ExternalWorld(1, 4, 3, 12, 6, Faults(quiet_s=30), 5, 2)
     world.run(40.0)
     assert world.collisions == []
     assert world.entered > 10
@@ -63,9 +65,9 @@ def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
     before = dict(world.moves)
     world.run(12.0)
     assert world.collisions == []
-    guests = [f"{robot}-00" for robot in world.robots] + [id for each in world.added.values() for id in each]
+    externals = [f"{robot}-00" for robot in world.robots] + [id for each in world.added.values() for id in each]
     vehicles = [id for each in world.spawns.values() for id in each]
-    assert [id for id in vehicles + guests if world.moves.get(id, 0) == before.get(id, 0)] == []
+    assert [id for id in vehicles + externals if world.moves.get(id, 0) == before.get(id, 0)] == []
     assert world.entered
 
 
@@ -77,7 +79,7 @@ def test_no_two_meet_where_two_robots_have_one_name(seed: int) -> None:
         assert world.collisions == []
 
 
-def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
+def test_cells_of_an_external_vehicle_that_is_gone_are_free_again() -> None:
     for seed in range(4):
         world = world_of(seed, twins=False)
         world.run(QUIET_S)
@@ -85,7 +87,7 @@ def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
         world.run(12.0)
         for process in world.processes:
             for member in process.rights._members.values():
-                if member.warden is not None:
+                if member.leader is not None:
                     held = [*member.stored.grants, *(each.agent for each in member.stored.fences)]
                     assert not set(map(agent_of, held)).intersection(world.robots)
 
@@ -94,22 +96,22 @@ def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
 
 
 def first_cells_are_entered_while_others_are_there(patch: pytest.MonkeyPatch) -> None:
-    may = Warden._may_follow
-    patch.setattr(Warden, "_may_follow", lambda self, stand, order: not stand.holds or may(self, stand, order))
+    may = Leader._may_follow
+    patch.setattr(Leader, "_may_follow", lambda self, stand, order: not stand.holds or may(self, stand, order))
     patch.setattr(HostEntries, "place", lambda self, vehicle: self.placed.add(vehicle))
 
 
-def a_silent_guest_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
-    tick = Warden.tick
+def a_silent_external_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
+    tick = Leader.tick
 
-    def leasing(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
+    def leasing(self: Leader, now_ns: int):  # type: ignore[no-untyped-def]
         for host in self._orders.by_host.keys() - self._fleets.keys():
             heard = self._hosts.get(host)
             if heard is not None and now_ns - heard.spoke_ns > SILENT_NS:
                 self._orders.remove(host, {}, (1 << 60, 0))
         return tick(self, now_ns)
 
-    patch.setattr(Warden, "tick", leasing)
+    patch.setattr(Leader, "tick", leasing)
 
 
 def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.MonkeyPatch) -> None:
@@ -123,48 +125,52 @@ def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.Mo
 
 
 def a_robot_that_is_replaced_says_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
-    def talkative(self: Guest, now_ns: int):  # type: ignore[no-untyped-def]
+    def talkative(self: ExternalVehicle, now_ns: int):  # type: ignore[no-untyped-def]
         actions = self._host.standings({}, now_ns)
         self._host.ended_alone(now_ns)
         return actions
 
-    tick = Guest.tick
-    patch.setattr(Guest, "tick", lambda self, now_ns: (talkative if self.replaced else tick)(self, now_ns))
+    tick = ExternalVehicle.tick
+    patch.setattr(
+        ExternalVehicle, "tick", lambda self, now_ns: (talkative if self.replaced else tick)(self, now_ns)
+    )
 
 
 def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
     hear = Host.hear_granted
 
     def unfenced(self: Host, granted, now_ns):  # type: ignore[no-untyped-def]
-        self.holdings.life = self.holdings._entries.life = max(self.holdings.life, granted.life)
+        self.holdings.generation = self.holdings._entries.generation = max(
+            self.holdings.generation, granted.generation
+        )
         return hear(self, granted, now_ns)
 
     patch.setattr(Host, "hear_granted", unfenced)
 
 
-def a_cell_that_was_shut_for_a_guest_is_anybodys(patch: pytest.MonkeyPatch) -> None:
+def a_cell_that_was_shut_for_a_external_is_anybodys(patch: pytest.MonkeyPatch) -> None:
     opened = Orders._open
-    patch.setattr(Orders, "_open", lambda self, host, life, bodies: opened(self, host, life, {}))
+    patch.setattr(Orders, "_open", lambda self, host, generation, bodies: opened(self, host, generation, {}))
 
 
 def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPatch) -> None:
-    carry = GuestWorld.carry_away
+    carry = ExternalWorld.carry_away
 
-    def careless(self: GuestWorld, process: GuestProcess, back: bool = True) -> None:
+    def careless(self: ExternalWorld, process: ExternalProcess, back: bool = True) -> None:
         bodies = dict(process.disk.bodies)
         carry(self, process, back)
         process.disk.bodies.update(bodies)
 
-    patch.setattr(GuestWorld, "carry_away", careless)
+    patch.setattr(ExternalWorld, "carry_away", careless)
 
 
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     first_cells_are_entered_while_others_are_there,
-    a_silent_guest_loses_its_cells,
+    a_silent_external_loses_its_cells,
     a_first_cell_is_taken_from_a_table_that_is_about_to_free_it,
     a_robot_that_is_replaced_says_that_it_has_ended,
     a_robot_drives_on_though_it_is_replaced,
-    a_cell_that_was_shut_for_a_guest_is_anybodys,
+    a_cell_that_was_shut_for_a_external_is_anybodys,
     an_operator_says_gone_of_one_that_still_stands_there,
 ]
 
@@ -173,7 +179,7 @@ FIRST = {
     "a_first_cell_is_taken_from_a_table_that_is_about_to_free_it": 66,
     "a_robot_that_is_replaced_says_that_it_has_ended": 3,
     "a_robot_drives_on_though_it_is_replaced": 4,
-    "a_cell_that_was_shut_for_a_guest_is_anybodys": 3,
+    "a_cell_that_was_shut_for_a_external_is_anybodys": 3,
 }
 """Histories tried before the others, because they collided last: rare faults are found soon."""
 

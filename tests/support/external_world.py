@@ -1,5 +1,5 @@
-"""A traffic world with guests: robots that speak for themselves, agents that join while the swarm runs, and
-operators who declare a robot absent. All under the same faults."""
+"""A traffic world with external vehicles: robots that speak for themselves, agents that join while the swarm runs,
+and operators who declare a robot absent. All under the same faults."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, TrafficWorld
 
 from swarm.liveness import Peer
-from swarm.right_of_way.guest import Guest, GuestAction, Removal, SaveLives
+from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
@@ -18,130 +18,130 @@ from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWa
 _ANOTHER_CELL_NS = 2 * NS_PER_S
 
 
-class GuestProcess(Process):
-    """One life of a robot. Its body is on `disk`: when the process dies, the body stays there until it is carried
-    away."""
+class ExternalProcess(Process):
+    """One generation of a robot. Its body is on `disk`: when the process dies, the body stays there until it is
+    carried away."""
 
-    world: GuestWorld
+    world: ExternalWorld
 
     def make_rights(self) -> RightOfWay:
-        self.guest = Guest(self.world.plots, self.agent, self.disk.own.lives)
+        self.external = ExternalVehicle(self.world.shards, self.agent, self.disk.own.generations)
         self.asked_ns = 0
         self.leaving = False
-        return RightOfWay(self.agent, self.world.plots, self.world.spawns, OwnRecord(disk=0), {})  # never used
+        return RightOfWay(self.agent, self.world.shards, self.world.spawns, OwnRecord(disk=0), {})  # never used
 
     @property
     def settled(self) -> bool:
-        return self.guest.settled
+        return self.external.settled
 
     @property
     def body(self) -> int | None:
-        return self.disk.bodies.get(self.guest.vehicle)
+        return self.disk.bodies.get(self.external.vehicle)
 
     def ask_known(self, request: KnownRequest) -> list[Action]:
         return []
 
     def hear_known(self, known: Known) -> None:
-        self.guest.hear_known(known)
+        self.external.hear_known(known)
 
     def begin(self) -> None:
-        if not self.guest.needs_life:
+        if not self.external.needs_generation:
             self.try_to_enter()
-        self.do(self.guest.begin(self.world.chance.getrandbits(32)))
+        self.do(self.external.begin(self.world.chance.getrandbits(32)))
 
     def try_to_enter(self) -> None:
         """Tries the cell of the body; a body without a cell tries here and there."""
         self.asked_ns = self.world.now_ns
-        self.guest.enter(self.world.chance.choice(self.world.free) if self.body is None else self.body)
+        self.external.enter(self.world.chance.choice(self.world.free) if self.body is None else self.body)
 
-    def do(self, actions: list[GuestAction]) -> None:
+    def do(self, actions: list[ExternalAction]) -> None:
         for action in actions:
             match action:
-                case SaveLives(lives):
-                    self.disk.own = OwnRecord(disk=self.disk.own.disk, lives=lives)
+                case SaveGenerations(generations):
+                    self.disk.own = OwnRecord(disk=self.disk.own.disk, generations=generations)
                 case AskKnown():
                     self.world.begin(self)
                 case Tell() | Left():
                     self.perform([action])
 
     def hear_granted(self, granted: Granted) -> None:
-        self.enter_if(self.guest.hear_granted(granted, self.now_ns))
+        self.enter_if(self.external.hear_granted(granted, self.now_ns))
 
     def hear_left(self, left: Left) -> None:
-        self.enter_if(self.guest.hear_left(left))
+        self.enter_if(self.external.hear_left(left))
 
     def enter_if(self, entered: bool) -> None:
         if entered:
             if self.body is None:
                 self.world.entered += 1
-            self.disk.bodies[self.guest.vehicle] = self.guest.cells[0]
+            self.disk.bodies[self.external.vehicle] = self.external.cells[0]
             self.world.look()
 
     def tick(self) -> None:
-        guest, world = self.guest, self.world
+        external, world = self.external, self.world
         self.see_tokens()
-        held = guest.cells
+        held = external.cells
         if held:
             self.drive_on()
-        elif self.leaving and guest.gone:
+        elif self.leaving and external.gone:
             world.left += 1
             self.leaving = False
         elif not self.leaving and world.now_ns - self.asked_ns > _ANOTHER_CELL_NS:
             self.try_to_enter()
-            if guest.needs_life:  # the last one ended while it was away
+            if external.needs_generation:  # the last one ended while it was away
                 world.begin(self)
-        self.do(guest.tick(self.now_ns))
+        self.do(external.tick(self.now_ns))
 
     def drive_on(self) -> None:
-        guest, world, chance = self.guest, self.world, self.world.chance
-        held_before = guest.cells[0]
+        external, world, chance = self.external, self.world, self.world.chance
+        held_before = external.cells[0]
         if not world.quiet and chance.random() < 0.01:
-            del self.disk.bodies[guest.vehicle]
-            guest.leave()
+            del self.disk.bodies[external.vehicle]
+            external.leave()
             self.leaving = chance.random() < 0.5
             if not self.leaving:
-                guest.enter(held_before)  # it has changed its mind, and stands beside the cell that it has left
+                external.enter(held_before)  # it has changed its mind, and stands beside the cell that it has left
             return
-        while len(guest.cells) > 1 and chance.random() < 0.7:
-            before, cell = guest.cells[:2]
-            guest.left(before)
-            self.disk.bodies[guest.vehicle] = cell
-            world.moves[guest.vehicle] = world.moves.get(guest.vehicle, 0) + 1
+        while len(external.cells) > 1 and chance.random() < 0.7:
+            before, cell = external.cells[:2]
+            external.left(before)
+            self.disk.bodies[external.vehicle] = cell
+            world.moves[external.vehicle] = world.moves.get(external.vehicle, 0) + 1
             world.look()
-        here = guest.cells[0]
-        goal = world.goals.setdefault(guest.vehicle, chance.choice(world.free))
+        here = external.cells[0]
+        goal = world.goals.setdefault(external.vehicle, chance.choice(world.free))
         if here == goal:
-            goal = world.new_goal(guest.vehicle)
+            goal = world.new_goal(external.vehicle)
         cost, path = world.costs(goal), [here]
         while cost[path[-1]] and len(path) < 6:
             path.append(min(world.next_to(path[-1]), key=cost.__getitem__))
-        guest.want(path, sorted(world.next_to(here), key=lambda cell: (cost[cell], cell)))
+        external.want(path, sorted(world.next_to(here), key=lambda cell: (cost[cell], cell)))
 
     def see_tokens(self) -> None:
         up = {Peer("agent", each.agent, id(each)) for each in self.world.twins_of(self)}
         for peer in up ^ self.tokens:
-            self.guest.hear_token(peer, up=peer in up)
+            self.external.hear_token(peer, up=peer in up)
         self.tokens = up
 
 
 class AddedProcess(Process):
-    """One life of an agent that is not in the scenario. Its vehicles enter where there is place; a new incarnation
-    finds its earlier vehicles in the tables, and lets the others enter again."""
+    """One generation of an agent that is not in the scenario. Its vehicles enter where there is place; a new
+    incarnation finds its earlier vehicles in the tables, and lets the others enter again."""
 
-    world: GuestWorld
+    world: ExternalWorld
 
     def make_rights(self) -> RightOfWay:
         world, disk = self.world, self.disk
         vehicles = world.added[self.agent]
         self.asked_ns: dict[str, int] = {}
-        rights = RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved, vehicles=vehicles)
+        rights = RightOfWay(self.agent, world.shards, world.spawns, disk.own, disk.saved, vehicles=vehicles)
         assert not rights._members
         return rights
 
     def tick(self) -> None:
         world, holdings = self.world, self.rights.holdings
         self.vehicles = world.added[self.agent]
-        for vehicle in self.vehicles if holdings.life and not holdings.replaced else ():
+        for vehicle in self.vehicles if holdings.generation and not holdings.replaced else ():
             asked_ns = self.asked_ns.setdefault(vehicle, world.now_ns)
             if holdings.path(vehicle):
                 if not world.quiet and world.chance.random() < 0.005:
@@ -157,13 +157,13 @@ class AddedProcess(Process):
 
 
 class OperatorProcess(Process):
-    """Declares a robot absent until wardens have freed its cells."""
+    """Declares a robot absent until leaders have freed its cells."""
 
-    world: GuestWorld
+    world: ExternalWorld
 
     def make_rights(self) -> RightOfWay:
-        self.removal = Removal(self.world.plots, self.agent)
-        return RightOfWay(self.agent, self.world.plots, self.world.spawns, OwnRecord(disk=0), {})  # never used
+        self.removal = Removal(self.world.shards, self.agent)
+        return RightOfWay(self.agent, self.world.shards, self.world.spawns, OwnRecord(disk=0), {})  # never used
 
     @property
     def settled(self) -> bool:
@@ -189,10 +189,10 @@ class OperatorProcess(Process):
             self.world.removed += self.removal.done
 
 
-class GuestWorld(TrafficWorld):
+class ExternalWorld(TrafficWorld):
     """A traffic world with `robots` that come and go and `added` agents of two vehicles each.
 
-    entered, left, removed  number of arrivals and departures of guests, and of robots declared absent
+    entered, left, removed  number of arrivals and departures of external vehicles, and of robots declared absent
     """
 
     def __init__(
@@ -206,24 +206,25 @@ class GuestWorld(TrafficWorld):
         """Robots that are dead now, and"""
         self.never_back: set[str] = set()
         """those that will never be back."""
-        self.guest_chance = random.Random(f"guests/{seed}")
+        self.external_chance = random.Random(f"guests/{seed}")
         for vehicles in self.added.values():
             for vehicle in vehicles:
-                self.goals[vehicle] = self.guest_chance.choice(self.free)
+                self.goals[vehicle] = self.external_chance.choice(self.free)
         for name in (*self.robots, *self.added):
             self.disks[name] = [self.new_disk()]
             self.at(
-                self.guest_chance.randrange(3 * NS_PER_S), lambda name=name: self.start(name, self.disks[name][0])
+                self.external_chance.randrange(3 * NS_PER_S),
+                lambda name=name: self.start(name, self.disks[name][0]),
             )
-        self.at(NS_PER_S, self.disturb_guests)
+        self.at(NS_PER_S, self.disturb_externals)
 
     def process_of(self, agent: str, disk: Disk) -> Process:
         if agent in self.robots:
-            return GuestProcess(self, agent, disk)
+            return ExternalProcess(self, agent, disk)
         return AddedProcess(self, agent, disk) if agent in self.added else Process(self, agent, disk)
 
     def twins_of(self, process: Process) -> list[Process]:
-        """Other processes of the same guest that it sees."""
+        """Other processes of the same external vehicle that it sees."""
         return [
             each
             for each in self.processes
@@ -237,22 +238,22 @@ class GuestWorld(TrafficWorld):
         if process.agent not in self.gone | self.never_back and not isinstance(process, OperatorProcess):
             super().restart(process)
 
-    def disturb_guests(self) -> None:
+    def disturb_externals(self) -> None:
         """Now and then a robot dies for good, is carried away, and an operator says so; later it comes again."""
         if self.quiet:
             return
-        self.at(NS_PER_S, self.disturb_guests)
-        alive = [each for each in self.processes if isinstance(each, GuestProcess)]
-        if not alive or self.guest_chance.random() > 0.3 or len(self.disks[alive[0].agent]) > 1:
+        self.at(NS_PER_S, self.disturb_externals)
+        alive = [each for each in self.processes if isinstance(each, ExternalProcess)]
+        if not alive or self.external_chance.random() > 0.3 or len(self.disks[alive[0].agent]) > 1:
             return
         process = alive[0]
         self.gone.add(process.agent)
         for each in [each for each in self.processes if each.agent == process.agent]:
             each.alive = False
             self.processes.remove(each)
-        self.at(self.guest_chance.randrange(NS_PER_S), lambda: self.carry_away(process))
+        self.at(self.external_chance.randrange(NS_PER_S), lambda: self.carry_away(process))
 
-    def carry_away(self, process: GuestProcess, back: bool = True) -> None:
+    def carry_away(self, process: ExternalProcess, back: bool = True) -> None:
         process.disk.bodies.clear()
         operator = OperatorProcess(self, process.agent, self.new_disk())
         self.processes.append(operator)
@@ -265,19 +266,19 @@ class GuestWorld(TrafficWorld):
 
         self.at(300 * MS, tick)
         if back:
-            self.at(self.guest_chance.randrange(4 * NS_PER_S), lambda: self.bring_back(process))
+            self.at(self.external_chance.randrange(4 * NS_PER_S), lambda: self.bring_back(process))
 
     def end_robots(self) -> None:
         """All robots die for good. Once no word of theirs is under way any more, they are carried away."""
         self.never_back.update(self.robots)
-        for robot in [each for each in self.processes if isinstance(each, GuestProcess)]:
+        for robot in [each for each in self.processes if isinstance(each, ExternalProcess)]:
             robot.alive = False
             self.processes.remove(robot)
         for name in self.robots:
-            robot = GuestProcess(self, name, self.disks[name][0])
+            robot = ExternalProcess(self, name, self.disks[name][0])
             self.at(6 * NS_PER_S, partial(self.carry_away, robot, back=False))
 
-    def bring_back(self, process: GuestProcess) -> None:
+    def bring_back(self, process: ExternalProcess) -> None:
         if process.agent in self.never_back:
             return
         self.gone.discard(process.agent)

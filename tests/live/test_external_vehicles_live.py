@@ -18,8 +18,8 @@ from support.processes import eventually
 
 from swarm.bus.zenoh_bus import open_bus
 from swarm.grid import GridSpec
-from swarm.right_of_way.guest_session import GuestSession
-from swarm.right_of_way.incarnations import LifeFile
+from swarm.right_of_way.external_session import ExternalSession
+from swarm.right_of_way.incarnations import GenerationFile
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
@@ -52,7 +52,7 @@ def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
     raise AssertionError("no route of twelve cells from anywhere")
 
 
-def drive(rover: GuestSession, path: list[int]) -> None:
+def drive(rover: ExternalSession, path: list[int]) -> None:
     rover.want(path)
     for here, there in pairwise(path):
         assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
@@ -78,9 +78,9 @@ with connect(endpoint) as swarm:
 """
 
 
-def session_of(live: LiveSwarm, run: RunInfo, name: str, file: Path) -> GuestSession:
+def session_of(live: LiveSwarm, run: RunInfo, name: str, file: Path) -> ExternalSession:
     bus = open_bus(live.network, authenticator=authenticator_of(live.network, run.run_id))
-    return GuestSession(name, GridSpec(run.rows, run.cols, run.resolution_m), bus, LifeFile(file))
+    return ExternalSession(name, GridSpec(run.rows, run.cols, run.resolution_m), bus, GenerationFile(file))
 
 
 def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
@@ -94,7 +94,9 @@ def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
     program.kill()
     program.wait(10)
     with session_of(live, run, "other", tmp_path / "other") as other:
-        assert not other.enter(path[5], timeout_s=4.0)  # the rover stands there, though its lease as a body is over
+        assert not other.enter(
+            path[5], timeout_s=4.0
+        )  # the rover stands there, though its lease as an obstacle is over
         with session_of(live, run, "rover", tmp_path / "rover") as rover:
             assert rover.enter(path[5], timeout_s=10.0)
             drive(rover, path[5:])
@@ -160,7 +162,7 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
     assert (gone.returncode, gone.stderr) == (0, ""), gone
     unknown = swarm("order", "vehicle", "forget", "nobody", *where)
     assert unknown.returncode == 2
-    assert "no agent knows a guest 'nobody'" in unknown.stderr
+    assert "no agent knows an external vehicle 'nobody'" in unknown.stderr
     for options, sentence in (
         (("--group", "none"), "has no group 'none'"),
         (("--id", "a0"), "has an agent 'a0' itself"),

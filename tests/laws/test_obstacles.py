@@ -1,4 +1,4 @@
-"""Bodies close what they say, as long as they say it: a slow twin knows every report that was ever heard."""
+"""Obstacles close what they say, as long as they say it: a slow twin knows every report that was ever heard."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.plot_tables import grants_of
+from support.shard_tables import grants_of
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted
-from swarm.wire.messages.vehicles import Body
+from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.cells_of_discs import Capsule
 from vehicle_agent.driving.driver import Driver
+from vehicle_agent.obstacles import REACTION_S, Obstacles
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.steering import Steering
 
@@ -38,9 +38,9 @@ SLACK_M = 0.51
 EAST_M, SOUTH_M = GRID.cols * GRID.resolution_m, GRID.rows * GRID.resolution_m
 
 
-def body(**said: object) -> Body:
+def obstacle(**said: object) -> Obstacle:
     fields = {"id": "r1", "incarnation": 1, "seq": 1, "x_m": 130.0, "y_m": 880.0, "radius_m": 1.0, "lease_s": 1.0}
-    return Body(**(fields | said))  # type: ignore[arg-type]
+    return Obstacle(**(fields | said))  # type: ignore[arg-type]
 
 
 def centre(row: int, col: int) -> dict[str, float]:
@@ -74,7 +74,7 @@ def touched(x_m: float, y_m: float, heading_rad: float | None, ahead_m: float, r
 
 @dataclass
 class Heard:
-    report: Body
+    report: Obstacle
     at_ns: int
     awake_ns: int = 0
     """Time for which the process has listened since."""
@@ -119,7 +119,7 @@ class Twin:
 places_x = st.floats(GRID.west_m, GRID.west_m + EAST_M)
 places_y = st.floats(GRID.north_m - SOUTH_M, GRID.north_m)
 reports = st.builds(
-    Body,
+    Obstacle,
     id=st.sampled_from(["r1", "r2"]),
     incarnation=st.integers(0, 1),
     seq=st.integers(0, 12),
@@ -137,14 +137,14 @@ pauses = st.sampled_from([TICK_NS, TICK_NS, TICK_NS, 2 * TICK_NS, 30 * TICK_NS])
 @settings(max_examples=few(60), deadline=None)
 @given(st.lists(st.tuples(st.lists(reports, max_size=2), pauses), min_size=1, max_size=12))
 def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(steps) -> None:
-    bodies, twin, now_ns = Bodies(GRID, MARGIN_M), Twin(), 10**18
-    bodies.tick(now_ns)
+    obstacles, twin, now_ns = Obstacles(GRID, MARGIN_M), Twin(), 10**18
+    obstacles.tick(now_ns)
     for said, pause_ns in steps:
         now_ns += pause_ns
         for each in twin.heard:
             # A process that is stopped for longer than a quarter of a second has not listened since then.
             each.awake_ns += min(pause_ns, NS_PER_S // 4)
-        bodies.tick(now_ns)
+        obstacles.tick(now_ns)
         for report in said:
             known = [
                 each.report.seq
@@ -152,7 +152,7 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(ste
                 if (each.report.id, each.report.incarnation) == (report.id, report.incarnation)
             ]
             if known and report.seq <= known[0]:
-                bodies.take_report(report, now_ns)
+                obstacles.take_report(report, now_ns)
                 continue
             twin.heard = [
                 each
@@ -160,9 +160,9 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(ste
                 if (each.report.id, each.report.incarnation, each.report.seq >= report.seq)
                 != (report.id, report.incarnation, True)
             ]
-            bodies.take_report(report, now_ns)
+            obstacles.take_report(report, now_ns)
             twin.heard.append(Heard(report, now_ns))
-        closed = {cell for cell in range(GRID.cells) if cell in bodies.closed}
+        closed = {cell for cell in range(GRID.cells) if cell in obstacles.closed}
         assert twin.must() <= closed
         if all(each.report.speed_m_per_s < 100 for each in twin.heard):
             assert closed <= twin.may()
@@ -195,37 +195,37 @@ per_agent = 3
 reserve_cells = 4
 """)
 LEVEL = np.full((GRID.rows, GRID.cols), 0.1, np.float32)
-PLOTS = Plots(GRID, ["a0"])
+SHARDS = Shards(GRID, ["a0"])
 
 
 def agent_at(cells: list[int]) -> Agent:
     plan = plan_agents(SCENARIO)[0]
-    holdings = Holdings(PLOTS, plan.id, plan.vehicle_ids)
+    holdings = Holdings(SHARDS, plan.id, plan.vehicle_ids)
     holdings.begin(1, [])
     local = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
-    agent = Agent(plan, SCENARIO, local, TruthSensor(GRID, LEVEL, 20.0), holdings, Bodies(GRID, MARGIN_M))
+    agent = Agent(plan, SCENARIO, local, TruthSensor(GRID, LEVEL, 20.0), holdings, Obstacles(GRID, MARGIN_M))
     grant(agent, 1, dict(zip(plan.vehicle_ids, ([cell] for cell in cells), strict=True)))
     return agent
 
 
 def grant(agent: Agent, seq: int, cells: dict[str, list[int]]) -> None:
-    warden, grants = PLOTS.warden(0, 1), grants_of(agent.holdings, seq, cells)
-    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+    leader, grants = SHARDS.leader(0, 1), grants_of(agent.holdings, seq, cells)
+    granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants)
     agent.place(agent.holdings.hear_granted(granted, seq))
 
 
 @dataclass
 class Driven:
-    """The outcome of a random drive among random bodies."""
+    """The outcome of a random drive among random obstacles."""
 
     steps: int = 0
     avoided: int = 0
-    """Ticks in which a body stood where a vehicle was about to go."""
+    """Ticks in which an obstacle stood where a vehicle was about to go."""
     into: list[tuple[str, int]] = field(default_factory=list)
 
 
 def drive(seed: int, ticks: int = 60) -> Driven:
-    """Vehicles that are granted any cells whatever, in every state of their steps, among any bodies."""
+    """Vehicles that are granted any cells whatever, in every state of their steps, among any obstacles."""
     chance, twin, driven, seq, now_ns = random.Random(seed), Twin(), Driven(), 1, 10**18
     agent = agent_at(chance.sample(range(GRID.cells), 3))
     vehicles = agent.vehicles
@@ -234,10 +234,10 @@ def drive(seed: int, ticks: int = 60) -> Driven:
         now_ns += passed_ns
         for each in twin.heard:
             each.awake_ns += min(passed_ns, NS_PER_S // 4)
-        agent.bodies.tick(now_ns)
+        agent.obstacles.tick(now_ns)
         for id in ("r1", "r2"):
             if chance.random() < 0.4:
-                report = body(
+                report = obstacle(
                     id=id,
                     seq=number,
                     x_m=GRID.west_m + chance.uniform(0, EAST_M),
@@ -247,7 +247,7 @@ def drive(seed: int, ticks: int = 60) -> Driven:
                     radius_m=chance.uniform(0.0, 6.0),
                     lease_s=chance.choice((0.1, 0.5, 2.0)),
                 )
-                agent.bodies.take_report(report, now_ns)
+                agent.obstacles.take_report(report, now_ns)
                 twin.heard = [each for each in twin.heard if each.report.id != id]
                 twin.heard.append(Heard(report, now_ns))
         closed = twin.must()
@@ -264,7 +264,7 @@ def drive(seed: int, ticks: int = 60) -> Driven:
         if chance.random() < 0.6:
             grant(agent, seq, grants)
         driven.avoided += any(set(agent.holdings.path(id)[1:]) & closed for id in vehicles)
-        agent.bodies_moved()
+        agent.obstacles_moved()
         agent.begin_drive(now_ns)
         before = {id: vehicle.cell for id, vehicle in vehicles.items()}
         while agent.drive() is not None:
@@ -278,24 +278,24 @@ def drive(seed: int, ticks: int = 60) -> Driven:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**9))
-def test_no_vehicle_enters_a_cell_that_a_body_closes_whatever_is_granted(seed) -> None:
+def test_no_vehicle_enters_a_cell_that_an_obstacle_closes_whatever_is_granted(seed) -> None:
     assert drive(seed).into == []
 
 
-def test_bodies_do_stand_in_the_way_of_these_drives() -> None:
+def test_obstacles_do_stand_in_the_way_of_these_drives() -> None:
     drives = [drive(seed) for seed in range(5)]
     assert sum(each.avoided for each in drives) > 20
     assert sum(each.steps for each in drives) > 100
 
 
 @pytest.mark.parametrize("rule", ["closed", "turn back", "reaction", "leases"])
-def test_without_any_one_rule_a_vehicle_drives_into_a_body(rule, monkeypatch) -> None:
+def test_without_any_one_rule_a_vehicle_drives_into_an_obstacle(rule, monkeypatch) -> None:
     if rule == "closed":
         monkeypatch.setattr(Steering, "closed", lambda self, cell: False)
     elif rule == "turn back":
         monkeypatch.setattr(Driver, "end_path", lambda self, vehicle: None)
     elif rule == "reaction":
-        monkeypatch.setattr("vehicle_agent.bodies.REACTION_S", 0.0)
+        monkeypatch.setattr("vehicle_agent.obstacles.REACTION_S", 0.0)
     else:
-        monkeypatch.setattr("vehicle_agent.bodies.NS_PER_S", NS_PER_S // 4)
+        monkeypatch.setattr("vehicle_agent.obstacles.NS_PER_S", NS_PER_S // 4)
     assert any(drive(seed).into for seed in range(40))

@@ -1,4 +1,4 @@
-"""The laws on a map of several regions and many plots, the borders of which vehicles cross all the time."""
+"""The laws on a map of several regions and many shards, the borders of which vehicles cross all the time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from launch_scripts.simulation.worlds import WIDE, seeded
 SECONDS = 24.0
 
 
-def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
+def test_agents_listen_to_the_shards_near_their_vehicles_and_keep_every_law():
     simulation = Simulation(seeded(1, WIDE))
     laws = LawBook(simulation)
     simulation.run_until(6)
-    plots = [len(service._right_of_way.core.holdings.plots) for service in agents(simulation).values()]
-    assert len(plots) == 8
-    assert sum(plots) < 48  # of 64
+    shards = [len(service._right_of_way.core.holdings.shards) for service in agents(simulation).values()]
+    assert len(shards) == 8
+    assert sum(shards) < 48  # of 64
     simulation.run_until(SECONDS)
     simulation.finish()
     report = simulation.report(SECONDS)
@@ -31,8 +31,8 @@ def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
 
 
 @pytest.mark.seeds(2)
-def test_nobody_meets_where_plots_are_larger_than_regions(seed):
-    wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, plot_regions=2))
+def test_nobody_meets_where_shards_are_larger_than_regions(seed):
+    wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, shard_regions=2))
     simulation = Simulation(seeded(seed, wide), faults=random_plan(wide, seed, SECONDS))
     laws = LawBook(simulation)
     messages = {"standing": 0, "table": 0}
@@ -47,8 +47,8 @@ def test_nobody_meets_where_plots_are_larger_than_regions(seed):
     assert report["captures"] > 0
     assert min(messages.values()) > 0
     cores = [service._right_of_way.core for service in agents(simulation).values()]
-    assert {core.plots.count for core in cores} == {2}  # 280 x 800 cells
-    assert {plot for core in cores for plot in core.holdings.plots} <= set(cores[0].plots.all)
+    assert {core.shards.count for core in cores} == {2}  # 280 x 800 cells
+    assert {shard for core in cores for shard in core.holdings.shards} <= set(cores[0].shards.all)
 
 
 def test_agents_that_drove_alone_and_died_are_not_driven_into():

@@ -1,4 +1,4 @@
-"""Bodies among the whole swarm: no vehicle drives into one, with faults and without, and work goes on."""
+"""Obstacles among the whole swarm: no vehicle drives into one, with faults and without, and work goes on."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ def test_no_vehicle_drives_into_a_rover_that_looks_out_for_nobody(seed) -> None:
 def test_no_vehicle_drives_into_a_rover_that_was_reported_in_time_though_messages_are_lost(seed) -> None:
     law, _ = driven("open", seed, 8.0, faults=True)
     assert law.driven_into == []
-    assert any(life.reports for life in law._lives.values())
+    assert any(generation.reports for generation in law._generations.values())
 
 
-def test_vehicles_that_do_not_look_at_bodies_drive_into_them_and_the_referee_sees_it(monkeypatch) -> None:
+def test_vehicles_that_do_not_look_at_obstacles_drive_into_them_and_the_referee_sees_it(monkeypatch) -> None:
     monkeypatch.setattr(Steering, "closed", lambda self, cell: not math.isfinite(self._pace[cell]))
     law, counts = driven("open", 1, 5.0, faults=False)
     assert law.driven_into
     assert counts["driven_into"] > 0
 
 
-def test_targets_that_are_bodies_are_captured_and_not_driven_into() -> None:
-    target = msgspec.structs.replace(SMALL.targets[0], body_radius_m=1.0)
+def test_targets_that_are_obstacles_are_captured_and_not_driven_into() -> None:
+    target = msgspec.structs.replace(SMALL.targets[0], obstacle_radius_m=1.0)
     vehicles = msgspec.structs.replace(SMALL.vehicles, capture_range_m=65.0)
     simulation = Simulation(msgspec.structs.replace(seeded(1), targets=(target,), vehicles=vehicles))
     simulation.run_until(15.0)

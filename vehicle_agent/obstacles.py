@@ -1,12 +1,12 @@
-"""Cells closed by bodies: obstacles that report their position, with a lease, and reserve no cells. Pure.
+"""Cells closed by obstacles: obstacles that report their position, with a lease, and reserve no cells. Pure.
 
 A report closes the cells that its disc touches, and those that it touches within `REACTION_S` if it keeps its
 speed and heading. Until the next report it may have continued as stated, so the closed area grows with its age. A
-cell is open again only if a newer report of the same body leaves it, or its lease ends. Leases count by the
+cell is open again only if a newer report of the same obstacle leaves it, or its lease ends. Leases count by the
 receiver's clock, from when a report was heard; nothing depends on what the sender's clock says.
 
-If reports contradict each other, all cells of both are closed: two senders under one id are two bodies, and a body
-that leaps keeps its old position closed until that report's lease ends.
+If reports contradict each other, all cells of both are closed: two senders under one id are two obstacles, and an
+obstacle that leaps keeps its old position closed until that report's lease ends.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from swarm.config.scenario import Scenario, ids_of
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.planning import TargetPose
-from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body
+from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from vehicle_agent.cells_of_discs import Capsule
 
 REACTION_S = 0.5
 """Reports come ten times a second, take up to two ticks, and one or two of them may be lost."""
 MAKE_WAY_S = 2.0
-"""Vehicles at rest leave cells to which a body comes within this time."""
+"""Vehicles at rest leave cells to which an obstacle comes within this time."""
 STANDS_NS = NS_PER_S
-"""A body that has kept its place for so long is driven around, not waited for."""
-MOST_BODIES = 256
+"""An obstacle that has kept its place for so long is driven around, not waited for."""
+MOST_OBSTACLES = 256
 MOST_CELLS = 100_000
-"""Limit for all bodies together: bounds time and memory, and the effect of false reports."""
+"""Limit for all obstacles together: bounds time and memory, and the effect of false reports."""
 _FURTHEST_CELLS = 64
-"""Largest number of cells ahead of a body that are closed: a faster body must look out itself."""
+"""Largest number of cells ahead of an obstacle that are closed: a faster obstacle must look out itself."""
 _LONGEST_PAUSE_NS = NS_PER_S // 4
 """Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
 _DEAF_NS = NS_PER_S // 2
 LISTEN_NS = NS_PER_S
-"""Each body is published at least this often, so that a new subscriber knows it."""
+"""Each obstacle is published at least this often, so that a new subscriber knows it."""
 _GHOSTS = 3
-"""Places that a body has leapt from and that are still closed, at most."""
+"""Places that an obstacle has leapt from and that are still closed, at most."""
 _MOST_SENDERS = 4
 """Lives of one id, of which each may still be there: one that starts again, a second program by mistake."""
 _MOST_TOLD = 1000
@@ -54,8 +54,8 @@ _LEAP_M = 5.0
 _NOTHING = Window(0, 0, 0, 0)
 
 
-def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0.0) -> Capsule:
-    """Returns the area that a body touches on a distance: by its heading, or in any direction without one."""
+def capsule_of(report: Obstacle, grid: GridSpec, ahead_m: float, margin_m: float = 0.0) -> Capsule:
+    """Returns the area that an obstacle touches on a distance: by its heading, or in any direction without one."""
     ahead_m = min(ahead_m, _FURTHEST_CELLS * grid.resolution_m)
     radius_m = report.radius_m + margin_m
     if report.heading_rad is None:
@@ -73,10 +73,10 @@ class _Known:
     coming    where it comes to within `MAKE_WAY_S`; None if it stands
     window    holds all that it closes or comes to
     charge    cells of the box that holds all that it can ever close
-    since_ns  since when the body has been near `anchor`
+    since_ns  since when the obstacle has been near `anchor`
     """
 
-    report: Body
+    report: Obstacle
     came_ns: int
     heard_ns: int
     until_ns: int
@@ -90,13 +90,13 @@ class _Known:
     ghosts: list[_Known] = field(default_factory=list)
 
 
-class Bodies:
-    """Bodies and the cells that they close.
+class Obstacles:
+    """Obstacles and the cells that they close.
 
     Call `tick` before each use, and before the reports that have come since the last one: all answers are as of
     then.
 
-    margin_m    added to each body's radius: the radius of a vehicle
+    margin_m    added to each obstacle's radius: the radius of a vehicle
     complaints  a sentence for each id and kind of report that was changed or refused; the reader clears them
     refused     how many such reports there were
     """
@@ -118,7 +118,7 @@ class Bodies:
         self._changed: list[Window] = []
         self._ticked_ns: int | None = None
         self._listens_ns = 0
-        """From when on all bodies are known."""
+        """From when on all obstacles are known."""
 
     @property
     def closed(self) -> Container[int]:
@@ -136,7 +136,7 @@ class Bodies:
 
     # --- reports --------------------------------------------------------------------------------------------
 
-    def take_report(self, report: Body, now_ns: int) -> None:
+    def take_report(self, report: Obstacle, now_ns: int) -> None:
         """Takes in a report, after `tick` at the same time. A report older than the last one of its sender changes
         nothing."""
         key = report.id, report.incarnation
@@ -183,7 +183,7 @@ class Bodies:
         else:
             self._open(known)
 
-    def _charge(self, report: Body) -> tuple[int, str | None]:
+    def _charge(self, report: Obstacle) -> tuple[int, str | None]:
         """Returns the largest number of cells that it may close until its lease ends, and the reason if it is
         refused."""
         if report.radius_m > MOST_RADIUS_M:
@@ -202,11 +202,11 @@ class Bodies:
         return window.cells, None
 
     def _crowded(self, known: _Known | None, leaps: bool, charge: int) -> str | None:
-        if known is None and len(self._known) >= MOST_BODIES:
-            return f"there are {MOST_BODIES} others already, as many as there may be"
+        if known is None and len(self._known) >= MOST_OBSTACLES:
+            return f"there are {MOST_OBSTACLES} others already, as many as there may be"
         charged = self._charged + charge - (0 if known is None or leaps else known.charge)
         if charged > MOST_CELLS:
-            return f"with it, bodies could close {charged} cells, expected at most {MOST_CELLS}"
+            return f"with it, obstacles could close {charged} cells, expected at most {MOST_CELLS}"
         return None
 
     def _outgrown(self, id: str, charge: int) -> str | None:
@@ -219,13 +219,13 @@ class Bodies:
             return f"its senders could close {charged} cells, expected at most {most}"
         return None
 
-    def _leaps(self, before: Body, report: Body, passed_ns: int) -> bool:
+    def _leaps(self, before: Obstacle, report: Obstacle, passed_ns: int) -> bool:
         speed = max(before.speed_m_per_s, report.speed_m_per_s)
         slack_m = _LEAP_M + self._grid.resolution_m + report.radius_m
         far_m = slack_m + 2.0 * speed * (passed_ns / NS_PER_S + REACTION_S)
         return math.hypot(report.x_m - before.x_m, report.y_m - before.y_m) > far_m
 
-    def _meet_namesake(self, report: Body, known: _Known | None) -> None:
+    def _meet_namesake(self, report: Obstacle, known: _Known | None) -> None:
         """Reports if two senders take turns under one id; one that was started again does not return."""
         senders = self._senders.setdefault(report.id, {})
         senders[report.incarnation] = None
@@ -245,7 +245,7 @@ class Bodies:
         told = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
         if told not in self._told and len(self._told) < _MOST_TOLD:
             self._told.add(told)
-            self.complaints.append(f"body {id} {text}")
+            self.complaints.append(f"obstacle {id} {text}")
 
     # --- time passes ----------------------------------------------------------------------------------------
 
@@ -272,12 +272,13 @@ class Bodies:
 
     @property
     def is_deaf(self) -> bool:
-        """Returns True if there may be bodies without a received report: the process has just started, or its last
-        tick was so long ago that messages meanwhile may be unread. No vehicle drives then."""
+        """Returns True if there may be obstacles without a received report: the process has just started, or its
+        last tick was so long ago that messages meanwhile may be unread. No vehicle drives then."""
         return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
 
     def listen_anew(self, now_ns: int) -> None:
-        """Starts listening again: for a second, in which every body publishes its position, no vehicle drives."""
+        """Starts listening again: for a second, in which every obstacle publishes its position, no vehicle
+        drives."""
         self._listens_ns = now_ns + LISTEN_NS
 
     def _forget(self, key: tuple[str, int]) -> None:
@@ -295,7 +296,7 @@ class Bodies:
         self._close(known, frozenset(), _NOTHING)
 
     def _cover(self, known: _Known, now_ns: int) -> None:
-        """Closes what the body can reach by now and within the reaction time."""
+        """Closes what the obstacle can reach by now and within the reaction time."""
         report = known.report
         age_s = max(now_ns - known.heard_ns, 0) / NS_PER_S
         # In steps of half a cell, so that it is seldom computed; never less than said.
@@ -324,14 +325,14 @@ class Bodies:
         self._changed.append(window.union(known.window))
         known.cells, known.window = cells, window
 
-    def _capsule(self, report: Body, ahead_m: float) -> Capsule:
+    def _capsule(self, report: Obstacle, ahead_m: float) -> Capsule:
         return capsule_of(report, self._grid, ahead_m, self._margin_m)
 
     # --- what is asked --------------------------------------------------------------------------------------
 
     def danger(self, cell: int) -> float:
-        """Returns an urgency score for a cell. 0 if no body reaches it within `MAKE_WAY_S`; higher the closer a
-        body passes its centre."""
+        """Returns an urgency score for a cell. 0 if no obstacle reaches it within `MAKE_WAY_S`; higher the closer
+        an obstacle passes its centre."""
         worst = 0.0
         for known in self._known.values():
             if known.coming is not None:
@@ -340,7 +341,7 @@ class Bodies:
 
     @property
     def standing(self) -> set[int]:
-        """Cells closed by bodies that keep their places."""
+        """Cells closed by obstacles that keep their places."""
         if self._standing is None:
             now_ns = self._ticked_ns or 0
             known = (known for known in self._known.values() if now_ns - known.since_ns >= STANDS_NS)
@@ -348,12 +349,12 @@ class Bodies:
         return self._standing
 
     @property
-    def reports(self) -> list[Body]:
-        """The newest report of each body, by each of its senders."""
+    def reports(self) -> list[Obstacle]:
+        """The newest report of each obstacle, by each of its senders."""
         return [known.report for known in self._known.values()]
 
 
-# --- targets as bodies ---
+# --- targets as obstacles ---
 
 _LEASE_S = 2.0
 """A pose comes twice a second at least, and three of four may be lost."""
@@ -363,39 +364,39 @@ _CELLS_BETWEEN = 2
 """From the middle of a cell beside a closed one to what closes it, at most, rounded up."""
 
 
-class TargetBodies:
-    """Makes bodies of the poses of those targets that vehicles must not drive into, as the scenario says. A pose
+class TargetObstacles:
+    """Makes obstacles of the poses of those targets that vehicles must not drive into, as the scenario says. A pose
     tells no heading and no speed: both are taken from the pose before.
 
-    Raises ConfigError if a target's body leaves no cell within capture range.
+    Raises ConfigError if a target's obstacle leaves no cell within capture range.
     """
 
     def __init__(self, scenario: Scenario, grid: GridSpec) -> None:
         self._radii_m: Mapping[str, float] = {
-            id: each.body_radius_m
+            id: each.obstacle_radius_m
             for each in scenario.targets
-            if each.body_radius_m is not None
+            if each.obstacle_radius_m is not None
             for id in ids_of(each)
         }
         self._last: dict[str, tuple[TargetPose, int, int]] = {}
-        """Target -> its last pose, when that was heard, and the number of its body's report."""
+        """Target -> its last pose, when that was heard, and the number of its obstacle's report."""
         for id, radius_m in self._radii_m.items():
             needed_m = radius_m + scenario.cost.vehicle_radius_m + _CELLS_BETWEEN * grid.resolution_m
             range_m = scenario.vehicles.capture_range_m
             if range_m < needed_m:
                 raise ConfigError(
-                    f"targets: {id}: with body_radius_m = {radius_m:g} no vehicle comes near enough to capture it: "
+                    f"targets: {id}: with obstacle_radius_m = {radius_m:g} no vehicle comes near enough to capture it: "
                     f"vehicles.capture_range_m is {range_m:g}, expected at least {needed_m:g}"
                 )
 
-    def bodies_of(self, pose: TargetPose, now_ns: int) -> list[Body]:
-        """Returns the bodies in a pose: none for a target without a body."""
+    def obstacles_of(self, pose: TargetPose, now_ns: int) -> list[Obstacle]:
+        """Returns the obstacles in a pose: none for a target without an obstacle."""
         radius_m = self._radii_m.get(pose.target)
         if radius_m is None:
             return []
         before, heard_ns, seq = self._last.get(pose.target, (None, 0, 0))
         self._last[pose.target] = pose, now_ns, seq + 1
-        body = Body(
+        obstacle = Obstacle(
             id=f"target.{pose.target}"[:64],
             incarnation=pose.jumps,
             seq=seq + 1,
@@ -407,12 +408,12 @@ class TargetBodies:
             lease_s=_LEASE_S,
         )
         if before is None:
-            return [body]
+            return [obstacle]
         if before.jumps != pose.jumps:  # it is at its new place, and no more at its old one
-            return [replace(body, incarnation=before.jumps, lease_s=0.0), body]
+            return [replace(obstacle, incarnation=before.jumps, lease_s=0.0), obstacle]
         passed_ns = now_ns - heard_ns
         if not 0 < passed_ns <= _LONGEST_NS:
-            return [body]
+            return [obstacle]
         east_m, north_m = pose.x_m - before.x_m, pose.y_m - before.y_m
         speed = min(math.hypot(east_m, north_m) * NS_PER_S / passed_ns, 1e6)
-        return [replace(body, heading_rad=math.atan2(east_m, north_m), speed_m_per_s=speed)]
+        return [replace(obstacle, heading_rad=math.atan2(east_m, north_m), speed_m_per_s=speed)]

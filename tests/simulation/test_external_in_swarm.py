@@ -6,28 +6,30 @@ import random
 from typing import Any
 
 import numpy as np
-from support.simulated import Guest, OrderedSimulation, cells
+from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
-from swarm.right_of_way.incarnations import MemoryLives
+from swarm.right_of_way.incarnations import MemoryGenerations
 from swarm.wire.messages.orders import ZoneOrder
-from swarm.wire.messages.vehicles import Body, Removed, RemoveVehicles
-from swarm.wire.topics import BODY, LEAVE
+from swarm.wire.messages.vehicles import Obstacle, Removed, RemoveVehicles
+from swarm.wire.topics import LEAVE, OBSTACLE
 from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
 
-def guest(simulation: OrderedSimulation, name: str, cell: int, lives: MemoryLives | None = None) -> Guest:
+def external(
+    simulation: OrderedSimulation, name: str, cell: int, generations: MemoryGenerations | None = None
+) -> ExternalVehicle:
     open = np.isfinite(simulation.terrain.pace_s_per_m).ravel()
-    found = Guest(simulation, name, cell, random.Random(name), open, lives)
+    found = ExternalVehicle(simulation, name, cell, random.Random(name), open, generations)
     found.boot()
     return found
 
 
-def drive(simulation: OrderedSimulation, rovers: list[Guest], seconds: float) -> None:
+def drive(simulation: OrderedSimulation, rovers: list[ExternalVehicle], seconds: float) -> None:
     """Drive on, and look that all vehicles are on cells of their own."""
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:
@@ -42,11 +44,11 @@ def places(simulation: OrderedSimulation) -> list[int]:
     return list(cells(simulation).values())
 
 
-def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
+def test_an_external_vehicle_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(3)
     # The cells of vehicles: they have to leave before it gets in.
-    rovers = [guest(simulation, f"rover-{n}", cell) for n, cell in enumerate(places(simulation)[:3])]
+    rovers = [external(simulation, f"rover-{n}", cell) for n, cell in enumerate(places(simulation)[:3])]
     drive(simulation, rovers, 12)
     assert all(rover.moves > 5 for rover in rovers)
     assert not any(rover.warnings for rover in rovers)
@@ -65,17 +67,17 @@ def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_
     for rover in rovers:
         rover.leave()
     drive(simulation, rovers, 1.5)
-    assert all(rover.service and rover.service.guest and rover.service.guest.gone for rover in rovers)
+    assert all(rover.service and rover.service.external and rover.service.external.gone for rover in rovers)
 
 
-def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
+def test_an_external_vehicle_must_not_have_the_name_of_an_agent() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(2)
-    rover = guest(simulation, "a0", 5)
+    rover = external(simulation, "a0", 5)
     simulation.run_until(4)
     assert rover.service is not None
-    assert rover.service.guest is None
-    assert rover.warnings == ["a0 is an agent of this run's scenario: a guest needs another name"]
+    assert rover.service.external is None
+    assert rover.warnings == ["a0 is an agent of this run's scenario: an external vehicle needs another name"]
 
 
 def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anybody() -> None:
@@ -126,7 +128,7 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     assert asked[-1].held == 0
 
 
-def test_vehicles_are_added_beside_a_body_and_outside_of_a_zone_where_their_place_is_closed() -> None:
+def test_vehicles_are_added_beside_an_obstacle_and_outside_of_a_zone_where_their_place_is_closed() -> None:
     scenario, terrain = crowd("open", 1, vehicles=8, per_agent=4, side=20)
     simulation = OrderedSimulation(scenario, terrain=terrain)
     zone: Any = [(6, 6), (6, 14), (14, 14), (14, 6)]
@@ -135,8 +137,8 @@ def test_vehicles_are_added_beside_a_body_and_outside_of_a_zone_where_their_plac
     group = scenario.groups[0].name
     for tick in range(80):
         # In the middle of cell [17, 17].
-        report = Body(id="walker", incarnation=1, seq=tick, x_m=175.0, y_m=-175.0, radius_m=3.0)
-        bus.publish(BODY, report, id="walker")
+        report = Obstacle(id="walker", incarnation=1, seq=tick, x_m=175.0, y_m=-175.0, radius_m=3.0)
+        bus.publish(OBSTACLE, report, id="walker")
         if tick == 20:
             nodes = [
                 simulation.add(added_agent(scenario, f"extra{n}", group, 1, place))

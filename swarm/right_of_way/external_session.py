@@ -1,7 +1,7 @@
 """Right of way of a vehicle that is not in the scenario, on the bus.
 
-`GuestSession` is what a program of one's own uses: a thread that keeps the right of way, and calls that may be
-made from any other. `GuestService` is the same without the thread, for another loop to drive. `say_gone` is an
+`ExternalSession` is what a program of one's own uses: a thread that keeps the right of way, and calls that may be
+made from any other. `ExternalService` is the same without the thread, for another loop to drive. `say_gone` is an
 operator's statement that such a vehicle is not on the map any more.
 """
 
@@ -18,32 +18,32 @@ from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.right_of_way.guest import Guest, Removal, SaveLives
+from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.incarnations import MemoryLives
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.incarnations import MemoryGenerations
+from swarm.right_of_way.lock_regions import Shards
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
-from swarm.wire.topics import GRANTED, KNOWN, LEFT, STANDING
+from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT
 
 _NOBODY_NS = 10 * NS_PER_S
-"""Time without a reply after which a guest is informed of it."""
+"""Time without a reply after which an external vehicle is informed of it."""
 _ANSWERS_S = 0.3
-"""A new life waits so long for the agents' answers before it begins."""
+"""A new generation waits so long for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
 """Time until agents are asked again what they know, where too few have answered."""
 _ROLE = "rover"
 
 
-class GuestService:
+class ExternalService:
     """Right of way of one vehicle that is not in the scenario, on a bus that may carry other things, too.
 
     `handle` and `tick` are called by one thread, `tick` some ten times a second. The bus needs the run's secret, or
-    a certificate of the guest, `rover.GROUP.NAME`.
+    a certificate of the external vehicle, `rover.GROUP.NAME`.
 
-    name         of the guest, as in its certificate; no agent of the scenario has it
+    name         of the external vehicle, as in its certificate; no agent of the scenario has it
     incarnation  nanosecond of this process's start, which tells its liveliness token from that of another
     warn         called with a sentence about what cannot be, or why the vehicle waits
 
@@ -55,7 +55,7 @@ class GuestService:
         name: str,
         grid: GridSpec,
         incarnation: int,
-        lives: MemoryLives,
+        generations: MemoryGenerations,
         bus: Bus,
         post: Post,
         warn: Callable[[str], None],
@@ -65,11 +65,11 @@ class GuestService:
         except ValueError as error:
             raise ConfigError(str(error)) from error
         self.name = name
-        self.guest: Guest | None = None
+        self.external: ExternalVehicle | None = None
         """None until an agent has said which agents there are."""
         self._grid = grid
         self._incarnation = incarnation
-        self._lives = lives
+        self._generations = generations
         self._bus = bus
         self._post = post
         self._warn = warn
@@ -80,7 +80,7 @@ class GuestService:
         self._tokens: set[Peer] = set()
         self._began_ns = 0
         self._cell: int | None = None
-        """The cell to enter, once there is a guest."""
+        """The cell to enter, once there is an external vehicle."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role=_ROLE)
@@ -95,39 +95,39 @@ class GuestService:
         self._bus.unsubscribe(LEFT, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
-        """Asks for the cell on which the vehicle stands. Raises as `Guest.enter`."""
+        """Asks for the cell on which the vehicle stands. Raises as `ExternalVehicle.enter`."""
         if not 0 <= cell < self._grid.cells:
             raise ValueError(f"cell {cell} is outside the map of {self._grid.cells} cells")
         self._cell = cell
-        if self.guest is not None:
-            self.guest.enter(cell)
-            if self.guest.needs_life and not self._asking:
+        if self.external is not None:
+            self.external.enter(cell)
+            if self.external.needs_generation and not self._asking:
                 self._ask(now_ns)
         self.tell(now_ns)
 
     def leave(self, now_ns: int) -> None:
         """Gives all cells back."""
         self._cell = None
-        if self.guest is not None:
-            self.guest.leave()
+        if self.external is not None:
+            self.external.leave()
         self.tell(now_ns)
 
-    def on_guest_event(self, event: Event, now_ns: int) -> bool:
-        """True if the event was about the right of way of this guest."""
+    def on_external_event(self, event: Event, now_ns: int) -> bool:
+        """True if the event was about the right of way of this external vehicle."""
         match event:
             case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
-                if self.guest is not None:
-                    self.guest.hear_granted(granted, now_ns)
+                if self.external is not None:
+                    self.external.hear_granted(granted, now_ns)
             case Heard(topic=topic, message=Left() as left) if topic is LEFT and left.host == self.name:
-                if self.guest is not None:
-                    self.guest.hear_left(left)
+                if self.external is not None:
+                    self.external.hear_left(left)
             case Replied(tag=self._tag, message=Known() as known):
                 self._hear_known(known)
             case AskEnded(tag=self._tag):
                 self._asking = False
                 self._ask_due_ns = now_ns + _ASK_AGAIN_NS
-                if self.guest is not None:
-                    self._perform(self.guest.begin(self._chance(now_ns)), now_ns)
+                if self.external is not None:
+                    self._perform(self.external.begin(self._chance(now_ns)), now_ns)
                     self.tell(now_ns)
             case Appeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
                 self._hear_token(peer, up=True)
@@ -138,41 +138,45 @@ class GuestService:
         return True
 
     def tick(self, now_ns: int) -> None:
-        settled = self.guest is not None and self.guest.settled
+        settled = self.external is not None and self.external.settled
         if not settled and not self._asking and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
-        if self.guest is None and now_ns - self._began_ns > _NOBODY_NS:
+        if self.external is None and now_ns - self._began_ns > _NOBODY_NS:
             self._warn_once(
-                (f"no agent answers {self.name}: a guest needs one that drives in this run, and a name of its own",)
+                (
+                    f"no agent answers {self.name}: an external vehicle needs one that drives in this run, and a name of its own",
+                )
             )
         self.tell(now_ns)
-        if self.guest is not None:
-            self._warn_once((*self.guest.refused, *self.guest.unled(now_ns)))
-            self.guest.refused.clear()
+        if self.external is not None:
+            self._warn_once((*self.external.refused, *self.external.unled(now_ns)))
+            self.external.refused.clear()
 
     def tell(self, now_ns: int) -> None:
         """Sends new statements without waiting for the next tick."""
-        if self.guest is not None:
-            self._perform(self.guest.tick(now_ns), now_ns)
+        if self.external is not None:
+            self._perform(self.external.tick(now_ns), now_ns)
 
     def _hear_known(self, known: Known) -> None:
-        if known.agents and (self.guest is None or _tells_of_larger(known, self.guest)):
+        if known.agents and (self.external is None or _tells_of_larger(known, self.external)):
             if self.name in known.agents:
-                self._warn_once((f"{self.name} is an agent of this run's scenario: a guest needs another name",))
+                self._warn_once(
+                    (f"{self.name} is an agent of this run's scenario: an external vehicle needs another name",)
+                )
                 return
-            plots = Plots(self._grid, known.agents, known.plot_cells)
-            self.guest = Guest(plots, self.name, self._lives.lives)
+            shards = Shards(self._grid, known.agents, known.shard_cells)
+            self.external = ExternalVehicle(shards, self.name, self._generations.generations)
             for peer in self._tokens:
-                self.guest.hear_token(peer, up=True)
+                self.external.hear_token(peer, up=True)
             if self._cell is not None:
-                self.guest.enter(self._cell)
-        if self.guest is not None and known.plot_cells == self.guest.plots.side:
-            self.guest.hear_known(known)
+                self.external.enter(self._cell)
+        if self.external is not None and known.shard_cells == self.external.shards.side:
+            self.external.hear_known(known)
 
     def _hear_token(self, peer: Peer, *, up: bool) -> None:
         (self._tokens.add if up else self._tokens.discard)(peer)
-        if self.guest is not None:
-            self.guest.hear_token(peer, up=up)
+        if self.external is not None:
+            self.external.hear_token(peer, up=up)
 
     def _ask(self, now_ns: int) -> None:
         self._asking = True
@@ -184,13 +188,15 @@ class GuestService:
             match action:
                 case AskKnown():
                     self._ask(now_ns)
-                case SaveLives(lives):
-                    self._lives.save(lives)
+                case SaveGenerations(generations):
+                    self._generations.save(generations)
                 case Left() as left:
                     self._bus.publish(LEFT, left, host=left.host, agent=self.name)
                 case Tell(members, standing):
                     for member in members:
-                        self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self.name)
+                        self._bus.publish(
+                            HOST_STATE, standing, shard=standing.shard, member=member, agent=self.name
+                        )
 
     def _chance(self, now_ns: int) -> int:
         seed = f"{self.name}/{self._incarnation}/{now_ns}".encode()
@@ -203,42 +209,42 @@ class GuestService:
                 self._warn(text)
 
 
-def _tells_of_larger(known: Known, guest: Guest) -> bool:
-    """Returns True if plots are larger than the guest assumes. An agent says so only if this is so for the whole
-    run; one that says less may not belong."""
-    return known.plot_cells > guest.plots.side and not guest.cells
+def _tells_of_larger(known: Known, external: ExternalVehicle) -> bool:
+    """Returns True if shards are larger than the external vehicle assumes. An agent says so only if this is so for
+    the whole run; one that says less may not belong."""
+    return known.shard_cells > external.shards.side and not external.cells
 
 
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.1
-"""Time between two ticks: half a beat, so that each beat is sent in time."""
+"""Time between two ticks: half a heartbeat, so that each heartbeat is sent in time."""
 _ENTER_S, _LEAVE_S = 5.0, 3.0
 """Longest waits for the first cell, and at the end for the word that all cells are free: a few hops, or an election
-of a warden, which takes a second."""
+of a leader, which takes a second."""
 
 
-class GuestSession:
+class ExternalSession:
     """Right of way of one vehicle: which cells of the map it may stand on and enter.
 
-    >>> with GuestSession("rover", grid, bus, LifeFile(path)) as rover:  # doctest: +SKIP
-    ...     rover.enter(cell)
-    ...     rover.want([cell, *route])
-    ...     if rover.may_enter(route[0], timeout_s=10.0):
-    ...         drive()
-    ...         rover.left(cell)
+    >>> with ExternalSession("rover", grid, bus, GenerationFile(path)) as rover:  # doctest: +SKIP
+    ...  rover.enter(cell)
+    ...  rover.want([cell, *route])
+    ...  if rover.may_enter(route[0], timeout_s=10.0):
+    ...  drive()
+    ...  rover.left(cell)
 
     The vehicle drives into a cell only while `may_enter` of it is true, and says which it has left. At its end the
     session leaves. A program that dies leaves its cells shut, until the next one of the same name and file enters,
     or an operator removes the vehicle (`swarm order vehicle forget`).
 
-    name   of the vehicle, unlike all agents of the scenario
-    grid   of the run's map
-    bus    opened with the run's secret, or with the vehicle's certificate, `rover.GROUP.NAME`
-    lives  the vehicle's file; closed with this session, as the bus is
+    name         of the vehicle, unlike all agents of the scenario
+    grid         of the run's map
+    bus          opened with the run's secret, or with the vehicle's certificate, `rover.GROUP.NAME`
+    generations  the vehicle's file; closed with this session, as the bus is
     """
 
-    def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: MemoryLives) -> None:
+    def __init__(self, name: str, grid: GridSpec, bus: Bus, generations: MemoryGenerations) -> None:
         self._clock = MonotonicClock()
         self._inbox = Inbox()
         self._changed = threading.Condition(threading.RLock())
@@ -247,17 +253,17 @@ class GuestSession:
         self._entered = False
         """True if `stands` was called."""
         self._bus = bus
-        self._lives = lives
+        self._generations = generations
         self._failure: BaseException | None = None
         self.warnings: list[str] = []
         """Sentences about why it waits, or what cannot be true."""
         incarnation = self._clock.now_ns()
-        self._service = GuestService(name, grid, incarnation, lives, bus, self._inbox.post, self._warn)
+        self._service = ExternalService(name, grid, incarnation, generations, bus, self._inbox.post, self._warn)
         self._service.start(self._clock.now_ns())
-        self._thread = threading.Thread(target=self._run, name=f"guest-{name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"external vehicle-{name}", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> GuestSession:
+    def __enter__(self) -> ExternalSession:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -270,15 +276,15 @@ class GuestSession:
         """The cells that it may stand on and enter, in driving order, its own first. They grow by themselves, and
         shrink by `want`, `left` and `leave` only; all are lost at once when another process takes the name."""
         with self._changed:
-            guest = self._service.guest
-            return () if guest is None else guest.cells
+            external = self._service.external
+            return () if external is None else external.cells
 
     @property
     def replaced(self) -> bool:
         """True if another process has taken the name: this vehicle must stand still, and its cells stay shut."""
         with self._changed:
-            guest = self._service.guest
-            return guest is not None and guest.replaced
+            external = self._service.external
+            return external is not None and external.replaced
 
     def enter(self, cell: int, timeout_s: float | None = None) -> bool:
         """Asks for the cell where the vehicle stands. Returns whether it is granted within `timeout_s`; None asks
@@ -299,10 +305,10 @@ class GuestSession:
         Raises ValueError if it has not entered, or the path begins elsewhere or leaps.
         """
         with self._changed:
-            guest = self._service.guest
-            if guest is None:
+            external = self._service.external
+            if external is None:
                 raise ValueError("it has not entered: no agent of the run has answered yet")
-            guest.want(path, aside)
+            external.want(path, aside)
             self._service.tell(self._clock.now_ns())
 
     def may_enter(self, cell: int, timeout_s: float | None = None) -> bool:
@@ -312,10 +318,10 @@ class GuestSession:
     def left(self, cell: int) -> None:
         """It has left a cell for the next of `cells`. Raises ValueError if it holds none after it."""
         with self._changed:
-            guest = self._service.guest
-            if guest is None:
+            external = self._service.external
+            if external is None:
                 raise ValueError("it has not entered")
-            guest.left(cell)
+            external.left(cell)
             self._service.tell(self._clock.now_ns())
 
     def stands(self, cell: int) -> bool:
@@ -336,7 +342,7 @@ class GuestSession:
         drive there."""
         with self._changed:
             self._service.leave(self._clock.now_ns())
-        return self._wait(lambda: self._service.guest is None or self._service.guest.gone, timeout_s)
+        return self._wait(lambda: self._service.external is None or self._service.external.gone, timeout_s)
 
     def close(self) -> None:
         """Leave, and end the session."""
@@ -348,7 +354,7 @@ class GuestSession:
             self._inbox.close()
             self._thread.join(2 * _TICK_S + 1.0)
             self._bus.close()
-            self._lives.close()
+            self._generations.close()
 
     # --- its thread -----------------------------------------------------------------------------------------
 
@@ -369,7 +375,7 @@ class GuestSession:
                         return
                     now_ns = self._clock.now_ns()
                     if event is not None:
-                        self._service.on_guest_event(event, now_ns)
+                        self._service.on_external_event(event, now_ns)
                     if now_ns >= due_ns:
                         due_ns = now_ns + int(_TICK_S * NS_PER_S)
                         self._service.tick(now_ns)
@@ -389,11 +395,12 @@ _WORDS_S = 0.5
 
 
 def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
-    """Removes a guest, and waits until its cells are free. Returns whether they are within the timeout.
+    """Removes an external vehicle, and waits until its cells are free. Returns whether they are within the timeout.
 
-    bus  opened with the run's secret, or the guest's own certificate
+    bus  opened with the run's secret, or the external vehicle's own certificate
 
-    Raises ConfigError where no such guest is known, or it is no guest, or its program still runs.
+    Raises ConfigError where no such external vehicle is known, or it is no external vehicle, or its program still
+    runs.
     """
     inbox = Inbox()
     clock = MonotonicClock()
@@ -409,14 +416,16 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 raise ConfigError(f"{name} is alive: end its program, or use `swarm order vehicle remove`")
             case Replied(message=Known() as known) if known.agents:
                 if name in known.agents:
-                    raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")
-                if removal is None or (not begun and known.plot_cells > removal.plots.side):
-                    removal = Removal(Plots(grid, known.agents, known.plot_cells), name)
-                if known.plot_cells == removal.plots.side:
+                    raise ConfigError(
+                        f"{name} is an agent of the scenario, not an external vehicle: start it again instead"
+                    )
+                if removal is None or (not begun and known.shard_cells > removal.shards.side):
+                    removal = Removal(Shards(grid, known.agents, known.shard_cells), name)
+                if known.shard_cells == removal.shards.side:
                     removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
                 if not removal.known:
-                    raise ConfigError(f"no agent knows a guest {name!r}")
+                    raise ConfigError(f"no agent knows an external vehicle {name!r}")
                 removal.begin(secrets.randbits(32))
                 begun = True
             case AskEnded() if not begun:
@@ -429,7 +438,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
             due_ns = now_ns + int(_TICK_S * NS_PER_S)
             for told in removal.tick(now_ns):
                 for member in told.members:
-                    bus.publish(STANDING, told.standing, plot=told.standing.plot, member=member, agent=name)
+                    bus.publish(HOST_STATE, told.standing, shard=told.standing.shard, member=member, agent=name)
             if removal.done:
                 return True
     return False

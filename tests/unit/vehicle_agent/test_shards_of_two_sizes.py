@@ -1,4 +1,4 @@
-"""Agents of plots of two sizes in one run, as where a machine has another map.plot_regions: one size counts."""
+"""Agents of shards of two sizes in one run, as where a machine has another map.shard_regions: one size counts."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 import swarm.right_of_way.lock_regions
 from swarm.errors import ConfigError, StoreError
-from swarm.grid import MOST_PLOTS, REGION_CELLS, GridSpec
-from swarm.right_of_way.guest_session import GuestService
-from swarm.right_of_way.incarnations import MemoryLives
-from swarm.right_of_way.lock_regions import Plots
+from swarm.grid import MOST_SHARDS, REGION_CELLS, GridSpec
+from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way.incarnations import MemoryGenerations
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
@@ -24,22 +24,22 @@ SMALL, LARGE = REGION_CELLS, 2 * REGION_CELLS
 
 
 class Sized(Process):
-    """A process whose plots are of a size of its own."""
+    """A process whose shards are of a size of its own."""
 
     world: Mixed
 
     def make_rights(self) -> RightOfWay:
         world, disk = self.world, self.disk
-        side = world.other_side if self.agent in world.others else world.plots.side
-        self.plots = Plots(world.grid, list(world.spawns), side)
-        return RightOfWay(self.agent, self.plots, world.spawns, disk.own, disk.saved)
+        side = world.other_side if self.agent in world.others else world.shards.side
+        self.shards = Shards(world.grid, list(world.spawns), side)
+        return RightOfWay(self.agent, self.shards, world.spawns, disk.own, disk.saved)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
             if not isinstance(action, Table | Stored):
                 super().perform([action])
                 continue
-            for member in self.plots.members(action.plot):
+            for member in self.shards.members(action.shard):
                 if isinstance(action, Table):
                     self.world.send(self, member, lambda to, table=action: to.hear_table(table))
                 else:
@@ -47,7 +47,7 @@ class Sized(Process):
 
 
 class Mixed(TrafficWorld):
-    """Some agents have plots of another size; none is called a stranger."""
+    """Some agents have shards of another size; none is called a stranger."""
 
     def __init__(
         self, seed: int, agents: int, per_agent: int, side: int, others: set[str], other_side: int
@@ -63,13 +63,13 @@ class Mixed(TrafficWorld):
     ("agents", "per_agent", "side", "others", "other_side"),
     [
         (2, 24, 4, {"a1"}, 8),  # of fewer than three agents one has a seat without anybody's word
-        (6, 12, 4, {"a3", "a4", "a5"}, 8),  # three of one size are all that a plot needs
+        (6, 12, 4, {"a3", "a4", "a5"}, 8),  # three of one size are all that a shard needs
         (7, 10, 8, {"a4", "a5", "a6"}, 4),
         (4, 16, 8, {"a3"}, 4),  # one without a seat, who would give back cells on which its vehicles stand
         (4, 16, 4, {"a3"}, 8),
     ],
 )
-def test_vehicles_of_agents_with_plots_of_two_sizes_do_not_meet(
+def test_vehicles_of_agents_with_shards_of_two_sizes_do_not_meet(
     agents: int, per_agent: int, side: int, others: set[str], other_side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(swarm.right_of_way.lock_regions, "REGION_CELLS", 4)
@@ -85,73 +85,73 @@ def test_of_agents_of_several_sizes_those_of_one_have_seats(regions_of: list[int
     seated = []
     for regions in set(regions_of):
         alike = {agent for agent, its in zip(agents, regions_of, strict=True) if its == regions}
-        plots = Plots(GRID, agents, regions * REGION_CELLS)
-        enough = len(alike) >= (3 if plots.majority > 1 else 1)  # to be all members of some plot
-        if enough and plots.has_quorum(alike):
+        shards = Shards(GRID, agents, regions * REGION_CELLS)
+        enough = len(alike) >= (3 if shards.majority > 1 else 1)  # to be all members of some shard
+        if enough and shards.has_quorum(alike):
             seated.append(regions)
     assert len(seated) <= 1
 
 
 def test_a_run_of_one_size_gets_its_seats_while_two_agents_have_never_been_there() -> None:
     agents = [f"a{n}" for n in range(7)]
-    plots = Plots(GRID, agents, LARGE)
-    assert plots.has_quorum(agents[2:])
-    assert not plots.has_quorum(agents[3:])
-    assert not Plots(GRID, agents[:2], LARGE).has_quorum(agents[:1])
+    shards = Shards(GRID, agents, LARGE)
+    assert shards.has_quorum(agents[2:])
+    assert not shards.has_quorum(agents[3:])
+    assert not Shards(GRID, agents[:2], LARGE).has_quorum(agents[:1])
 
 
 @given(st.integers(1, 2000), st.integers(1, 2000), st.integers(0, 1), st.integers(0, 1))
-def test_no_number_is_that_of_a_plot_of_another_size(rows: int, cols: int, layer: int, other: int) -> None:
+def test_no_number_is_that_of_a_shard_of_another_size(rows: int, cols: int, layer: int, other: int) -> None:
     grid = GridSpec(rows, cols, 1.0)
-    every = [Plots(grid, (), regions * REGION_CELLS, layer=each).all for regions in range(1, 6) for each in (0, 1)]
+    every = [Shards(grid, (), regions * REGION_CELLS, layer=each).all for regions in range(1, 6) for each in (0, 1)]
     for one, two in combinations(every, 2):
         assert not set(one) & set(two)
-    assert Plots(grid, (), layer=1).all.start == Plots(grid, ()).count  # those of a region are numbered as ever
+    assert Shards(grid, (), layer=1).all.start == Shards(grid, ()).count  # those of a region are numbered as ever
 
 
-def test_a_grid_whose_larger_plots_have_no_numbers_is_refused() -> None:
+def test_a_grid_whose_larger_shards_have_no_numbers_is_refused() -> None:
     grid = GridSpec(1, 1 << 28, 1.0)
-    assert Plots(grid, (), layer=1).all.stop == MOST_PLOTS
-    with pytest.raises(ConfigError, match=r"map\.plot_regions is 3: a grid of 1 x 268435456 cells is too narrow"):
-        Plots(grid, (), 3 * REGION_CELLS)
+    assert Shards(grid, (), layer=1).all.stop == MOST_SHARDS
+    with pytest.raises(ConfigError, match=r"map\.shard_regions is 3: a grid of 1 x 268435456 cells is too narrow"):
+        Shards(grid, (), 3 * REGION_CELLS)
 
 
 def test_an_agent_with_a_wrong_size_that_nobody_built_on_may_start_again_with_the_right_one() -> None:
     spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1", "a2"))}
-    wrong = RightOfWay("a0", Plots(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {})
+    wrong = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {})
     (own,) = wrong.begin(5)
     assert isinstance(own, OwnRecord)
-    assert RightOfWay("a0", Plots(GRID, list(spawns), SMALL), spawns, own, {}).own.plot_cells == SMALL
+    assert RightOfWay("a0", Shards(GRID, list(spawns), SMALL), spawns, own, {}).own.shard_cells == SMALL
 
 
-def test_what_was_promised_before_a_life_began_counts() -> None:
+def test_what_was_promised_before_a_generation_began_counts() -> None:
     spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1"))}
-    table = Table(plot=0, agent="a0", epoch=3, seq=1, hosts={}, grants={})
+    table = Table(shard=0, agent="a0", epoch=3, seq=1, hosts={}, grants={})
     with pytest.raises(StoreError, match="plots"):
-        RightOfWay("a0", Plots(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {0: (3, table)})
+        RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {0: (3, table)})
 
 
 @pytest.mark.parametrize("order", [(SMALL, LARGE, LARGE, LARGE), (LARGE, LARGE, SMALL, LARGE)])
-def test_a_guest_goes_by_the_largest_plots_that_it_is_told_of(order: tuple[int, ...]) -> None:
-    """Agents tell a guest of larger ones only if the whole run has them."""
+def test_an_external_vehicle_goes_by_the_largest_shards_that_it_is_told_of(order: tuple[int, ...]) -> None:
+    """Agents tell an external vehicle of larger ones only if the whole run has them."""
 
     class NoBus:
         def __getattr__(self, name: str) -> Any:
             return lambda *args, **kwargs: None
 
-    guest = GuestService("rover", GRID, 1, MemoryLives(), NoBus(), lambda event: None, print)  # type: ignore[arg-type]
-    guest.start(0)
+    external = ExternalService("rover", GRID, 1, MemoryGenerations(), NoBus(), lambda event: None, print)  # type: ignore[arg-type]
+    external.start(0)
     agents = ["a0", "a1", "a2", "a3"]
     for agent, cells in zip(agents, order, strict=True):
-        guest._hear_known(Known(agent=agent, disk=0, life=0, plots=[], agents=agents, plot_cells=cells))
-    assert guest.guest is not None
-    assert guest.guest.plots.side == LARGE
+        external._hear_known(Known(agent=agent, disk=0, generation=0, shards=[], agents=agents, shard_cells=cells))
+    assert external.external is not None
+    assert external.external.shards.side == LARGE
 
 
-def test_an_agent_tells_a_guest_of_larger_plots_only_if_the_run_has_them() -> None:
+def test_an_agent_tells_an_external_vehicle_of_larger_shards_only_if_the_run_has_them() -> None:
     spawns = {f"a{n}": {f"a{n}-00": n} for n in range(6)}
     asked = KnownRequest(agent="rover", disk=0)
     for noted_by, answers in ((["a1", "a2"], 0), (["a1", "a2", "a3"], 1)):
-        own = OwnRecord(disk=1, noted_by=noted_by, plot_cells=LARGE)
-        rights = RightOfWay("a0", Plots(GRID, list(spawns), LARGE), spawns, own, {})
+        own = OwnRecord(disk=1, noted_by=noted_by, shard_cells=LARGE)
+        rights = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, own, {})
         assert len(rights.answer_known(asked)) == answers

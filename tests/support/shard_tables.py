@@ -1,4 +1,5 @@
-"""Messages of members, wardens and hosts of one plot in tests: plot 0 of a grid of 8 x 8 cells, and five agents."""
+"""Messages of members, leaders and hosts of one shard in tests: shard 0 of a grid of 8 x 8 cells, and five
+agents."""
 
 from __future__ import annotations
 
@@ -7,15 +8,15 @@ from collections.abc import Mapping, Sequence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Entry, Granted, Number, Stand, Standing, Table
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stand, Table
 from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 GRID = GridSpec(8, 8, 1.0)
 AGENTS = [f"a{n}" for n in range(5)]
-PLOTS = Plots(GRID, AGENTS)
-MEMBERS = PLOTS.members(0)
+SHARDS = Shards(GRID, AGENTS)
+MEMBERS = SHARDS.members(0)
 S = NS_PER_S
 
 
@@ -32,7 +33,7 @@ def table_of(epoch: int, seq: int, **grants: list[int | Number]) -> Table:
         for host, cells in grants.items()
     }
     hosts = dict.fromkeys(grants, (1, seq))
-    return Table(plot=0, agent=PLOTS.warden(0, epoch), epoch=epoch, seq=seq, hosts=hosts, grants=held)
+    return Table(shard=0, agent=SHARDS.leader(0, epoch), epoch=epoch, seq=seq, hosts=hosts, grants=held)
 
 
 def cells_of(table: Table | None, vehicle: str) -> list[int]:
@@ -41,15 +42,17 @@ def cells_of(table: Table | None, vehicle: str) -> list[int]:
     return [number[0] for number in table.grants.get(vehicle, ())]
 
 
-def standing(host: str, holds: list[Number], seq: int, knows: tuple[int, int] = (0, 0), **more: object) -> Standing:
+def standing(
+    host: str, holds: list[Number], seq: int, knows: tuple[int, int] = (0, 0), **more: object
+) -> HostState:
     cells = [number[0] for number in holds]
     stand = Stand(f"{host}-00", cells[0], cells[-1], holds, [], [], 0, 0)
     fields = {"life": 1, "vehicles": [stand], **more}
-    return Standing(plot=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
+    return HostState(shard=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
 
 
 def holdings_of() -> Holdings:
-    holdings = Holdings(PLOTS, "a0", ["a0-00"])
+    holdings = Holdings(SHARDS, "a0", ["a0-00"])
     holdings.begin(1, [])
     holdings.watch([0])
     return holdings
@@ -57,14 +60,14 @@ def holdings_of() -> Holdings:
 
 def granted_of(table: Table, host: str = "a0") -> Granted:
     """The message of a table to one host."""
-    life, heard = table.hosts.get(host, (0, 0))
+    generation, heard = table.hosts.get(host, (0, 0))
     grants = {
         vehicle: [Entry(number) for number in numbers]
         for vehicle, numbers in table.grants.items()
         if vehicle.startswith(host)
     }
     return Granted(
-        plot=table.plot, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, life=life, heard=heard,
+        shard=table.shard, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, generation=generation, heard=heard,
         grants=grants,
     )  # fmt: skip
 
@@ -85,7 +88,7 @@ def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
 
 def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
     spawns = {name: {f"{name}-00": n} for n, name in enumerate(AGENTS)}
-    return RightOfWay(agent, PLOTS, spawns, OwnRecord(disk=7), saved or {})
+    return RightOfWay(agent, SHARDS, spawns, OwnRecord(disk=7), saved or {})
 
 
 def near_members() -> RoundTrips:

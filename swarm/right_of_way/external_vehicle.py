@@ -1,5 +1,5 @@
-"""External vehicles in right of way: how such a guest enters and reserves cells, and how an operator removes it
-(docs/design/external-vehicles.md)."""
+"""External vehicles in right of way: how such an external vehicle enters and reserves cells, and how an operator
+removes it (docs/design/external-vehicles.md)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from itertools import pairwise
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
-from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
-from swarm.right_of_way.lock_regions import Plots
+from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, Known, Left
 
 MOST_AHEAD = 16
-"""Cells ahead of itself that a guest is granted at most."""
+"""Cells ahead of itself that an external vehicle is granted at most."""
 _PATIENCE_NS = 3 * NS_PER_S
 """For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
@@ -23,32 +23,32 @@ _OLDEST_MS = 1 << 31
 
 
 @dataclass(frozen=True, slots=True)
-class SaveLives:
+class SaveGenerations:
     """Put these on file before what follows is said."""
 
-    lives: list[int]
+    generations: list[int]
 
 
-GuestAction = AskKnown | SaveLives | Tell | Left
+ExternalAction = AskKnown | SaveGenerations | Tell | Left
 
 
-class Guest:
+class ExternalVehicle:
     """One vehicle that speaks for itself. It has no seat among members; else it is a host as any other.
 
-    Nothing is said before `enter`: what a new life leaves out is given back, so it must not speak before it knows
-    where its vehicle stands.
+    Nothing is said before `enter`: what a new generation leaves out is given back, so it must not speak before it
+    knows where its vehicle stands.
 
-    name   of the guest; its vehicle is called `name-00`
-    lives  of it that are on the file which this process has locked: they have ended
+    name         of the external vehicle; its vehicle is called `name-00`
+    generations  of it that are on the file which this process has locked: they have ended
 
-    needs_life  whether it wants to enter and waits for `begin`
+    needs_generation  whether it wants to enter and waits for `begin`
     """
 
-    def __init__(self, plots: Plots, name: str, lives: Sequence[int] = ()) -> None:
+    def __init__(self, shards: Shards, name: str, generations: Sequence[int] = ()) -> None:
         self.vehicle = f"{name}-00"
-        self.plots = plots
-        self._host = Host(plots, name, [self.vehicle])
-        self._lives = list(lives)
+        self.shards = shards
+        self._host = Host(shards, name, [self.vehicle])
+        self._generations = list(generations)
         self._cell: int | None = None
         """Its cell, or the one that it would enter; None while it is away."""
         self._path: tuple[int, ...] = ()
@@ -68,17 +68,18 @@ class Guest:
 
     @property
     def replaced(self) -> bool:
-        """True if another process represents this guest. It stands where it stands, and must not move."""
+        """True if another process represents this external vehicle. It stands where it stands, and must not
+        move."""
         return self._host.holdings.replaced
 
     @property
     def gone(self) -> bool:
-        """True if it holds and requests nothing, and every warden that it contacted knows."""
-        return self._cell is None and (not self._host.holdings.life or self._host.holdings.gone)
+        """True if it holds and requests nothing, and every leader that it contacted knows."""
+        return self._cell is None and (not self._host.holdings.generation or self._host.holdings.gone)
 
     @property
-    def needs_life(self) -> bool:
-        return self._cell is not None and not self._host.holdings.life
+    def needs_generation(self) -> bool:
+        return self._cell is not None and not self._host.holdings.generation
 
     @property
     def refused(self) -> list[str]:
@@ -90,10 +91,10 @@ class Guest:
         there is none."""
         if self.cells:
             raise ValueError(f"it holds cell {self.cells[0]}: leave before it enters elsewhere")
-        if self.plots.of(cell) < 0:
-            raise ValueError(f"cell {cell} is outside the map of {self.plots.grid.cells} cells")
+        if self.shards.of(cell) < 0:
+            raise ValueError(f"cell {cell} is outside the map of {self.shards.grid.cells} cells")
         self._cell = cell
-        if self._host.holdings.life and not self.replaced:
+        if self._host.holdings.generation and not self.replaced:
             self._host.holdings.enter(self.vehicle, cell)
 
     def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
@@ -109,7 +110,7 @@ class Guest:
             where = f"cell {held[0]}" if held else "no cell"
             raise ValueError(f"the path must begin at the vehicle's cell: it holds {where}")
         for tail, head in pairwise(path):
-            if self.plots.of(head) < 0 or not self.plots.adjacent(tail, head):
+            if self.shards.of(head) < 0 or not self.shards.adjacent(tail, head):
                 raise ValueError(f"cell {head} of the path is not next to cell {tail}")
         same = next(
             (n for n, (a, b) in enumerate(zip(held, path, strict=False)) if a != b), min(len(held), len(path))
@@ -117,7 +118,7 @@ class Guest:
         if same < len(held):
             self._host.holdings.give_back(self.vehicle, same)
         self._path = tuple(path)
-        self._aside = tuple(cell for cell in aside if self.plots.adjacent(held[0], cell))
+        self._aside = tuple(cell for cell in aside if self.shards.adjacent(held[0], cell))
 
     def left(self, cell: int) -> None:
         """It has driven out of a cell, into the next that it holds. Raises ValueError if it holds none after it."""
@@ -128,7 +129,7 @@ class Guest:
         self._cell = self.cells[0]
 
     def leave(self) -> None:
-        """It stands nowhere any more: its cells are free for others once wardens have heard."""
+        """It stands nowhere any more: its cells are free for others once leaders have heard."""
         self._cell = None
         self._path = self._aside = ()
         self._host.holdings.leave(self.vehicle)
@@ -138,26 +139,26 @@ class Guest:
     @property
     def settled(self) -> bool:
         """True if no recovery query is pending."""
-        return not self.needs_life and self._host.informed
+        return not self.needs_generation and self._host.informed
 
     def hear_known(self, known: Known) -> None:
         """An agent's answer to `AskKnown`."""
-        self._host.hear_known(known.agent, known.life, known.plots)
+        self._host.hear_known(known.agent, known.generation, known.shards)
 
-    def begin(self, chance: int) -> list[GuestAction]:
-        """Begins a life, once all agents that could be asked have answered.
+    def begin(self, chance: int) -> list[ExternalAction]:
+        """Begins a generation, once all agents that could be asked have answered.
 
         chance  a random number
         """
-        if not self.needs_life:
+        if not self.needs_generation:
             return []
         assert self._cell is not None
-        self._lives = self._host.begin(self._lives, chance)
+        self._generations = self._host.begin(self._generations, chance)
         self._host.holdings.enter(self.vehicle, self._cell)
-        return [SaveLives(self._lives)]
+        return [SaveGenerations(self._generations)]
 
     def hear_granted(self, granted: Granted, now_ns: int) -> bool:
-        """A warden's word to us. Returns True if the vehicle has entered by it."""
+        """A leader's word to us. Returns True if the vehicle has entered by it."""
         return bool(self._host.hear_granted(granted, now_ns))
 
     def hear_left(self, left: Left) -> bool:
@@ -169,10 +170,10 @@ class Guest:
         self._host.hear_token(peer, up=up)
 
     def unled(self, now_ns: int) -> list[str]:
-        """Reason why it waits: plots of which no warden is heard."""
+        """Reason why it waits: shards of which no leader is heard."""
         return list(self._host.unled(now_ns).values())
 
-    def tick(self, now_ns: int) -> list[GuestAction]:
+    def tick(self, now_ns: int) -> list[ExternalAction]:
         """Returns the messages to send in this tick."""
         if self.replaced:
             # Not that it has ended, as a host would: its vehicle still stands there.
@@ -209,44 +210,45 @@ class Guest:
 
 
 class Removal:
-    """An operator's removal of a guest: neither it nor any process that represented it is in a cell any more.
+    """An operator's removal of an external vehicle: neither it nor any process that represented it is in a cell any
+    more.
 
-    It is a new life of the guest, which proves by the operator's word that all before it have ended, and holds
-    nothing. A process that still speaks for the guest stops as soon as it hears of it.
+    It is a new generation of the external vehicle, which proves by the operator's word that all before it have
+    ended, and holds nothing. A process that still speaks for the external vehicle stops as soon as it hears of it.
     """
 
-    def __init__(self, plots: Plots, name: str) -> None:
-        self.plots = plots
-        self._host = Host(plots, name, None)
-        self._lives: set[int] = set()
+    def __init__(self, shards: Shards, name: str) -> None:
+        self.shards = shards
+        self._host = Host(shards, name, None)
+        self._generations: set[int] = set()
 
     @property
     def known(self) -> bool:
-        """True if any reply knew this guest."""
-        return bool(self._lives)
+        """True if any reply knew this external vehicle."""
+        return bool(self._generations)
 
     @property
     def done(self) -> bool:
-        """True if every warden that had cells of the guest has freed them."""
-        return self._host.holdings.life > 0 and self._host.holdings.gone and self.settled
+        """True if every leader that had cells of the external vehicle has freed them."""
+        return self._host.holdings.generation > 0 and self._host.holdings.gone and self.settled
 
     @property
     def settled(self) -> bool:
-        """True if enough agents have replied that no plot can be missing."""
+        """True if enough agents have replied that no shard can be missing."""
         return self._host.informed
 
     @property
     def replaced(self) -> bool:
-        """True if the guest has begun a later life meanwhile."""
+        """True if the external vehicle has begun a later generation meanwhile."""
         return self._host.holdings.replaced
 
     def hear_known(self, known: Known) -> None:
-        self._lives.update(known.lives)
-        self._host.hear_known(known.agent, known.life, known.plots)
+        self._generations.update(known.generations)
+        self._host.hear_known(known.agent, known.generation, known.shards)
 
     def begin(self, chance: int) -> None:
         """Once all agents that could be asked have answered."""
-        self._host.begin(sorted(self._lives)[1 - LIVES_KEPT :], chance)
+        self._host.begin(sorted(self._generations)[1 - GENERATIONS_KEPT :], chance)
         self._host.holdings.end_at_once()
 
     def hear_granted(self, granted: Granted, now_ns: int) -> None:

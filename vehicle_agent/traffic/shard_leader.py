@@ -1,4 +1,5 @@
-"""The warden of a plot: it appends vehicles to the orders of cells, and removes them only by their host's own word.
+"""The leader of a shard: it appends vehicles to the orders of cells, and removes them only by their host's own
+word.
 
 An entry is never revoked, and no other is put before it (see docs/design/right-of-way.md for the proof). No vehicle
 waits for one that stays: it follows only those that have an entry behind the cell.
@@ -14,27 +15,28 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.right_of_way.host import LIVES_KEPT
-from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
-from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Granted, Number, Stamp, Stand, Standing, Table
+from swarm.right_of_way.host import GENERATIONS_KEPT
+from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.messages.traffic import Granted, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
 """Vehicles of a host that is silent for this time are obstacles: no vehicle waits for them or pushes them."""
 _AGE_BITS = 12
-"""Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
+"""Ages are compared in steps of 4 s: two leaders hear the same two at different times, and have to agree which is
 the older most of the time, or each lets its own wait for the other (docs/design/right-of-way.md)."""
-_TOLD_AGAIN_NS = 3 * BEAT_NS // 4
-"""Interval at which an unchanged grant is repeated: somewhat less than a beat, so that a beat carries it."""
-MOST_GUESTS = 256
-"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts
+_TOLD_AGAIN_NS = 3 * HEARTBEAT_NS // 4
+"""Interval at which an unchanged grant is repeated: somewhat less than a heartbeat, so that a heartbeat carries
+it."""
+MOST_EXTERNALS = 256
+"""External vehicles that one shard has ever known: their generations stay in its table, as those of all hosts
 (docs/design/external-vehicles.md)."""
-MOST_CELLS_OF_GUEST = 1024
-"""Cells of one plot that one guest holds (docs/design/external-vehicles.md)."""
-MOST_CELLS_OF_GUESTS = 1 << 14
-"""Cells of one plot that all guests together hold: a quarter of one as large as a region
+MOST_CELLS_OF_EXTERNAL = 1024
+"""Cells of one shard that one external vehicle holds (docs/design/external-vehicles.md)."""
+MOST_CELLS_OF_EXTERNALS = 1 << 14
+"""Cells of one shard that all external vehicles together hold: a quarter of one as large as a region
 (docs/design/external-vehicles.md)."""
 _NO_ENTRIES: Sequence[Number] = []
 _MOST_BEFORE = 2
@@ -69,16 +71,16 @@ def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
 class _Host:
     """Known state of a host.
 
-    standing  the newest of its newest life, and when it came; None if none counts
+    standing  the newest of its newest generation, and when it came; None if none counts
     stands    of that, vehicle -> its stand, for vehicles that the host may speak for
     asking    those of them that are at rest, or request more than they are granted; other vehicles under way
               request nothing now
-    spoke_ns  time of the last message, of any of its lives: a replaced one is informed
+    spoke_ns  time of the last message, of any of its generations: a replaced one is informed
     told      the last grant to it, and its time
     """
 
     spoke_ns: int
-    standing: Standing | None = None
+    standing: HostState | None = None
     stands: dict[str, Stand] = field(default_factory=dict)
     asking: Sequence[Stand] = ()
     heard_ns: int = 0
@@ -86,22 +88,23 @@ class _Host:
     told_ns: int = 0
 
 
-class Warden:
-    """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
+class Leader:
+    """Holds one shard's table in one epoch. Every `tick` may make a new one, which counts once a majority stored
+    it.
 
-    fleets  agent -> its vehicles, all of the scenario's. Any other host is a guest
+    fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
     (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
     """
 
     def __init__(
-        self, plots: Plots, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
+        self, shards: Shards, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
     ) -> None:
         self.epoch = epoch
         self.seq = 0
         self.refused: list[str] = []
-        self._plots = plots
-        self._plot = table.plot
+        self._shards = shards
+        self._shard = table.shard
         self._me = me
         self._fleets = fleets
         self._orders = Orders(table)
@@ -122,39 +125,45 @@ class Warden:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def take_standing(self, standing: Standing, now_ns: int) -> None:
+    def take_host_state(self, standing: HostState, now_ns: int) -> None:
         host = standing.agent
         if not self._is_welcome(host):
-            self.refused.append(f"plot {self._plot} has known {MOST_GUESTS} guests: {host} cannot enter")
+            self.refused.append(
+                f"shard {self._shard} has known {MOST_EXTERNALS} external vehicles: {host} cannot enter"
+            )
             return
         known = self._hosts.setdefault(host, _Host(now_ns))
         known.spoke_ns = now_ns
-        life, seq = self._orders.hosts.get(host, (0, 0))
+        generation, seq = self._orders.hosts.get(host, (0, 0))
         if standing.ended:
-            for ended in (*standing.dead, standing.life):
+            for ended in (*standing.dead, standing.generation):
                 self._granted |= self._orders.end(host, ended)
             return
-        if (standing.life, standing.seq) <= (life, seq):
+        if (standing.generation, standing.seq) <= (generation, seq):
             return
-        if is_far_ahead(standing.life, life):
-            self.refused.append(f"{host} names a life that is implausibly far ahead: {standing.life}")
+        if is_far_ahead(standing.generation, generation):
+            self.refused.append(f"{host} names a generation that is implausibly far ahead: {standing.generation}")
             return
-        fenced = self._orders.lives_of(host)
-        if standing.life != life and len(fenced) >= LIVES_KEPT and fenced.isdisjoint(standing.dead):
+        fenced = self._orders.generations_of(host)
+        if (
+            standing.generation != generation
+            and len(fenced) >= GENERATIONS_KEPT
+            and fenced.isdisjoint(standing.dead)
+        ):
             self.refused.append(f"{host} has {len(fenced)} lives here which are not known to have ended")
             return
-        if standing.life != life:
+        if standing.generation != generation:
             known.told = None
-            self.seq += 1  # two lives of one tick are given different entries
+            self.seq += 1  # two generations of one tick are given different entries
         if not standing.vehicles and (known.standing is None or known.standing.vehicles):
-            self._changed = True  # it leaves the plot as soon as a table counts this
+            self._changed = True  # it leaves the shard as soon as a table counts this
         stands = self._stands_of(standing)
         holds = {id: stand.holds for id, stand in stands.items()}
         bodies = {id: stand.cell for id, stand in stands.items() if _is_entering(stand)}
         before = self._orders.by_host_count(host)
-        self._granted |= self._orders.take_standing(
+        self._granted |= self._orders.take_host_state(
             host,
-            standing.life,
+            standing.generation,
             standing.seq,
             holds,
             standing.knows,
@@ -168,13 +177,14 @@ class Warden:
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
     def _is_welcome(self, host: str) -> bool:
-        """Returns True if there is room for this host: for each of the scenario, and for a number of guests."""
+        """Returns True if there is room for this host: for each of the scenario, and for a number of external
+        vehicles."""
         if host in self._fleets or host in self._orders.hosts or host in self._hosts:
             return True
         known = self._orders.hosts.keys() | self._hosts.keys()
-        return len(known - self._fleets.keys()) < MOST_GUESTS
+        return len(known - self._fleets.keys()) < MOST_EXTERNALS
 
-    def _stands_of(self, standing: Standing) -> dict[str, Stand]:
+    def _stands_of(self, standing: HostState) -> dict[str, Stand]:
         """Returns vehicle -> its stand, for vehicles that the host may speak for."""
         fleet = self._fleets.get(standing.agent)
         if fleet is None:
@@ -184,31 +194,31 @@ class Warden:
     # --- what is granted ------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> Table | None:
-        """Grants all possible requests. Returns the table if a host waits for a change in it, or once in a beat:
-        the same as before if it is unchanged."""
+        """Grants all possible requests. Returns the table if a host waits for a change in it, or once in a
+        heartbeat: the same as before if it is unchanged."""
         self._plan(now_ns)
-        if not self._granted and now_ns - self._told_ns < BEAT_NS:
+        if not self._granted and now_ns - self._told_ns < HEARTBEAT_NS:
             return None
         if self._told is None or self._granted or self._changed:
             self.seq += 1
-            self._told = self._orders.table(self._plot, self._me, (self.epoch, self.seq), self._pushed)
+            self._told = self._orders.table(self._shard, self._me, (self.epoch, self.seq), self._pushed)
         self._changed = self._granted = False
         self._told_ns = now_ns
         return self._told
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
-        beat old."""
+        heartbeat old."""
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
         current = table is self._told and not (self._granted or self._changed)
         orders = self._orders if current else Orders(table)
-        held, cols, followed = orders.orders.keys(), self._plots.grid.cols, orders.followed()
+        held, cols, followed = orders.orders.keys(), self._shards.grid.cols, orders.followed()
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
-            life, heard = table.hosts.get(name, (0, 0))
+            generation, heard = table.hosts.get(name, (0, 0))
             grants = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
@@ -217,17 +227,17 @@ class Warden:
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             behind = followed.get(name, {})
-            says = (life, grants, behind, pushed, occupied, 0 if stands else heard)
+            says = (generation, grants, behind, pushed, occupied, 0 if stands else heard)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
                 continue
             host.told, host.told_ns = says, now_ns
             yield Granted(
-                plot=table.plot,
+                shard=table.shard,
                 host=name,
                 agent=table.agent,
                 epoch=table.epoch,
                 seq=table.seq,
-                life=life,
+                generation=generation,
                 heard=heard,
                 grants=grants,
                 followed=behind,
@@ -257,7 +267,7 @@ class Warden:
         round = Round(
             list(movers.values()),
             lambda cell: self._stays(cell, movers),
-            lambda cell: self._plots.of(cell) == self._plot,
+            lambda cell: self._shards.of(cell) == self._shard,
             self._orders.onward,
         )
         for stand in asking:
@@ -301,9 +311,9 @@ class Warden:
         stand, entries = self._stands.get(vehicle), self._orders.entries(vehicle)
         if stand is None or number not in entries or self._orders.is_fenced(number[0]):
             return False
-        # Into a plot of a greater number only: no warden sees circles over two, and so there are none.
+        # Into a shard of a greater number only: no leader sees circles over two, and so there are none.
         return number != entries[-1] or (
-            number[0] != stand.end and number in stand.holds and self._plots.of(stand.end) > self._plot
+            number[0] != stand.end and number in stand.holds and self._shards.of(stand.end) > self._shard
         )
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
@@ -319,12 +329,12 @@ class Warden:
         orders, vehicle = self._orders, stand.vehicle
         for cell in ahead:
             mine = taken.setdefault(cell, vehicle) == vehicle
-            if not mine or self._plots.of(cell) != self._plot:
+            if not mine or self._shards.of(cell) != self._shard:
                 return
             order = orders.order(cell)
             if order and not self._may_follow(stand, order):
                 return
-            if len(orders.entries(vehicle)) >= _MOST_CELLS or not self._guest_may_hold_more(vehicle):
+            if len(orders.entries(vehicle)) >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
                 return
             if not orders.append(vehicle, cell, self._next_stamp):
                 return
@@ -342,13 +352,16 @@ class Warden:
             and not self._orders.would_circle(stand.vehicle, number[0])
         )
 
-    def _guest_may_hold_more(self, vehicle: str) -> bool:
-        """Returns True if neither this guest nor all together hold their share; true of vehicles of the
+    def _external_may_hold_more(self, vehicle: str) -> bool:
+        """Returns True if neither this external vehicle nor all together hold their share; true of vehicles of the
         scenario."""
         host = agent_of(vehicle)
         if host in self._fleets:
             return True
         fleets, count = self._fleets, self._orders.by_host_count
-        if count(host) >= MOST_CELLS_OF_GUEST:
+        if count(host) >= MOST_CELLS_OF_EXTERNAL:
             return False
-        return sum(count(guest) for guest in self._orders.by_host if guest not in fleets) < MOST_CELLS_OF_GUESTS
+        return (
+            sum(count(external) for external in self._orders.by_host if external not in fleets)
+            < MOST_CELLS_OF_EXTERNALS
+        )

@@ -1,0 +1,249 @@
+"""An external vehicle's side of right of way, and the bounds that leaders set to external vehicles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from swarm.errors import ConfigError, DamagedError, StoreError
+from swarm.grid import GridSpec
+from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
+from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.incarnations import GenerationFile, MemoryGenerations
+from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.traffic import Fence, Granted, HostState, Known, Stand, Table
+from vehicle_agent.traffic import leader as leaders
+from vehicle_agent.traffic.shard_leader import Leader
+
+GRID = GridSpec(64, 64, 1.0)
+SHARDS = Shards(GRID, ["a0", "a1", "a2"])
+FLEETS = {"a0": ["a0-00"], "a1": ["a1-00"], "a2": ["a2-00"]}
+
+
+def leader_of(**of: object) -> Leader:
+    fields: dict[str, object] = {"hosts": {}, "grants": {}, **of}
+    table = Table(shard=0, agent="a0", epoch=3, seq=1, **fields)  # type: ignore[arg-type]
+    return Leader(SHARDS, SHARDS.leader(0, 6), 6, table, FLEETS)
+
+
+def entering(
+    name: str, cell: int, seq: int = 1, ahead: list[int] | None = None, generation: int = 1 << 32
+) -> HostState:
+    stand = Stand(f"{name}-00", cell, cell, [], ahead or [cell], [], 0, 0)
+    return HostState(shard=0, agent=name, generation=generation, seq=seq, knows=(0, 0), vehicles=[stand])
+
+
+def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
+    external, leader = ExternalVehicle(SHARDS, "rover"), leader_of()
+    external.enter(cell)
+    external.begin(7)
+    talk(external, leader)
+    assert external.cells == (cell,)
+    return external, leader
+
+
+def talk(external: ExternalVehicle, leader: Leader, now_ns: int = 0) -> None:
+    """Passes messages between the external vehicle and the leader as if they were on file."""
+    for action in external.tick(now_ns):
+        assert isinstance(action, Tell)
+        leader.take_host_state(action.standing, now_ns)
+    table = leader.tick(now_ns)
+    if table is not None:
+        for granted in leader.granted(table, now_ns):
+            external.hear_granted(granted, now_ns)
+
+
+def test_it_enters_drives_on_what_it_is_granted_and_gives_back_what_it_does_not_want_any_more() -> None:
+    external, leader = entered()
+    external.want([70, 71, 72, 73])
+    talk(external, leader, 1)
+    assert external.cells == (70, 71, 72, 73)
+    external.left(70)
+    assert external.cells == (71, 72, 73)
+    external.want([71, 72, 136])
+    assert external.cells == (71, 72)
+    external.leave()
+    assert external.cells == ()
+    assert not external.gone
+    for heartbeat in range(1, 4):
+        talk(external, leader, heartbeat * 300_000_000)
+    assert external.gone
+
+
+def test_what_a_driver_says_wrong_is_one_sentence() -> None:
+    external = ExternalVehicle(SHARDS, "rover")
+    with pytest.raises(ValueError, match="cell 9999 is outside the map of 4096 cells"):
+        external.enter(9999)
+    with pytest.raises(ValueError, match="it holds no cell"):
+        external.want([1, 2])
+    external, _ = entered()
+    with pytest.raises(ValueError, match="it holds cell 70: leave before it enters elsewhere"):
+        external.enter(3)
+    with pytest.raises(ValueError, match="must begin at the vehicle's cell: it holds cell 70"):
+        external.want([71])
+    with pytest.raises(ValueError, match="cell 80 of the path is not next to cell 70"):
+        external.want([70, 80])
+    with pytest.raises(ValueError, match="cannot have left cell 70"):
+        external.left(70)
+
+
+def test_a_name_that_cannot_be_a_part_of_a_key_is_refused() -> None:
+    with pytest.raises(ConfigError, match="external vehicle 'my rover-00'"):
+        ExternalService("my rover", GRID, 1, MemoryGenerations(), None, print, print)  # type: ignore[arg-type]
+
+
+def test_a_host_may_speak_for_vehicles_of_its_own_name_only() -> None:
+    leader = leader_of()
+    lie = entering("rover", 70)
+    for vehicle in ("a1-00", "other-00", "rover2-00"):
+        stand = Stand(vehicle, 70, 70, [], [70], [], 0, 0)
+        leader.take_host_state(
+            HostState(shard=0, agent="rover", generation=5, seq=lie.seq, knows=(0, 0), vehicles=[stand]), 0
+        )
+        table = leader.tick(0)
+        assert table is None or not table.grants
+
+
+def test_no_external_vehicle_and_not_all_together_take_all_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    leader = leader_of()
+    leader.take_host_state(entering("rover", 0), 0)
+    leader.tick(0)
+    for seq in range(2, 12):  # one vehicle that never moves and always wants more
+        held = list(leader._orders.of["rover-00"])
+        end = held[-1][0]
+        ahead = list(range(end + 1, end + 13))
+        stand = Stand("rover-00", 0, end, held, ahead, ahead[:1], 1, 0)
+        leader.take_host_state(
+            HostState(shard=0, agent="rover", generation=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0
+        )
+        leader.tick(0)
+    table = leader.tick(1 << 40)
+    assert table is not None
+    assert len(table.grants["rover-00"]) == 64
+    decode(encode(table), Table)
+
+    monkeypatch.setattr(leaders, "MOST_CELLS_OF_EXTERNAL", 3)
+    monkeypatch.setattr(leaders, "MOST_CELLS_OF_EXTERNALS", 5)
+    leader = leader_of()
+    for n in range(4):
+        leader.take_host_state(entering(f"r{n}", 8 * n, ahead=[8 * n, 8 * n + 1, 8 * n + 2, 8 * n + 3]), 0)
+    table = leader.tick(0)
+    assert table is not None
+    held = sorted(len(numbers) for numbers in table.grants.values())
+    assert sum(held) == 5
+    assert held[-1] == 3
+
+
+def test_a_shard_knows_so_many_external_vehicles_and_says_whom_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leaders, "MOST_EXTERNALS", 2)
+    leader = leader_of(hosts={"a1": (1, 1), "r0": (1, 1)})
+    for n in (1, 2, 0, 1):
+        leader.take_host_state(entering(f"r{n}", 8 * n, seq=n + 5), 0)
+    assert leader.refused == ["shard 0 has known 2 external vehicles: r2 cannot enter"]
+    table = leader.tick(0)
+    assert table is not None
+    assert set(table.grants) == {"r0-00", "r1-00"}
+    leader.take_host_state(
+        HostState(shard=0, agent="a2", generation=1, seq=1, knows=(0, 0), vehicles=[]), 0
+    )  # of the scenario
+    assert len(leader.refused) == 1
+
+
+def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_its_next_generation_enters_again() -> (
+    None
+):
+    external, leader = entered()
+    leader._orders.fenced["rover", 77] = {"rover-00": [(90, 1, 1), (91, 1, 1)]}
+    generations = [77, leader._orders.hosts["rover"][0]]
+    removal = Removal(SHARDS, "rover")
+    for agent in SHARDS.agents:
+        known = Known(
+            agent=agent,
+            disk=0,
+            generation=generations[1],
+            shards=[0],
+            agents=list(SHARDS.agents),
+            generations=generations,
+        )
+        removal.hear_known(known)
+    assert removal.known
+    assert removal.settled
+    removal.begin(3)
+    for heartbeat in range(1, 6):
+        now_ns = heartbeat * 300_000_000
+        for told in removal.tick(now_ns):
+            leader.take_host_state(told.standing, now_ns)
+        table = leader.tick(now_ns)
+        assert table is not None
+        for granted in leader.granted(table, now_ns):
+            removal.hear_granted(granted, now_ns)
+            external.hear_granted(granted, now_ns)
+    assert removal.done
+    assert not table.grants
+    assert not table.fences
+    assert external.replaced
+    assert external.cells == ()
+
+    back = ExternalVehicle(SHARDS, "rover", [generations[1]])
+    for agent in SHARDS.agents:
+        generation, _ = leader._orders.hosts["rover"]
+        back.hear_known(Known(agent=agent, disk=0, generation=generation, shards=[], agents=[], generations=[]))
+    back.enter(90)
+    back.begin(9)
+    talk(back, leader, 2_000_000_000)
+    assert back.cells == (90,)
+    table = leader.tick(3_000_000_000)
+    assert table is not None
+    assert table.fences == []  # no vehicle drove by the operator's incarnation
+
+
+def test_a_replaced_external_vehicle_says_nothing_and_takes_nothing() -> None:
+    external, _ = entered()
+    told = Granted(shard=0, host="rover", agent=SHARDS.leader(0, 6), epoch=6, seq=50, generation=1 << 40, heard=0)
+    external.hear_granted(told, 5)
+    assert external.replaced
+    assert external.tick(6) == []
+    assert external.cells == ()
+
+
+def test_what_was_shut_for_an_external_vehicle_is_opened_only_by_a_generation_that_counts_and_is_its_own_first() -> (
+    None
+):
+    held = {"rover-00": [(70, 1, 1), (71, 1, 1)]}
+    leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, held)])
+    older = entering("rover", 70, generation=1 << 33)
+    leader.take_host_state(HostState(**{**fields_of(older), "dead": [5]}), 0)
+    assert leader._orders.fenced == {("rover", 5): held}
+    leader.take_host_state(entering("a1", 71), 0)
+    younger = entering("rover", 70, generation=(1 << 40) + 1)
+    leader.take_host_state(HostState(**{**fields_of(younger), "dead": [5]}), 0)
+    table = leader.tick(0)
+    assert table is not None
+    assert table.grants["rover-00"] == [(70, 1, 1)]
+
+
+def fields_of(standing: HostState) -> dict[str, object]:
+    return {name: getattr(standing, name) for name in standing.__struct_fields__}
+
+
+def test_generations_are_on_file_before_they_speak_and_one_process_has_the_file(tmp_path: Path) -> None:
+    generations = GenerationFile(tmp_path / "deep" / "rover")
+    generations.save([4, 9])
+    with pytest.raises(StoreError, match="is in use"):
+        GenerationFile(tmp_path / "deep" / "rover")
+    generations.close()
+    again = GenerationFile(tmp_path / "deep" / "rover")
+    assert again.generations == [4, 9]
+    again.close()
+    older = tmp_path / "older"
+    older.write_text("4\nnine\n")
+    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1'"):
+        GenerationFile(older)
+    older.write_text("4\n9\n")
+    for _ in range(2):
+        again = GenerationFile(older)
+        assert again.generations == [4, 9]
+        again.close()

@@ -1,0 +1,152 @@
+"""The grants, releases and messages of a shard's leader."""
+
+from __future__ import annotations
+
+from support.shard_tables import (
+    SHARDS,
+    S,
+    cells_of,
+    entries,
+    standing,
+    table_of,
+)
+
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.incarnations import HEARTBEAT_NS, first_generation, is_far_ahead
+from swarm.wire.messages.traffic import Stand
+from vehicle_agent.traffic.shard_leader import Leader
+
+
+def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
+    leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10, (11, 1, 2)]), {"a1": ["a1-00"]})
+    assert cells_of(leader.tick(0), "a1-00") == [9, 10, 11]
+    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=2, knows=(1, 1)), 0)
+    assert cells_of(leader.tick(S), "a1-00") == [10, 11]
+    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=1), 0)  # late
+    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), 0)  # of before the last grant
+    assert cells_of(leader.tick(2 * S), "a1-00") == [10, 11]
+    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
+    assert cells_of(leader.tick(3 * S), "a1-00") == [10]
+
+
+def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_dead() -> None:
+    nine = entries(1, 1, 9)
+    for end in (standing("a1", nine, seq=9, ended=True), standing("a1", nine, seq=9, generation=1 << 33, dead=[1])):
+        leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
+        leader.take_host_state(standing("a1", nine, seq=1, generation=1 << 32, vehicles=[]), 0)
+        table = leader.tick(0)
+        assert table is not None
+        assert [(each.agent, each.generation, each.entries) for each in table.fences] == [
+            ("a1", 1, {"a1-00": entries(1, 1, 9, 10)})
+        ]
+        assert table.grants["a1-00"] == [(9, 3, 2)]  # a new one, behind that of the older generation
+        leader.take_host_state(end, 0)
+        assert all(each.generation != 1 for each in leader.tick(S).fences)  # type: ignore[union-attr]
+
+
+def test_the_entry_of_a_body_passes_to_the_generation_that_proves_the_older_one_ended() -> None:
+    for dead, cells in (([1], [(10, 1, 1)]), ([], [])):
+        leader = Leader(SHARDS, "a0", 3, table_of(1, 1, rover=[9, 10]), {"a1": ["a1-00"]})
+        stands = Stand("rover-00", 10, 10, [], [10], [], 0, 0)
+        leader.take_host_state(
+            standing("rover", [(10, 0, 0)], 1, generation=1 << 32, dead=dead, vehicles=[stands]), 0
+        )
+        table = leader.tick(0)
+        assert table is not None
+        assert table.grants.get("rover-00", []) == cells
+
+
+def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_heard_the_younger() -> None:
+    """The younger has died, and the leader knows of it by the table only."""
+    table = table_of(1, 1, a1=[9])
+    table.hosts["a1"] = (2 << 32, 7)
+    leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
+    for late in (standing("a1", [(9, 1, 1)], seq=50), standing("a1", [(9, 1, 1)], seq=51, ended=True)):
+        leader.take_host_state(late, S)
+        told = leader.tick(S)
+        (granted,) = leader.granted(table if told is None else told, S)
+        assert (granted.host, granted.generation) == ("a1", 2 << 32)
+        leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
+    older = Holdings(SHARDS, "a1", ["a1-00"])
+    older.begin(1, [])
+    older.watch([0])
+    older.hear_granted(granted, S)
+    assert older.replaced
+
+
+def test_a_generation_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
+    leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9]), {"a1": ["a1-00"]})
+    leader.take_host_state(standing("a1", [(9, 1, 1)], seq=1, generation=1 << 61), 0)
+    assert "a1 names a generation" in leader.refused[0]
+    assert leader.tick(0).hosts["a1"] == (1, 1)  # type: ignore[union-attr]
+    assert first_generation(5 << 32 | 7, 1) > 5 << 32 | 0xFFFF_FFFF
+    assert not is_far_ahead(first_generation(0, 3), 0)
+
+
+def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
+    """All agents that began the run together have one age: vehicles of the last agent must not always give way."""
+    places = {"a0": 18, "a1": 19, "a2": 20, "a3": 26, "a4": 28}
+    first = set()
+    for step in range(30):
+        held = table_of(1, 1, **{host: [cell] for host, cell in places.items()})
+        leader = Leader(SHARDS, "a0", 3, held, {host: [f"{host}-00"] for host in places})
+        for host, cell in places.items():
+            stand = Stand(f"{host}-00", cell, cell, [(cell, 1, 1)], [27], [27], 1, step << 12)
+            leader.take_host_state(standing(host, [(cell, 1, 1)], seq=2, vehicles=[stand]), 0)
+        table = leader.tick(0)
+        assert table is not None
+        first.update(vehicle for vehicle in table.grants if 27 in cells_of(table, vehicle))
+    assert first == set(held.grants)
+
+
+def plan(stands: dict[str, Stand]) -> dict[str, list[int]]:
+    """The cells of each vehicle in a leader's first table; vehicles hold what their stands say."""
+    held = table_of(1, 1, **{host: list(stand.holds) for host, stand in stands.items()})
+    leader = Leader(SHARDS, "a0", 3, held, {host: [f"{host}-00"] for host in stands})
+    for host, stand in stands.items():
+        leader.take_host_state(standing(host, list(stand.holds), seq=2, vehicles=[stand]), 0)
+    table = leader.tick(0)
+    assert table is not None
+    return {vehicle: cells_of(table, vehicle) for vehicle in table.grants}
+
+
+def stand_of(host: str, cells: list[int], ahead: list[int] = [], wants: list[int] = [], age: int = 0) -> Stand:  # noqa: B006
+    return Stand(f"{host}-00", cells[0], cells[-1], entries(1, 1, *cells), ahead, wants, len(wants), age << 12)
+
+
+def test_a_vehicle_follows_one_that_goes_on_and_none_that_stays() -> None:
+    drives = {"a1": stand_of("a1", [9, 10], ahead=[11]), "a2": stand_of("a2", [8], wants=[9, 16])}
+    assert plan(drives) == {"a1-00": [9, 10, 11], "a2-00": [8, 9]}
+    stays = {"a1": stand_of("a1", [9]), "a2": stand_of("a2", [8], wants=[9, 16])}
+    assert plan(stays)["a2-00"] == [8, 16]
+
+
+def test_who_is_pushed_and_who_pushes_are_granted_their_cells_by_one_table() -> None:
+    pushed = {"a1": stand_of("a1", [9], wants=[10]), "a2": stand_of("a2", [8], wants=[9], age=9)}
+    assert plan(pushed) == {"a1-00": [9, 10], "a2-00": [8, 9]}
+
+
+def test_no_two_exchange_places_and_none_go_around_in_a_ring() -> None:
+    swap = {"a1": stand_of("a1", [9], wants=[8]), "a2": stand_of("a2", [8], wants=[9], age=9)}
+    assert plan(swap) == {"a1-00": [9], "a2-00": [8]}
+    cells = {"a1": (9, 10), "a2": (10, 18), "a3": (18, 17), "a4": (17, 9)}
+    ring = {host: stand_of(host, [here], wants=[there]) for host, (here, there) in cells.items()}
+    assert plan(ring) == {f"{host}-00": [here] for host, (here, _) in cells.items()}
+
+
+def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_heartbeat() -> None:
+    leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
+    first = leader.tick(0)
+    assert first is not None
+    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=2), 0)
+    assert leader.tick(HEARTBEAT_NS // 2) is None
+    assert leader.tick(HEARTBEAT_NS) is first
+    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), HEARTBEAT_NS)
+    assert leader.tick(HEARTBEAT_NS + 1) is None  # a mere release can wait
+    freed = leader.tick(2 * HEARTBEAT_NS)
+    assert freed is not None
+    assert (freed.seq, freed.hosts["a1"], cells_of(freed, "a1-00")) == (2, (1, 3), [10])
+    leader.take_host_state(
+        standing("a1", entries(1, 1, 10), seq=4, vehicles=[]), 2 * HEARTBEAT_NS
+    )  # it wants nothing here any more
+    assert leader.tick(3 * HEARTBEAT_NS).hosts["a1"] == (1, 4)  # type: ignore[union-attr]
