@@ -37,8 +37,8 @@ class Patches:
 
     labels    int32 (rows, cols), 1 .. count; 0 is no patch
     height_m  float32 (count + 1,), of the first cell of each; NaN of number 0
-    spread_m  float32 (count + 1,), of an even slope whose heights vary as much, as ripples of a filter
-              are few; of means, from the lowest to the highest
+    spread_m  float32 (count + 1,), of an even slope whose heights vary as much: the lowest and the highest
+              of many cells tell of their number
     cells     int64 (count + 1,)
     edge      int64 (count + 1,): sides of its cells beyond which another cell lies
     differ    of these, those with another height beyond: the visible part of its shore
@@ -92,7 +92,6 @@ def level_patches(
         elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE_MEANS if means else _LEAST_ALIKE
     )
     many = len(cells)
-    from scipy import ndimage
 
     first = np.full(many, np.nan, np.float32)
     at = np.flatnonzero(labels)[::-1]  # backwards: the value of a patch's first cell is written last
@@ -105,9 +104,6 @@ def level_patches(
         total_m2 += np.bincount(of_cell, above_m**2, many)
     variance = total_m2 / np.maximum(cells, 1) - (total_m / np.maximum(cells, 1)) ** 2
     spread_m = np.sqrt(12 * np.maximum(variance, 0)).astype(np.float32)
-    if means:
-        each = np.arange(many)
-        spread_m = ndimage.maximum(elevation_m, labels, each) - ndimage.minimum(elevation_m, labels, each)
     if shore_m is None:
         shore_m = elevation_m
         _grow(elevation_m, labels, first)

@@ -76,12 +76,8 @@ def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float
     It is taken over a cell and its neighbours: so a straight flight between the centres of two neighbours keeps it,
     too, over any ground that is nowhere higher than the cells around it.
     """
-    rows, cols = elevation_m.shape
-    padded = np.pad(elevation_m.astype(np.float64), 1, mode="edge")
-    highest = padded[1:-1, 1:-1].copy()
-    for south in range(3):
-        for east in range(3):
-            np.maximum(highest, padded[south : south + rows, east : east + cols], out=highest)  # NaN stays
+    around_m = np.lib.stride_tricks.sliding_window_view(np.pad(elevation_m, 1, mode="edge"), (3, 3))
+    highest: NDArray[np.float64] = around_m.max(axis=(2, 3)).astype(np.float64)  # NaN stays
     return highest + clearance_m
 
 

@@ -30,7 +30,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.terrain.row_bands import in_bands
+from shared_map.terrain.row_bands import in_bands, padded_rows
 from shared_map.terrain.slope_rules import along_slope_factor, slope_factor
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
@@ -84,18 +84,12 @@ READABLE = (
 lowest."""
 
 
-def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
-    """Horn's derivative, metres per metre: (to the east, to the north).
-
-    The weights 1 2 1 over 3 x 3 cells, as in GDAL. At the border the ground goes on as steep as it is; a void (NaN)
-    beside a cell counts as level with it.
-    """
-    padded = np.pad(elevation_m, 1, mode="reflect", reflect_type="odd")
-    return gradient_of_padded(padded, resolution_m)
-
-
 def gradient_of_padded(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
-    """`gradient` of an array that brings its own border of one cell."""
+    """Horn's derivative, metres per metre: (to the east, to the north), of an array that brings its own border of
+    one cell (`row_bands.padded_rows`).
+
+    The weights 1 2 1 over 3 x 3 cells, as in GDAL. A void (NaN) beside a cell counts as level with it.
+    """
     if np.isnan(padded_m).any():
         return _gradient_beside_voids(padded_m, resolution_m)
     scale = np.float32(1.0 / (8.0 * resolution_m))
@@ -135,9 +129,14 @@ def _gradient_beside_voids(padded_m: Floats, resolution_m: float) -> tuple[Float
 
 
 def grade(elevation_m: Floats, resolution_m: float) -> Floats:
-    """Steepest rise over run of each cell."""
-    east, north = gradient(elevation_m, resolution_m)
-    return _hypot(east, north)
+    """Steepest rise over run of each cell. At the border the ground goes on as steep as it is."""
+    steepness = np.empty(elevation_m.shape, np.float32)
+
+    def work(row0: int, row1: int) -> None:
+        steepness[row0:row1] = grade_of_padded(padded_rows(elevation_m, row0, row1), resolution_m)
+
+    in_bands(elevation_m.shape[0], work)
+    return steepness
 
 
 def _hypot(east: Floats, north: Floats) -> Floats:

@@ -186,15 +186,6 @@ def _naismith_langmuir(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return factor
 
 
-def polynomial(rise: Floats, coefficients: tuple[float, ...]) -> Floats:
-    """By Horner's rule, from the highest power down."""
-    value: Floats = np.full_like(rise, coefficients[0])
-    for each in coefficients[1:]:
-        value *= rise
-        value += np.float32(each)
-    return value
-
-
 MINETTI = (280.5, -58.7, -76.8, 51.9, 19.6, 2.5)
 """J per kg and metre of way, by the gradient; of walking."""
 MINETTI_STEEPEST = 0.45
@@ -207,7 +198,7 @@ def _minetti(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     end."""
     steepest = np.float32(MINETTI_STEEPEST)
     inside = np.clip(rise, -steepest, steepest)
-    joules = polynomial(inside, MINETTI)
+    joules = np.polyval(np.array(MINETTI, np.float32), inside)
     along = np.sqrt(np.float32(1) + inside * inside)
     # Per metre of height the same as at the end: per metre of the map it grows with the rise.
     beyond = np.maximum(np.abs(rise) / steepest, np.float32(1))
@@ -223,8 +214,8 @@ def _herzog(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     """Walking at constant metabolic power, by Herzog's polynomial through Minetti's data: it stays positive on all
     slopes, and is for those of up to 50 %."""
     # Beyond a grade of 2 the bound is reached anyway, and float32 would overflow.
-    factor: Floats = polynomial(np.clip(rise, -2, 2), HERZOG) / np.float32(HERZOG[-1])
-    return factor
+    joules = np.polyval(np.array(HERZOG, np.float32), np.clip(rise, -2, 2))
+    return np.asarray(joules / np.float32(HERZOG[-1]), np.float32)
 
 
 def _herzog_wheeled(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared_map.array_files import Bytes, Floats
-from shared_map.terrain import layers
-from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient_of_padded
+from shared_map.terrain.layers import TerrainClass, grade, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.synthetic.noise import fractal_noise, mountain_noise
 from shared_map.terrain.synthetic.rivers import carve
@@ -116,15 +115,15 @@ def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
     """
     rows, cols = elevation_m.shape
     rng = np.random.default_rng([seed, 2])
-    grade = _grade(elevation_m, resolution_m)
+    steepness = grade(elevation_m, resolution_m)
     patches = fractal_noise(rng, rows, cols, max(min(rows, cols) / 12, 4.0))
-    known = grade[~np.isnan(elevation_m)]
+    known = steepness[~np.isnan(elevation_m)]
     steep = np.quantile(known, 0.985) if known.size else 1.0
     gentle = np.quantile(known, 0.30) if known.size else 0.0
     classes = np.full((rows, cols), TerrainClass.GRASS, np.uint8)
 
     def work(row0: int, row1: int) -> None:
-        here, slope, patch = classes[row0:row1], grade[row0:row1], patches.band(row0, row1)
+        here, slope, patch = classes[row0:row1], steepness[row0:row1], patches.band(row0, row1)
         here[(slope > gentle) & (patch > -0.12)] = TerrainClass.FOREST
         here[(slope <= gentle) & (patch < -0.35)] = TerrainClass.SOIL
         here[slope > max(float(steep), 0.3)] = TerrainClass.ROCK
@@ -132,19 +131,6 @@ def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
 
     in_bands(rows, work)
     return classes
-
-
-def _grade(elevation_m: Floats, resolution_m: float) -> Floats:
-    """`layers.grade`, to the bit, in bands where no void makes that depend on the whole."""
-    if np.isnan(elevation_m).any():
-        return layers.grade(elevation_m, resolution_m)
-    steepness = np.empty(elevation_m.shape, np.float32)
-
-    def work(row0: int, row1: int) -> None:
-        steepness[row0:row1] = grade_of_padded(padded_rows(elevation_m, row0, row1), resolution_m)
-
-    in_bands(elevation_m.shape[0], work)
-    return steepness
 
 
 LEVEL_LIGHT = 0.70710678

@@ -13,12 +13,13 @@ from shared_map.importers.sources import load_source
 from shared_map.terrain.layers import (
     CLASS_FACTOR,
     TerrainClass,
-    gradient,
+    gradient_of_padded,
     polygon_mask,
     roughness_of_padded,
     slope_deg,
     terrain_pace,
 )
+from shared_map.terrain.row_bands import padded_rows
 from shared_map.terrain.slope_rules import slope_factor
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
@@ -43,6 +44,10 @@ def ruled(rule: str, **cost: object) -> CostConfig:
     return CostConfig(slope_rule=rule, slope_table=POINTS if rule == "table" else (), **cost)
 
 
+def whole(heights_m: np.ndarray) -> np.ndarray:
+    return padded_rows(heights_m, 0, len(heights_m))
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_slope_is_scikit_images_derivative_within_1e_5(name: str) -> None:
     from skimage.filters import sobel_h, sobel_v
@@ -52,7 +57,7 @@ def test_slope_is_scikit_images_derivative_within_1e_5(name: str) -> None:
     source = load_source(TerrainConfig(source=MODELS[name]), 1)
     heights, step = source.elevation_m.astype(np.float64), source.grid.resolution_m
     theirs_east, theirs_south = sobel_v(heights) / (2 * step), sobel_h(heights) / (2 * step)
-    ours_east, ours_north = gradient(source.elevation_m, step)
+    ours_east, ours_north = gradient_of_padded(whole(source.elevation_m), step)
     inner = (slice(1, -1), slice(1, -1))
     np.testing.assert_allclose(ours_east[inner], theirs_east[inner], rtol=0, atol=1e-5)
     np.testing.assert_allclose(ours_north[inner], -theirs_south[inner], rtol=0, atol=1e-5)
@@ -63,7 +68,7 @@ def test_slope_is_scikit_images_derivative_within_1e_5(name: str) -> None:
 
 def test_a_plane_has_its_slope_everywhere_the_border_too() -> None:
     row, col = np.mgrid[:9, :7]
-    east, north = gradient((100 + 3.0 * col - 4.0 * row).astype(np.float32), 10.0)
+    east, north = gradient_of_padded(whole((100 + 3.0 * col - 4.0 * row).astype(np.float32)), 10.0)
     np.testing.assert_allclose(east, 0.3, atol=1e-6)
     np.testing.assert_allclose(north, 0.4, atol=1e-6)
 
@@ -72,7 +77,7 @@ def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
     row, _ = np.mgrid[:9, :9]
     heights = (row * 2.0).astype(np.float32)
     heights[4, 4] = np.nan
-    east, north = gradient(heights, 10.0)
+    east, north = gradient_of_padded(whole(heights), 10.0)
     known = ~np.isnan(heights)
     assert np.isfinite(east[known]).all()
     np.testing.assert_allclose(north[0:3], -0.2, atol=1e-6)

@@ -109,6 +109,8 @@ REAL = {
     "coast of bigtujunga": lambda: flooded("bigtujunga/bigtujunga_512.tif", 0.3),
 }
 SAME = [name for name in MODELS if name.startswith(("coast", "lakes", "reservoir", "delta"))]
+SMALL = ("lakes, laser, +-0.1 m on water", "lakes, warped by a cubic filter")
+"""Models of which 2 to 4 % are lakes of some ten cells across: 4 x 4 cells, and a cell of a shore, count."""
 
 
 @pytest.mark.parametrize("name", [*REAL, *SAME])
@@ -118,7 +120,7 @@ def test_water_is_the_same_after_a_resampling(name: str, how: str, factors: tupl
     before = level_ground(heights_m).mask.mean()
     for factor in factors:
         after = level_ground(resampled(heights_m, factor, how)).mask.mean()
-        assert after == pytest.approx(before, rel=0.02), factor
+        assert after == pytest.approx(before, rel=0.035 if name in SMALL else 0.02), factor
 
 
 @pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
