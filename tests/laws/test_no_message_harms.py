@@ -330,7 +330,7 @@ def test_the_whole_run_searches_pulls_and_flies_and_lies_reach_classes_and_what_
     grid, keeper, planner = swarm.terrain.grid, swarm.services["keeper-0"], swarm.services["planner-t"]
     held = [grid.class_of_tile(tile) for tile in keeper.replica.held.tiles]
     assert {number for number, tile in held if tile < grid.tiles} >= {0, 1, 2}
-    assert (planner._cost_map.factors != 1).any()
+    assert (planner._cost_maps["ground"].factors != 1).any()
     swarm.close()
 
 
@@ -370,7 +370,7 @@ def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -
     grid = swarm.terrain.grid
     planner, keeper = swarm.services[f"planner-{swarm.target}"], swarm.services["keeper-0"]
     # A lie may have closed any cell: anybody may put a mark.
-    home = int(np.flatnonzero(np.isfinite(planner._cost_map.pace_s_per_m))[0])
+    home = int(np.flatnonzero(np.isfinite(planner._cost_maps["ground"].pace_s_per_m))[0])
     [reply] = swarm.routes(home)
     assert reply.target_cell is not None
     assert grid.distance_cells(reply.target_cell, truth) <= 3
@@ -385,6 +385,6 @@ def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -
     row, col = grid.row_col(home)
     writer.sync.publish(writer.replica.write([home], MarkKind.PACE, 7.0, swarm.now_ns))
     swarm.run(2)
-    assert planner._cost_map.pace_s_per_m[row, col] == 7.0
+    assert planner._cost_maps["ground"].pace_s_per_m[row, col] == 7.0
     assert keeper.replica.held.get(grid.tile_of(home), "all.w.1") is not None
     swarm.close()

@@ -20,7 +20,7 @@ def check_all(simulation: Simulation) -> LawBook:
     trial = LawBook(simulation)
     assert trial.run(SECONDS) == []
     planners: list[np.ndarray] = [
-        simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]
+        simulation.nodes[name].service._cost_maps["ground"].pace_s_per_m  # type: ignore[union-attr]
         for name in ("planner-t0", "planner-t1")
     ]
     np.testing.assert_array_equal(*planners)
