@@ -95,6 +95,12 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     finer = elevation_m.size / heights_m.size
     if finer > 1:
         mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
+        # No level patch of the file itself becomes ground in silence, even if the survey is estimated wrongly.
+        own = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE, 0.0)
+        missed = own.cells - np.bincount(own.labels[mask], minlength=own.cells.size)
+        large = (own.cells > _TOLD_SHARE * elevation_m.size) & (2 * missed > own.cells)
+        large[0] = False
+        level |= large[own.labels]
     patches = sorted(((height_m, round(cells * finer)) for height_m, cells in patches), key=lambda patch: -patch[1])
     return LevelGround(mask, tuple(patches), float(np.count_nonzero(level & ~mask) / elevation_m.size))
 

@@ -42,7 +42,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 if TYPE_CHECKING:
     from shared_map.importers.sources import Source
 
-FORMAT = 5
+FORMAT = 6
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
 

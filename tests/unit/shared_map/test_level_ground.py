@@ -109,8 +109,12 @@ REAL = {
     "coast of bigtujunga": lambda: flooded("bigtujunga/bigtujunga_512.tif", 0.3),
 }
 SAME = [name for name in MODELS if name.startswith(("coast", "lakes", "reservoir", "delta"))]
-SMALL = ("lakes, laser, +-0.1 m on water", "lakes, warped by a cubic filter")
-"""Models of which 2 to 4 % are lakes of some ten cells across: 4 x 4 cells, and a cell of a shore, count."""
+SMALL = {
+    "lakes, laser, +-0.1 m on water": 0.035, "lakes, warped by a cubic filter": 0.035,
+    "lakes, packed with 2 cm of loss": 0.05,
+}  # fmt: skip
+"""Share lost at most in models of which 2 to 6 % are lakes of some ten cells across: 4 x 4 cells of water which the
+survey left rough, and a cell of a shore, count."""
 
 
 @pytest.mark.parametrize("name", [*REAL, *SAME])
@@ -120,7 +124,7 @@ def test_water_is_the_same_after_a_resampling(name: str, how: str, factors: tupl
     before = level_ground(heights_m).mask.mean()
     for factor in factors:
         after = level_ground(resampled(heights_m, factor, how)).mask.mean()
-        assert after == pytest.approx(before, rel=0.035 if name in SMALL else 0.02), factor
+        assert after == pytest.approx(before, rel=SMALL.get(name, 0.02)), factor
 
 
 @pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
@@ -137,7 +141,9 @@ def test_a_survey_is_recovered_from_a_file_that_was_made_finer(how: str) -> None
     heights_m = MODELS["lakes, decimetres"]().heights_m
     for factor in (1.3, 2.7):
         recovered, row, col = surveyed(resampled(heights_m, factor, how))
-        np.testing.assert_allclose(recovered, heights_m[3:-3, 3:-3], atol=0.05)
+        off_m = np.abs(recovered - heights_m[3:-3, 3:-3])
+        assert off_m.max() < 0.2
+        assert (off_m > 0.05).mean() < 0.001, "beside the border"
         assert (row[-1], col[-1]) == (377, 377)
     assert surveyed(heights_m)[0] is heights_m
 
