@@ -20,9 +20,8 @@ from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_filter import readable_for_target
-from shared_map.sightings import Sightings, pose_of
+from shared_map.sightings import Presence, Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
-from shared_map.vehicle_presence import Presence
 from swarm.bus.bus import Asked, Bus, Event, Heard, LinkChanged, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND

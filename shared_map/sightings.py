@@ -1,4 +1,4 @@
-"""Sightings: where vehicles saw targets. They expire, and change no pace.
+"""Sightings: where vehicles saw targets; and where the vehicles are. Both expire, and change no pace.
 
 The newest sighting of each author of a target counts, and of all authors' the newest that has not expired. As with
 marks, merging therefore depends on neither order, grouping nor repetition.
@@ -12,11 +12,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from shared_map.array_files import Floats
 from shared_map.replication.mark_filter import MarkFilter
 from swarm.clock import NS_PER_S
-from swarm.liveness import POSE_SILENCE_NS
+from swarm.liveness import POSE_SILENCE_NS, Leases
 from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.planning import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Fleet
 
 LONGEST_NS = 120 * NS_PER_S
 """A tracker that was lost for two minutes says nothing any more about where its target is."""
@@ -93,3 +97,49 @@ def pose_of(sighted: Sighted) -> TargetPose:
         x_m=sighted.x_m,
         y_m=sighted.y_m,
     )
+
+
+class Presence:
+    """Where all vehicles are now: the newest message of each (author, region), until its lease ends. Not stored.
+
+    A message lists an author's vehicles in one region, and replaces the author's last message of that region.
+    Presence therefore needs no merging, and a lost message needs no repeat.
+
+    lease_ns  a message is forgotten so long after it came
+    filter    whose vehicles count; None: everybody's
+    """
+
+    def __init__(self, lease_ns: int, filter: MarkFilter | None = None) -> None:
+        self._filter = filter
+        self._leases = Leases(lease_ns)
+        self._newest: dict[str, Fleet] = {}
+
+    def receive(self, fleet: Fleet, now_ns: int) -> None:
+        """Takes in a message; late and repeated ones change nothing."""
+        if self._filter is not None and not self._filter.accepts_author(fleet.author, fleet.group):
+            return
+        key = f"{fleet.author}/{fleet.region}"
+        known = self._newest.get(key)
+        if known is not None and fleet.seq <= known.seq:
+            return
+        self._leases.renew(key, now_ns)
+        self._newest[key] = fleet
+
+    def expire(self, now_ns: int) -> None:
+        """Forgets messages whose lease has ended."""
+        for key in self._leases.expired(now_ns):
+            del self._newest[key]
+
+    def places(self) -> dict[str, tuple[float, float]]:
+        """Vehicle -> (east_m, south_m) from the grid's west and north border. If messages about two regions list a
+        vehicle, which crosses a border, the newer one counts."""
+        found: dict[str, tuple[float, float]] = {}
+        for fleet in sorted(self._newest.values(), key=lambda each: each.stamp_ns):
+            east_m, south_m = np.frombuffer(fleet.east_m, "<f4"), np.frombuffer(fleet.south_m, "<f4")
+            found |= zip(fleet.ids, zip(east_m.tolist(), south_m.tolist(), strict=True), strict=True)
+        return found
+
+    def columns(self) -> tuple[Floats, Floats]:
+        """East and south of all vehicles in metres, float32 (vehicles,) each, in no particular order."""
+        east_m, south_m = np.array([*self.places().values()], np.float32).reshape(-1, 2).T
+        return east_m, south_m
