@@ -100,7 +100,7 @@ def pose_of(sighted: Sighted) -> TargetPose:
 
 
 class Presence:
-    """Where all vehicles are now: the newest message of each (author, region), until its lease ends. Not stored.
+    """Positions of all vehicles: the newest message of each (author, region), until its lease ends. Not stored.
 
     A message lists an author's vehicles in one region, and replaces the author's last message of that region.
     Presence therefore needs no merging, and a lost message needs no repeat.
