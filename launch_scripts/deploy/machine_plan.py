@@ -155,6 +155,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
     apart = {
         KEEPER: (hosts.losses + 1, f"survive = {hosts.losses}"),
         "planner": (standbys.planner + 1, f"{standbys.planner} standbys of each planner"),
+        "places": (standbys.planner + 1, f"{standbys.planner} standbys of each planner of places"),
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
     for role in ROLES:

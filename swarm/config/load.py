@@ -95,7 +95,7 @@ def read_scenario(
     return scenario if base is None else anchored(scenario, base), faults
 
 
-_RENAMED = {"map": {"shard_regions": "shard_regions"}, "targets": {"obstacle_radius_m": "obstacle_radius_m"}}
+_RENAMED = {"map": {"plot_regions": "shard_regions"}, "targets": {"body_radius_m": "obstacle_radius_m"}}
 """Section -> keys of the version before -> their names since. They are accepted for one version."""
 
 

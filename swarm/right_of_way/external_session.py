@@ -258,7 +258,7 @@ class ExternalSession:
         incarnation = self._clock.now_ns()
         self._service = ExternalService(name, grid, incarnation, generations, bus, self._inbox.post, self._warn)
         self._service.start(self._clock.now_ns())
-        self._thread = threading.Thread(target=self._run, name=f"external vehicle-{name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"external-{name}", daemon=True)
         self._thread.start()
 
     def __enter__(self) -> ExternalSession:

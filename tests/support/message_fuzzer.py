@@ -49,7 +49,7 @@ NAMES = (
     "x" * 64,
 )  # fmt: skip
 ROLES = ("agent", "planner", "keeper", "targets", "monitor", "router")
-_TRIES = 1000
+_TRIES = 10_000
 
 M = TypeVar("M")
 

@@ -97,7 +97,7 @@ class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
     ids: Annotated[list[VehicleId], SMALL]
     cells: Annotated[bytes, Column("<u4", per="ids")]
     vehicle_class: Id = "ground"
-    goals: Annotated[bytes, Column("<u4")] = b""
+    goals: Annotated[bytes, Meta(max_length=4 * MOST_VEHICLES), Column("<u4")] = b""
 
     def relate(self) -> None:
         expected = 0 if self.target is not None else len(self.cells)

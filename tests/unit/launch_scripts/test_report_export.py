@@ -178,7 +178,7 @@ def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_p
 
 
 def test_nothing_is_replaced_unless_asked(run: Path, tmp_path: Path, swarm: Swarm) -> None:
-    words = ("export", run, "--out", tmp_path / "new", "--what", "captures")
+    words = ("runs", "export", run, "--out", tmp_path / "new", "--what", "captures")
     assert swarm(*words)[0] == 0
     (path,) = (tmp_path / "new").iterdir()
     path.write_text("mine")

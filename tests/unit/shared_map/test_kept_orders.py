@@ -102,10 +102,10 @@ def test_a_target_is_put_on_passable_ground_of_the_terrain_only() -> None:
 def test_vehicles_of_agents_that_joined_later_are_stopped_too() -> None:
     world = BookWorld()
     world.keeper("k", KeeperStore(":memory:"))
-    assert isinstance(world.give(subject="vehicle", name="external vehicle-03"), str)
+    assert isinstance(world.give(subject="vehicle", name="guest-03"), str)
     world.bus("guest").declare_alive(Peer("agent", "guest", 7))
     world.run(0.2)
-    assert isinstance(world.give(subject="vehicle", name="external vehicle-03"), list)
+    assert isinstance(world.give(subject="vehicle", name="guest-03"), list)
     assert isinstance(world.give(subject="vehicle", name="a0-77"), str)
 
 
