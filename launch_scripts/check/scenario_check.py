@@ -62,10 +62,15 @@ def _of_source(name: str) -> Iterator[Finding]:
         yield from _of_file(key, path)
 
 
+_KINDS = {
+    "photo": FileKind.IMAGE, "mask": FileKind.IMAGE, "labels": FileKind.LABELS, "cover_codes": FileKind.COVER_TABLE,
+    "slope_csv": FileKind.SLOPE_TABLE, "file": FileKind.VECTORS,
+}  # fmt: skip
+"""Ending of a key -> kind of its file."""
+
+
 def _of_file(key: str, path: Path) -> Iterator[Finding]:
-    kind = FileKind.VECTORS if "zones" in key else FileKind.POINTS
-    if key == "cost.slope_csv":
-        kind = FileKind.SLOPE_TABLE
+    kind = next((kind for ending, kind in _KINDS.items() if key.endswith(ending)), FileKind.POINTS)
     try:
         check_file(path, kind)
         with path.open("rb"):

@@ -36,7 +36,7 @@ from swarm.wire.messages.vehicles import Followed, VehicleState
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
 _POINTS = 120
-"""Instants in a report: a shard of it is some 300 pixels wide."""
+"""Instants in a report: a plot of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000

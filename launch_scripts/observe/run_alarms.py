@@ -192,8 +192,8 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
             continue
         leads = next((ranked for each, ranked in latest.up() if (each, job_of(ranked)) == (role, job_of(id))), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
-        generations = "is gone" if latest.knows(role, id) else "has not come up"
-        yield _of_process("down", role, id, f"{generations}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
+        state = "is gone" if latest.knows(role, id) else "has not come up"
+        yield _of_process("down", role, id, f"{state}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from planner_service.followers import Followers
@@ -291,10 +292,23 @@ class PlacesService(PlanningProcess):
                 question.event.end()
                 continue
             trees, news = self._trees(question.request.vehicle_class), None
+            if question.event is None and not question.found and not self._starts_now(trees, question):
+                self._going_on.discard(id(question))
+                continue
             if not self._going_on or self._now_ns - trees.kept_up_ns >= _KEEPS_UP_NS:
                 news = trees.news(self._now_ns)
             self._at_work = question
             self._worker.submit("places", partial(trees.work, question, news), self._post, SLICE_CELLS * _CELL_NS)
+
+    def _starts_now(self, trees: _ClassTrees, question: _Question) -> bool:
+        """Moves the start of a route that no vehicle asked for to where the vehicle is by now. Returns False if it
+        goes elsewhere."""
+        for vehicle in question.request.vehicles:
+            follower = trees.followers.get(vehicle)
+            if follower is None or follower.goal != question.request.to:
+                return False
+            question.request = msgspec.structs.replace(question.request, cells=[follower.cell])
+        return True
 
     def _trees(self, name: str) -> _ClassTrees:
         trees = self._classes.get(name)

@@ -262,6 +262,8 @@ def plan_grid(
         )
     degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
+    if not np.isfinite([west, south, east, north]).all():
+        raise TerrainError(f"{what} lies beyond {crs_name(crs)}; its georeference is damaged")
     if east > 180 and crs.is_projected:
         ends, _ = to_crs(crs, degrees, *zip(transform @ (0, 0), transform @ (cols, rows), strict=True))
         back, _ = to_crs(degrees, crs, ends, [south, south])

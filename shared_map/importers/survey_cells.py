@@ -176,12 +176,14 @@ def _factors(heights_m: Floats) -> list[float]:
         peaks = peaks + np.abs(np.fft.rfft(bends * np.hanning(len(bends)), size))
     per_cell = np.arange(len(peaks)) / size
     peaks[per_cell < _SLOWEST] = 0
+    if not peaks.any():
+        return []
     usual = np.median(peaks[peaks > 0])
     found = {2.0}
     apart = _PEAK_APART * 4
     for _ in range(_PEAKS):
         n = int(peaks.argmax())
-        if peaks[n] < _PEAK * usual:
+        if peaks[n] <= 0 or peaks[n] < _PEAK * usual:
             break
         found |= {times / often for often in (per_cell[n], 1 - per_cell[n]) for times in (1, 2, 3)}
         peaks[max(n - apart, 0) : n + apart + 1] = 0

@@ -143,7 +143,7 @@ def test_a_vehicle_in_rust_asks_and_puts_json(live: LiveSwarm, swarm: Swarm) -> 
 def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell(
     live: LiveSwarm, swarm: Swarm, tmp_path: Path
 ) -> None:
-    file = tmp_path / "external vehicle.lives"
+    file = tmp_path / "guest.lives"
     problems: list[str] = []
     swarm.on_problem(problems.append)
     with swarm.vehicle("guest", radius_m=3.0, right_of_way=file) as external:
@@ -157,13 +157,11 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
             assert external.may_enter(there)
             external.at(*swarm.frame.centre_m(there))
         assert not external.may_enter(cells[0]), "it has been given back"
-        with pytest.raises(ConfigError, match="external vehicle: cell 0 of the path is not next to cell"):
+        with pytest.raises(ConfigError, match="vehicle guest: cell 0 of the path is not next to cell"):
             external.reserve([0])
         external.at(*swarm.frame.centre_m(swarm.frame.grid.cell(2, 2)))
         eventually(lambda: problems, 2, "a word about driving where it was not let in")
-    assert problems == [
-        f"vehicle external vehicle is in cell {swarm.frame.grid.cell(2, 2)}, into which it was not let: stop"
-    ]
+    assert problems == [f"vehicle guest is in cell {swarm.frame.grid.cell(2, 2)}, into which it was not let: stop"]
     with swarm.vehicle("other") as other:
         other.at(*swarm.frame.centre_m(5))
         with pytest.raises(ConfigError, match="has no right of way: make it with"):

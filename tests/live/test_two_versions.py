@@ -52,7 +52,7 @@ def take_over(machine: Machine, tree: Path) -> None:
     """Go over to the version in `tree`, beside the one that runs."""
     before = machine.process
     machine.start(tree, "--take-over")
-    eventually(lambda: machine.generations and before.poll() is not None, 120, "the end of the launcher before")
+    eventually(lambda: machine.lives and before.poll() is not None, 120, "the end of the launcher before")
     assert before.returncode == 0, machine.said()
     eventually(machine.up, 120, "the successors")
 

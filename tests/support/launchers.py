@@ -88,14 +88,14 @@ class Machine:
         return (self.folder / "output.txt").read_text()
 
     @property
-    def generations(self) -> bool:
+    def lives(self) -> bool:
         """Asserts that its launcher still runs; shows its output if not."""
         assert self.process.poll() is None, self.said()
         return True
 
     def up(self) -> bool:
         """True if the launcher that was started last reports that all is up."""
-        return self.generations and self.said().count("all processes are alive") >= len(self.started)
+        return self.lives and self.said().count("all processes are alive") >= len(self.started)
 
     def ask_to_end(self) -> None:
         """For the end of a test: asked twice, it writes no report."""
@@ -168,7 +168,7 @@ def machines_of(
     first, *others = machines
     try:
         machines[first].start(trees[first])
-        eventually(lambda: machines[first].generations and listening(network.connect[0]), 120, "the router")
+        eventually(lambda: machines[first].lives and listening(network.connect[0]), 120, "the router")
         with client(network) as bus:
             routed = Routed(bus)
             for name in others:

@@ -49,7 +49,7 @@ def cpu_s(pid: int) -> float | None:
 def machine_cpu_s() -> float:
     """Seconds of CPU that all processes of the machine have used, and that its host took."""
     times = psutil.cpu_times()
-    return float(sum(times) - times.idle - times.iowait - times.external - times.guest_nice)
+    return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice)
 
 
 def pss_bytes(pid: int) -> int | None:

@@ -1,6 +1,6 @@
 """Ways around obstacles that stand on routes. Planners know no obstacles, so the host drives around them itself.
 
-A route that passes a host state obstacle is replaced by the cheapest way from where the vehicle's path ends back
+A route that passes a standing obstacle is replaced by the cheapest way from where the vehicle's path ends back
 onto the route behind the obstacle: A* on the host's own map, with the cells of all obstacles closed.
 """
 

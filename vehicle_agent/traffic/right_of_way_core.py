@@ -22,7 +22,7 @@ from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
-_ON_DISK = {"generations": "lives", "shard_cells": "shard_cells"}
+_ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
 """Names of fields in files, which stay as they were."""
 
 

@@ -54,7 +54,7 @@ def _turn(stand: Stand) -> tuple[int, int, str]:
     return -step, _lot(stand.vehicle, step), stand.vehicle
 
 
-def _is_entering(stand: Stand) -> bool:
+def is_entering(stand: Stand) -> bool:
     """Returns True if the vehicle holds no cell and requests its first."""
     return not stand.holds and stand.ahead[:1] == [stand.cell]
 
@@ -171,7 +171,7 @@ class Leader:
             self._changed = True  # it leaves the shard as soon as a table counts this
         stands = self._stands_of(standing)
         holds = {id: stand.holds for id, stand in stands.items()}
-        bodies = {id: stand.cell for id, stand in stands.items() if _is_entering(stand)}
+        bodies = {id: stand.cell for id, stand in stands.items() if is_entering(stand)}
         before = self._orders.by_host_count(host)
         self._granted |= self._orders.take_host_state(
             host,
@@ -278,7 +278,7 @@ class Leader:
         movers: dict[str, Mover] = {}
         for stand in asking:
             entries = self._orders.entries(stand.vehicle)
-            if not entries and _is_entering(stand):
+            if not entries and is_entering(stand):
                 continue  # no vehicle makes way for it
             if _rests(stand, entries):
                 outside = not entries or stand.cell in stand.wants  # it waits to come to its first cell
@@ -381,7 +381,7 @@ class Leader:
         number = [*order][-1]
         return (
             len(order) <= _MOST_BEFORE
-            and not _is_entering(stand)
+            and not is_entering(stand)
             and self._goes_on(order[number], number)
             and not self._orders.would_circle(stand.vehicle, number[0])
         )

@@ -16,7 +16,7 @@ from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.incarnations import HEARTBEAT_NS
 from swarm.wire.messages.traffic import HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.shard_leader import SILENT_NS
+from vehicle_agent.traffic.shard_leader import SILENT_NS, is_entering
 
 _MOST_LACKED = 64
 """Entries that one word asks for; the next asks for more."""
@@ -41,13 +41,15 @@ class _Host:
     newest       (generation, sequence) of the newest
     generations  generation -> the newest table that it knows, the entries that it holds, and those that it never
                  takes
-    ended        lives that have ended
+    there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on
+    ended        generations that have ended
     told         the last word to it, and its time
     """
 
     spoke_ns: int
     newest: Stamp = BEFORE_ALL
     generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
+    there: set[tuple[str, int]] = field(default_factory=set)
     ended: set[int] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
@@ -61,6 +63,10 @@ class _Host:
             self.newest = standing.generation, standing.seq
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
             self.generations[standing.generation] = standing.knows, held, standing.never
+            entering = {(stand.vehicle, stand.cell) for stand in standing.vehicles if is_entering(stand)}
+            self.there = entering.union(
+                (each.vehicle, number[0]) for each in standing.vehicles for number in each.holds
+            )
             for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
                 del self.generations[old]
 
@@ -122,10 +128,19 @@ class Witness:
                 self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
         ordered = all(
-            (number > last.get(number[0], ()) and number[1:] <= new.stamp) or was.get(number, ("",))[0] == vehicle
+            (number > last.get(number[0], ()) and number[1:] <= new.stamp)
+            or self._passes(was.get(number), vehicle, number)
             for number, (vehicle, _) in added
         )
         return ordered and not self._lacks
+
+    def _passes(self, before: tuple[str, int] | None, vehicle: str, number: Number) -> bool:
+        """Returns True if an entry may pass to a newer generation of its host at its place in the order: the run's
+        first, or one that states the vehicle to be on the cell. All others may have been left."""
+        if before is None or before[0] != vehicle:
+            return False
+        host = self._hosts.get(agent_of(vehicle))
+        return not before[1] or (host is not None and (vehicle, number[0]) in host.there)
 
     def contradicts(self, table: Table) -> bool:
         """Returns True if a host held an entry which a table omits, by a statement no older than the one that the

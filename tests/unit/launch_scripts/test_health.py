@@ -56,11 +56,11 @@ processes = st.builds(
 
 @given(st.lists(processes, max_size=5))
 def test_a_machine_is_well_exactly_if_each_of_its_processes_is(seen: list[Process]) -> None:
-    generations, ready = verdict(HEALTHY, seen, _NOW_NS), verdict(READY, seen, _NOW_NS)
-    assert generations.ok == all(verdict(HEALTHY, [each], _NOW_NS).ok for each in seen)
+    alive, ready = verdict(HEALTHY, seen, _NOW_NS), verdict(READY, seen, _NOW_NS)
+    assert alive.ok == all(verdict(HEALTHY, [each], _NOW_NS).ok for each in seen)
     assert ready.ok == all(verdict(READY, [each], _NOW_NS).ok for each in seen)
-    assert generations.ok or not ready.ok, "what hangs is not ready"
-    for found in (generations, ready):
+    assert alive.ok or not ready.ok, "what hangs is not ready"
+    for found in (alive, ready):
         assert found.body.isascii()
         told = json.loads(found.body)
         assert told["status"] in ("healthy", "not healthy", "ready", "not ready")

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.place_routes import RouteQuestions
+from launch_scripts.gateways.ros2.incoming.place_routes import PATIENCE_S, RouteQuestions
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, Place, Track
 from launch_scripts.gateways.ros2.incoming.work_queue import Input
 from launch_scripts.gateways.ros2.rmw import Qos
@@ -28,7 +28,8 @@ _GOAL_HZ = 10.0
 _ROUTE_AGAIN_NS = 2 * NS_PER_S
 """A route to a goal is asked for again this long after the question before: marks may have closed it since."""
 _MOST_POSTED = 64
-_NEVER_NS = 1 << 63
+_UNANSWERED_NS = int((PATIENCE_S + 2.0) * NS_PER_S)
+"""An answer that did not come by then was lost."""
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
@@ -66,7 +67,7 @@ class Robot:
         self._goal: Place | None = None
         """Place to which it was sent; None while it has no goal of its own."""
         self._goal_due_ns = 0
-        """Time when the route to the goal is asked for; `_NEVER_NS` while that waits for its answer."""
+        """Time when the route to the goal is asked for, again if no answer came."""
         self._goal_cell: int | None = None
         """Cell of the last published goal_pose."""
         self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
@@ -99,7 +100,7 @@ class Robot:
         while self._followed is not None and (route := self._followed.next(0.0)) is not None:
             self._hear_route(route)
         if (goal := self._goal) is not None and self._track.place is not None and now_ns >= self._goal_due_ns:
-            self._goal_due_ns = _NEVER_NS
+            self._goal_due_ns = now_ns + _UNANSWERED_NS
             self._routes.ask(
                 goal, self._track.place, self._robots.vehicle_class,
                 lambda found: self._posted.append(lambda: self._hear_goal_route(goal, found, now_ns)),
