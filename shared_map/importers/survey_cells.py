@@ -219,33 +219,6 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
     return found.moved(-start)
 
 
-def _sums(count: int, by: _Resampling) -> Any:
-    """Sparse (count, cells of the survey): weights of each cell of a line. The first is `_REACH` - 1 before that in
-    which the line begins."""
-    from scipy import sparse
-
-    at = by.at(count)
-    near = np.floor(at).astype(np.intp)[:, None] + np.arange(1 - _REACH, _REACH + 1)
-    weights = by.kernel(at[:, None] - near)
-    weights /= weights.sum(axis=1, keepdims=True)
-    row = np.repeat(np.arange(count), near.shape[1])
-    return sparse.csr_array((weights.reshape(-1), (row, (near - near[0, 0]).reshape(-1))))
-
-
-def _solve(sums: Any, heights_m: _Doubles) -> _Doubles:
-    """The heights of the survey, by least squares."""
-    from scipy.linalg import solveh_banded
-
-    squares = (sums.T @ sums).tocsr()
-    many = squares.shape[0]
-    banded = np.zeros((2 * _REACH, many))
-    for off in range(2 * _REACH):
-        banded[off, : many - off] = squares.diagonal(off)
-    banded[0] += 1e-9
-    solved: _Doubles = solveh_banded(banded, sums.T @ heights_m, lower=True)
-    return solved
-
-
 def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
     """The survey in the direction of columns, without `_REACH` cells at either end.
 

@@ -14,7 +14,7 @@ from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, Left, Word
 
 GENERATIONS_KEPT = 32
-"""Numbers of generations on file, as many as a `Standing` has room for."""
+"""Numbers of generations on file, as many as a `HostState` has room for."""
 _ALONE_NS = NS_PER_S // 2
 """A generation that has been replaced begins again once no other process of its host has been alive for so long."""
 _UNLED_NS = 2 * NS_PER_S

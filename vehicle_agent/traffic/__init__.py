@@ -4,7 +4,7 @@ The map is cut into shards (`swarm.right_of_way.lock_regions`). Each shard has t
 four where certificates prove names; one is its leader. The host's part is in `swarm.right_of_way`;
 docs/design/right-of-way.md has the proof. Here:
 
-1. A host tells the leader where its vehicles stand and where they would go (`Standing`). `Steering` ranks the cells
+1. A host tells the leader where its vehicles are and where they would go (`HostState`). `Steering` ranks the cells
    around a vehicle by its route. `CellRequests` keeps requests until one of their inputs changes.
 2. The leader plans all vehicles without a next cell at once (`pibt`) and appends entries to the orders of cells
    (`cell_orders`): a vehicle follows one that goes on. An entry is never revoked: only its host's word ends it.

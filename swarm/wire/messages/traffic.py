@@ -212,7 +212,7 @@ class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     disk         the file that it knows as the other's: the first that it received
     generation   the greatest generation in any table
     shards       those whose tables grant cells to its vehicles, or keep cells of an earlier generation of it shut
-    agents       for an external vehicle, which may not know the scenario: the agents of which three are members of
+    agents       for an external vehicle, which may not know the scenario: the agents of which some are members of
                  each shard
     generations  for an external vehicle: all generations of it that tables name, so that an operator can say that
                  they have ended
