@@ -95,7 +95,8 @@ class Container(NamedTuple):
 def containers_of(plan: Plan, host: PlannedHost, image: str = "") -> list[Container]:
     """One for each process of a machine, in its order. `image`: of the roles; if empty, that of this version. A
     monitor needs a larger one."""
-    base = image or f"terrain-swarm:{importlib.metadata.version('terrain-swarm')}"
+    version = importlib.metadata.version("terrain-swarm").partition("+")[0]  # a tag has no "+COMMIT"
+    base = image or f"terrain-swarm:{version}"
     return [
         Container(
             process,

@@ -33,7 +33,7 @@ SlopeRule = Literal[
 class WayConfig(Section, frozen=True, kw_only=True):
     """Cost of a class of features in a zone file.
 
-    width_m  of its lines; a width that a line has of its own counts more
+    width_m  width of its lines; a line's own width takes precedence
     factor   pace relative to the road pace (kind road), or to the ground; "ignored" leaves such features out
     """
 
@@ -42,7 +42,7 @@ class WayConfig(Section, frozen=True, kw_only=True):
 
 
 class ZoneConfig(Section, frozen=True, kw_only=True):
-    """A part of the terrain with a cost of its own. Give one of `polygon`, `polygon_m`, `mask` and `file`.
+    """A part of the terrain with its own cost. Give one of `polygon`, `polygon_m`, `mask` and `file`.
 
     kind          forbidden is lethal; keep_in makes all else lethal; water is lethal or slow, by its class, and
                   bridges cross it; road sets the road pace; pace sets the pace of open ground; factor multiplies
@@ -50,18 +50,18 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
     polygon       corners as places: "46.81,9.85" (latitude, longitude), "xy:779600,190400" in metres of the map,
                   "cell:40,200"
     polygon_m     [east, south] corners in metres from the north-west corner of the terrain
-    mask          an image file with as many pixels as the terrain has cells: the zone is where it is not 0
+    mask          an image with one pixel per cell: the zone is where it is not 0
     file          a GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, KMZ, GPX or OSM XML (or a .zip of one), in any
                   coordinate system; a fence as .plan or .waypoints; for pace and factor also a raster of them
-    layer         which layer of a file that has several
-    crs           coordinate system of the file, where it does not say it; "local": metres of the terrain's own map
-    attribute     column of the file with the pace, the factor, or the class of each feature; of roads and water
-                  that of OpenStreetMap is known
-    factor        of kind factor, where no column says it
-    pace_s_per_m  of kind pace, where no column says it
-    width_m       width of lines, where neither they nor their class say it
-    classes       class -> its width and factor, beside the built-in ones of roads and water
-    name          how messages call the zone; its kind if empty
+    layer         layer of a file with several
+    crs           coordinate system of a file which does not state it; "local": metres of the terrain's own map
+    attribute     column of the file with the pace, the factor, or the class of each feature; the columns of
+                  OpenStreetMap for roads and water are built in
+    factor        factor of kind factor, where no column has it
+    pace_s_per_m  pace of kind pace, where no column has it
+    width_m       width of lines, where neither they nor their class have one
+    classes       width and factor of classes, beside the built-in ones of roads and water
+    name          name of the zone in messages; default: its kind
     """
 
     kind: Literal["forbidden", "keep_in", "water", "road", "pace", "factor", "preferred", "rough"]
@@ -90,13 +90,13 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
 
 
 class HiddenConfig(Section, frozen=True, kw_only=True):
-    """Hazards of the terrain that are missing from the map until vehicles find them.
+    """Hazards which are missing from the map until vehicles find them.
 
-    closed_roads   barriers: a stretch of road and the cells beside it is lethal
+    closed_roads   barriers: a stretch of road and the cells beside it are lethal
     rubble_fields  ragged patches, 4 to 10 cells in radius, of three times the pace
-    flooded_share  share of the passable cells which is one flooded, lethal valley
-    zones          zones painted on the truth only
-    class_factor   by how much the true pace of a whole class differs from the prior: { grass = 3.0 }
+    flooded_share  share of the passable cells in one flooded, lethal valley
+    zones          zones of the ground truth only
+    class_factor   true pace of a class over its prior: { grass = 3.0 }
     """
 
     closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
@@ -109,34 +109,32 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Sources of elevation and photo.
 
-    source         "jacksboro" (built in), "synthetic", or a file. Rasters: .tif, .tiff, .img, .hgt, .bil, .flt,
-                   .dem, .dt2, .nc, .vrt; each of these may be in a .zip. Others: .asc, .npz, .png, .csv, .xyz, .map
-                   (MovingAI), .yaml or .yml (ROS map)
-    photo          a colour GeoTIFF on the same ground, or nothing
-    labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
-    cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
-                   own; also an image of such a map in the colours of its published legend
-    cover_codes    the legend of `cover`, if it cannot be recognised from the file: "worldcover", "corine",
-                   "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to open
-                   ground, or "lethal")
-    cover_classes  codes whose class (or pace, or "lethal") differs from the legend `cover_codes`: code = class
-    resolution_m   cell size to bring everything to; the source's own if not given
-    crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
-    height_scale   metres per unit of height, where the file does not say it (.png)
+    source              "jacksboro" (built in), "synthetic", or a file. Rasters: .tif, .tiff, .img, .hgt, .bil,
+                        .flt, .dem, .dt2, .nc, .vrt; each of these may be in a .zip. Others: .asc, .npz, .png, .csv,
+                        .xyz, .map (MovingAI), .yaml or .yml (ROS map)
+    photo               a colour GeoTIFF on the same ground
+    labels              a TOML file of labelled polygons and points, from which the classes of the photo are learnt
+    cover               a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or your own
+                        codes; also an image in the colours of a published legend
+    cover_codes         the legend of `cover`, if the file does not show it: "worldcover", "corine",
+                        "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to
+                        open ground, or "lethal")
+    cover_classes       codes whose class (or pace, or "lethal") differs from the legend: code = class
+    resolution_m        cell size to which everything is resampled; default: the source's own
+    crs                 coordinate system of a source which does not state it, such as "EPSG:32632"
+    height_scale        metres per unit of height, where the file does not state it (.png)
     elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
                         Terrain-RGB or Terrarium tiles
-    nodata         cells without a height: "lethal", or "fill" to interpolate them from their surroundings
-    nodata_values  stored values that mean "no height", in addition to the value which the file declares
-    level_is       meaning of exactly flat areas of an elevation file, if no photo shows it: surveys level lakes and
-                   the sea
-    water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
-    roads          number of invented roads, laid between random places (by the seed) on any terrain, real ones too;
-                   0 lays none
-    rows           synthetic: cells from north to south
-    cols           synthetic: cells from west to east
-    relief_m       synthetic: height of the highest cell above the lowest
-    rivers         synthetic: how many rivers cross the terrain
-    hidden         hazards of the terrain that are missing from the map
+    nodata              cells without a height: "lethal", or "fill" to interpolate them from their surroundings
+    nodata_values       stored values which mean "no height", in addition to the value which the file declares
+    level_is            meaning of exactly flat areas which no photo shows: surveys level lakes and the sea
+    water_below_m       lower ground of a file is water where no photo shows it; 0 for a coast
+    roads               number of invented roads between random places (by the seed), on any terrain
+    rows                synthetic: cells from north to south
+    cols                synthetic: cells from west to east
+    relief_m            synthetic: height of the highest cell above the lowest
+    rivers              synthetic: number of rivers across the terrain
+    hidden              hazards which are missing from the map
     """
 
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
@@ -164,10 +162,10 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
 
 
 class CostLayerConfig(Section, frozen=True, kw_only=True):
-    """A rule of the user's own: it changes the pace that slope and ground give, before zones are painted.
+    """A rule of your own: it changes the pace of slope and ground, before zones.
 
     layer    a plug-in
-    options  what it takes
+    options  its options
     """
 
     layer: Annotated[str, plugin_name()]
@@ -177,33 +175,33 @@ class CostLayerConfig(Section, frozen=True, kw_only=True):
 class CostConfig(Section, frozen=True, kw_only=True):
     """Rules that turn terrain into pace.
 
-    preset                  a class of vehicles, whose settings stand for those that are not given here
+    preset                  a kind of vehicle, whose settings are the defaults of all others
     flat_speed_m_per_s      speed on level open ground
     road_speed_m_per_s      speed on roads
-    slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
-    directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
-                            by how steep it is; every strategy of the planner goes with it
+    slope_rule              effect of slope on pace; `swarm terrain rules` lists all with their sources
+    directional             true: a step costs by its own climb, so uphill and downhill differ, instead of by the
+                            slope of its cell
     steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
-    rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
-    power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
-    braking_share           energy: power that the brakes can hold for long over that of the motor
-    critical_slope_percent  herzog_wheeled: the slope that doubles the pace
-    slope_table             table: points [degrees, factor on the flat pace], negative is downhill; straight lines
-                            between them, and beyond the last the same factor
-    slope_csv               table: a .csv file with such points instead. Its first line names two columns:
-                            slope_deg or slope_percent; factor, pace_s_per_m or speed_m_per_s
-    top_speed_m_per_s       no slope makes a vehicle quicker than this on open ground
-    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down it
+    rolling_resistance      energy: share of its weight which a vehicle needs to roll on level open ground
+    power_reserve           energy: power of the motor over the power needed on level ground at the flat speed
+    braking_share           energy: lasting power of the brakes over that of the motor
+    critical_slope_percent  herzog_wheeled: slope which doubles the pace
+    slope_table             table: points [degrees, factor on the flat pace], negative is downhill; linear between
+                            them, constant beyond
+    slope_csv               table: a .csv file with such points instead. Its first line names two columns: slope_deg
+                            or slope_percent; factor, pace_s_per_m or speed_m_per_s
+    top_speed_m_per_s       limit on open ground, whatever the slope
+    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down
     max_slope_deg           steeper ground is lethal
-    max_climb_deg           directional: no step climbs steeper along its way; `max_slope_deg` if not given
-    max_descent_deg         directional: no step descends steeper along its way; `max_slope_deg` if not given
+    max_climb_deg           directional: steepest climb of a step; default: `max_slope_deg`
+    max_descent_deg         directional: steepest descent of a step; default: `max_slope_deg`
     rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
-    classes                 whether what covers the ground (water, forest, rock ...) counts
+    classes                 true: the land cover (water, forest, rock ...) counts
     class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
-    vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
-                            (inflation)
-    layers                  rules of the user's own, applied in order; no-data cells stay lethal
-    zones                   parts of the terrain with a cost of their own, painted in order; forbidden ones last
+    vehicle_radius_m        inflation: a cell is lethal if a vehicle of this radius in its centre touches a lethal
+                            cell
+    layers                  rules of your own, applied in order; no-data cells stay lethal
+    zones                   parts of the terrain with their own cost, applied in order, forbidden ones last
     """
 
     preset: Preset | None = None

@@ -42,22 +42,22 @@ UNTIL_STOPPED_S = 1e9
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
-    """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.
+    """A target, or `count` of them. The id is `name` for one, `name0, name1, ...` for several.
 
-    name               id of the target, or what the ids begin with
-    count              how many targets
-    walk               still; random: a new heading now and then; waypoints: to random places by the cheapest way;
-                       evade: away from the nearest vehicles; external: another process publishes its pose; or a
-                       plug-in
-    walk_options       what a plug-in for `walk` takes
-    speed_m_per_s      its speed on level open ground, elsewhere slower or faster as vehicles are
-    tracker            always: its pose is published all the time; sighted: only vehicles which see it tell where it
-                       is, and planners use the last sighting
-    caught             jump: a captured target goes on from another place; stay: it goes on from where it is
-    start              [row, col], or a place: "46.81,9.85" (latitude, longitude), "xy:X,Y" in metres of the map; a
-                       random passable cell if not given
-    obstacle_radius_m  vehicles keep out of the cells within this distance of it, and of those that it drives to
-                       (m); if not given, they may share its cell
+    name               id, or the beginning of the ids
+    count              number of targets
+    walk               still; random: changes its heading now and then; waypoints: to random places by the cheapest
+                       route; evade: away from the nearest vehicles; external: another process publishes its pose;
+                       or a plug-in
+    walk_options       options of a plug-in for `walk`
+    speed_m_per_s      speed on level open ground; other ground changes it as it changes the speed of vehicles
+    tracker            always: its pose is always published; sighted: only vehicles which see it report it, and
+                       planners use the last sighting
+    caught             jump: after a capture it continues from another place; stay: from the same place
+    start              [row, col], or a place: "46.81,9.85" (latitude, longitude), "xy:X,Y" in metres of the map;
+                       default: a random passable cell
+    obstacle_radius_m  vehicles keep this distance (m) from it and from the cells which it enters next; default:
+                       they may share its cell
     """
 
     name: Name = "t"
@@ -77,13 +77,13 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 
 
 class RoverConfig(Section, frozen=True, kw_only=True):
-    """A simulated external vehicle, or `count` alike: it publishes its position, reserves no cells and avoids no
-    other vehicle. Ids as those of targets.
+    """A simulated external vehicle, or `count` of them: it publishes its position, reserves no cells and avoids no
+    other vehicle. Ids are formed as those of targets.
 
-    name           id of the rover, or what the ids begin with
-    count          how many rovers
-    speed_m_per_s  its speed, on any ground
-    radius_m       what vehicles keep away from, around its middle
+    name           id, or the beginning of the ids
+    count          number of rovers
+    speed_m_per_s  speed, on any ground
+    radius_m       distance which vehicles keep from its centre
     """
 
     name: Name = "r"
@@ -93,21 +93,18 @@ class RoverConfig(Section, frozen=True, kw_only=True):
 
 
 class GroupConfig(Section, frozen=True, kw_only=True):
-    """Vehicles that belong together.
+    """Vehicles with common targets and sharing rules.
 
-    name      id of the group; the ids of its authors begin with it
-    vehicles  how many vehicles
-    targets   ids of the targets that they may chase; all if empty
-    start     spread over the terrain, or clustered around one random place
-    cells     explicit places for the first vehicles: [row, col], or as `start` of targets
-    reads     groups whose marks and positions its vehicles take in, besides their own; "*" is all
-    writes    groups that may take in its marks and positions; both must agree
-
-    assignment  which vehicle goes for which target: as `vehicles.assignment`, which counts if this is not given; a
-                plug-in takes `vehicles.assignment_options`
-    pursuers    balanced: number of vehicles that each target gets first, those which together are the quickest
-                there
-    class       the class of its vehicles: one of `classes`, or "ground", that of `cost` and `vehicles`
+    name        id of the group; the ids of its authors begin with it
+    vehicles    number of vehicles
+    targets     ids of the targets which they may chase; empty: all
+    start       spread over the terrain, or clustered around one random place
+    cells       places of the first vehicles: [row, col], or as `start` of targets
+    reads       groups whose marks and positions its vehicles use, besides their own; "*" is all
+    writes      groups which may use its marks and positions; both sides must agree
+    assignment  as `vehicles.assignment`, which is the default; a plug-in uses `vehicles.assignment_options`
+    pursuers    balanced: number of vehicles which each target gets first, chosen for the least total time
+    class       class of its vehicles: one of `classes`, or "ground", the class of `cost` and `vehicles`
     """
 
     name: Name = "all"
@@ -125,21 +122,21 @@ class GroupConfig(Section, frozen=True, kw_only=True):
 class VehicleConfig(Section, frozen=True, kw_only=True):
     """Behaviour of vehicles.
 
-    per_agent           vehicles that one agent process hosts, at most
-    tick_hz             how often an agent moves its vehicles and publishes their positions
+    per_agent           most vehicles of one agent process
+    tick_hz             rate at which an agent moves its vehicles and publishes their positions
     sense_range_m       radius within which the simulated sensor sees the true ground
-    capture_range_m     a target this near is captured
-    route_cells         steps of a route asked for at a time; 0 is the whole route
-    reserve_cells       cells ahead of itself that a vehicle keeps even if others wait for them
-    reassign_s          how often a vehicle asks which target is the cheapest
+    capture_range_m     distance at which a target is captured
+    route_cells         steps of a requested route; 0 is the whole route
+    reserve_cells       cells ahead of it which a vehicle keeps even if others wait for them
+    reassign_s          interval at which a vehicle asks for its cheapest target
     sensor              truth: sees the true ground within `sense_range_m`; or a plug-in
-    sensor_options      what a plug-in for `sensor` takes
-    assignment          spread: the lowest-cost pairs first, to each target an even share of an agent's vehicles;
-                        cheapest: each vehicle the target that it reaches first; balanced: every target first gets
-                        its pursuers out of the whole group, the rest are spread over it; or a plug-in
-    assignment_options  what a plug-in for `assignment` takes
-    dynamics            ground: vehicles are as fast as the ground allows; or a plug-in, which only slows
-    dynamics_options    what a plug-in for `dynamics` takes
+    sensor_options      options of a plug-in for `sensor`
+    assignment          spread: the cheapest pairs first, with an even share of an agent's vehicles to each target;
+                        cheapest: each vehicle chases the target which it reaches first; balanced: each target first
+                        gets its pursuers from the whole group, and the rest is spread; or a plug-in
+    assignment_options  options of a plug-in for `assignment`
+    dynamics            ground: as fast as the ground allows; or a plug-in, which can only slow vehicles
+    dynamics_options    options of a plug-in for `dynamics`
     """
 
     per_agent: Annotated[int, Meta(ge=1, le=MOST_PER_AGENT)] = 25
@@ -160,20 +157,20 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
 class PlannerConfig(Section, frozen=True, kw_only=True):
     """Updates of a planner's tree.
 
-    strategy          extent of the search when the target has moved; auto chooses by `cpu_budget`; or a plug-in
-    strategy_options  what a plug-in for `strategy` takes
-    tick_hz           how often a planner follows its target and its map
-    edge              octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
-    neighbours        cells that one step reaches: 4, or 8 with the diagonal ones
-    corner_cutting    whether a diagonal step may pass the corner of a lethal cell
+    strategy          extent of the search after the target has moved; auto chooses by `cpu_budget`; or a plug-in
+    strategy_options  options of a plug-in for `strategy`
+    tick_hz           rate at which a planner follows its target and its map
+    edge              octile: a diagonal step is sqrt(2) long; paper: each step costs as much as its cell
+    neighbours        cells which one step reaches: 4, or 8 with the diagonal ones
+    corner_cutting    true: a diagonal step may pass the corner of a lethal cell
     length_weight     lambda of the paper's length-aware key, seconds per metre
-    k_min             smallest block exponent, as in the paper: the narrowest window of variable range is
-                      2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
-    cpu_budget        auto: share of one core that this planner may use
-    push_s            newer routes are pushed to a vehicle at most this often
-    routes            grid: vehicles drive from the middle of a cell to that of a neighbour; pulled: straight from
-                      cell to distant cell, where that is no slower. With `cost.directional` only flights are
-    places            whether a process plans routes to any place, for vehicles that are sent somewhere
+    k_min             smallest block exponent of the paper: the narrowest window is 2**(k_min+1) + 1 cells wide with
+                      variable range, 2**(k_min+3) + 1 with other strategies
+    cpu_budget        auto: share of one core which this planner may use
+    push_s            least time between two routes pushed to a vehicle
+    routes            grid: vehicles drive from cell centre to cell centre; pulled: straight between distant cells
+                      where that is no slower. With `cost.directional` only flights are pulled
+    places            true: a process plans routes to any place, for vehicles which are sent there
     """
 
     strategy: Annotated[str, plugin_name(Strategy)] = "auto"
@@ -191,10 +188,10 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 
 
 class StandbyConfig(Section, frozen=True, kw_only=True):
-    """Processes that stand by: as many as said keep up with each one that leads, and take over when it is dead.
+    """Numbers of standbys, which follow each leading process and take over when it dies.
 
-    planner  standbys of each target's planner, and of `places`; each costs as much as that process
-    targets  standbys of the process that moves the targets
+    planner  standbys of each target's planner and of `places`; each costs as much as its leader
+    targets  standbys of the process which moves the targets
     """
 
     planner: Standbys = 0
@@ -204,19 +201,19 @@ class StandbyConfig(Section, frozen=True, kw_only=True):
 class MapConfig(Section, frozen=True, kw_only=True):
     """Replication of the shared map.
 
-    interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
-                        only. Planners, keepers and the monitor hold all
+    interest            all: agents hold all marks; near: only those of regions within `interest_m` of their
+                        vehicles. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
-    shard_regions       side of a shard of right of way, in regions of 256 x 256 cells. Agents speak of every shard
-                        in every tick: few agents on a large map want larger ones. The same for all processes of a
-                        run
-    digest_s            every replica publishes this often which sets it holds
-    author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
-    total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
-    learning            vehicles measure how fast they drive on each kind of ground, and all processes correct the
-                        prior pace of that kind by it
-    compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
-                        compacted with those of other dead authors. Longer than a partition is likely to last
+    shard_regions       side of a shard of right of way, in regions of 256 x 256 cells. Agents send messages about
+                        each shard at each tick: few agents on a large map need larger shards. Equal for all
+                        processes of a run
+    digest_s            interval at which each replica publishes which sets it holds
+    author_marks_per_s  a process which changes more cells for ten seconds is named, and its sets are delayed
+    total_marks_per_s   the same for all processes together: the sets of those above an equal share are delayed
+    learning            true: vehicles measure their speed on each kind of ground, and all processes correct its
+                        prior pace
+    compact_after_s     an author which a keeper has not heard for this time counts as dead, and its sets are
+                        compacted. Choose more than the usual length of a partition
     """
 
     interest: Literal["all", "near"] = "all"
@@ -230,10 +227,10 @@ class MapConfig(Section, frozen=True, kw_only=True):
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):
-    """Mutual TLS: files in PEM, relative to the scenario.
+    """Mutual TLS: PEM files, relative to the scenario.
 
-    ca           certificate of the authority that signed all others
-    certificate  certificate of this process, or the folder in which each process finds the one of its name
+    ca           certificate of the authority which signed all others
+    certificate  certificate of this process, or the folder in which each process finds its own
     key          private key of this process, or the same folder
     """
 
@@ -243,19 +240,19 @@ class TlsConfig(Section, frozen=True, kw_only=True):
 
 
 class NetworkConfig(Section, frozen=True, kw_only=True):
-    """Endpoints at which processes meet.
+    """Endpoints of routers, and rights of processes.
 
-    namespace          first chunk of all keys: runs in different ones do not hear each other
-    listen             endpoints of the router; beyond loopback they must be tls/ with certificates
-    connect            endpoints of the routers that the other processes connect to
-    peers              endpoints of other routers that a router connects to
-    lease_s            a peer that is silent for this long counts as gone
-    connect_timeout_s  a tool that reaches no router for this long ends, and a process whose router listens but does
-                       not answer; while no router listens, processes wait
+    namespace          first part of all keys: runs in different namespaces do not receive each other's messages
+    listen             endpoints of the router; beyond loopback tls/ with certificates
+    connect            endpoints of the routers to which other processes connect
+    peers              endpoints of other routers to which a router connects
+    lease_s            a peer which is silent for this time counts as dead
+    connect_timeout_s  time without a router after which a tool ends, or a process whose router listens but does not
+                       answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
-    admit              names in certificates that a router lets take part, beside those of the scenario's processes:
+    admit              names in certificates which a router admits, beside those of the scenario's processes:
                        router.north, keeper.east, operator.anna, rover.all.r1
-    revoked            names in certificates that a router denies everything
+    revoked            names in certificates to which a router denies everything
     """
 
     namespace: Name = "swarm"
@@ -272,13 +269,12 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
 class MonitorConfig(Section, frozen=True, kw_only=True):
     """The live view.
 
-    live       whether there is one, beside the recording
-    grpc_port  loopback port of the stream, for native viewers; 0 is any free one
-    web_port   loopback port of the page, for browsers; 0 is any free one
-
-    show_target    the target of whose cost-to-go there is a picture; the first if empty
-    height_factor  how many times as high as they are heights are drawn; chosen by the relief if absent
-    follow         vehicle or target that the camera follows; none if absent
+    live           true: serve the view, beside the recording
+    grpc_port      loopback port of the stream, for native viewers; 0 is any free one
+    web_port       loopback port of the page, for browsers; 0 is any free one
+    show_target    target whose cost-to-go is shown; empty: the first
+    height_factor  vertical exaggeration; default: chosen by the relief
+    follow         vehicle or target which the camera follows
     """
 
     live: bool = True
@@ -290,26 +286,26 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
 
 
 class Scenario(Section, frozen=True, kw_only=True):
-    """One run, whole.
+    """Settings of one run.
 
-    name           what reports call it
-    seed           decides roads, hidden obstacles, starts and walks; a simulated run is decided by it entirely
-    seconds        how long the run lasts
-    time_scale     seconds on the terrain per second of the run: motion is that much faster than real
-    terrain        where elevation and photo come from
-    cost           how terrain becomes pace
-    targets        what is chased
-    groups         which vehicles there are
+    name           name of the scenario in reports
+    seed           determines roads, hidden obstacles, starts and walks, and a simulated run entirely
+    seconds        duration of the run
+    time_scale     seconds on the terrain per second of the run: motion is faster by this factor
+    terrain        sources of elevation and photo
+    cost           rules that turn terrain into pace
+    targets        targets of the vehicles
+    groups         groups of vehicles
     classes        kinds of vehicles that differ from `cost` and `vehicles`
-    wind           in which classes that fly do so
-    rovers         simulated outside vehicles that the swarm's must not drive into
-    vehicles       how vehicles behave
-    planner        how a planner keeps its tree
-    standbys       which processes stand by
-    map            how the shared map is replicated
-    network        where processes meet
+    wind           wind for flying classes
+    rovers         simulated external vehicles which the swarm's vehicles avoid
+    vehicles       behaviour of vehicles
+    planner        updates of a planner's tree
+    standbys       processes that stand by
+    map            replication of the shared map
+    network        endpoints and rights of processes
     monitor        the live view
-    plugin_folder  where the modules of plug-ins lie that are not installed: the scenario's own folder if not given
+    plugin_folder  folder of plug-in modules which are not installed; default: the scenario's folder
     """
 
     name: Name = "unnamed"

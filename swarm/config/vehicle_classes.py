@@ -26,10 +26,10 @@ SHARED = ("zones", "layers", "directional")
 
 
 class WindConfig(Section, frozen=True, kw_only=True):
-    """The wind in which vehicles fly: everywhere and at every height alike. Ground vehicles are not affected by it.
+    """Wind for flying vehicles: equal everywhere and at every height. It has no effect on the ground.
 
-    speed_m_per_s  less than the speed of every class that flies, so that each makes headway in every direction
-    from_deg       where it comes from, clockwise from the map's north: 270 is a wind from the west
+    speed_m_per_s  must be below the speed of each flying class, which can then fly in every direction
+    from_deg       its origin, clockwise from the map's north: 270 is a west wind
     """
 
     speed_m_per_s: Annotated[float, Meta(ge=0, le=340)] = 0.0
@@ -37,15 +37,15 @@ class WindConfig(Section, frozen=True, kw_only=True):
 
 
 class AirConfig(Section, frozen=True, kw_only=True):
-    """Flight of a class: over a surface that keeps its clearance and is no steeper than it can climb.
+    """Flight of a class, over a surface which keeps the clearance and limits the climb.
 
-    speed_m_per_s    in level flight, through the air; over the ground the wind adds to it, or takes from it
-    clearance_m      it is never lower over the highest ground of a cell and its eight neighbours
-    climb_m_per_s    a metre of climb takes this much longer: 1 / climb_m_per_s
-    descent_m_per_s  the same of a metre of descent
-    grade            steepest rise and fall of the surface, metres per metre; by the terrain's relief if not given
-    no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and hidden hazards do not
-                     affect flying classes
+    speed_m_per_s    speed in level flight through the air; the wind changes it over the ground
+    clearance_m      least height over the highest ground of a cell and its eight neighbours
+    climb_m_per_s    each metre of climb takes 1 / climb_m_per_s longer
+    descent_m_per_s  the same for a metre of descent
+    grade            steepest rise and fall of the surface, metres per metre; default: by the relief
+    no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and hidden hazards have no
+                     effect on flying classes
     """
 
     speed_m_per_s: Annotated[float, Meta(ge=0.1, le=340)] = 15.0
@@ -57,18 +57,18 @@ class AirConfig(Section, frozen=True, kw_only=True):
 
 
 class ClassConfig(Section, frozen=True, kw_only=True):
-    """A class of vehicles beside "ground", that of `[cost]` and `[vehicles]`: groups name theirs, and queries may.
+    """A class of vehicles beside "ground", the class of `[cost]` and `[vehicles]`. Groups name their class; queries
+    may.
 
-    name                 what groups and queries call it
-    cost                 what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
-                             and `directional` are those of `[cost]`
-    max_speed_m_per_s    top speed: level, on roads, downhill, with any mark or learned factor
-    sense_range_m        as `vehicles.sense_range_m`, which counts if this is not given
-    accel_m_per_s2       it speeds up no quicker, and brakes no harder before turns and where it has to stop
-    turn_rate_deg_per_s  it turns no quicker, so it takes turns slowly. With this or `accel_m_per_s2` it drives by
-                         these, not by `vehicles.dynamics`
-    air                  it flies: then `cost` and `max_speed_m_per_s` have no effect, and it neither meets nor
-                         waits for ground vehicles
+    name                 name for groups and queries
+    cost                 differences from `[cost]`: preset, slope rule, speeds, limits, radius. Zones, layers and
+                         `directional` are those of `[cost]`
+    max_speed_m_per_s    top speed on any ground, with any mark or learned factor
+    sense_range_m        default: `vehicles.sense_range_m`
+    accel_m_per_s2       greatest acceleration, and deceleration before turns and stops
+    turn_rate_deg_per_s  greatest turn rate. With this or `accel_m_per_s2`, `vehicles.dynamics` has no effect
+    air                  settings of a flying class: `cost` and `max_speed_m_per_s` then have no effect, and ground
+                         vehicles do not block it
     """
 
     name: Name

@@ -42,10 +42,10 @@ Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
 class RosSide(Section, frozen=True, kw_only=True):
     """The ROS side.
 
-    endpoint      of its Zenoh router, rmw_zenohd; a swarm's router has the same port by default
-    in_the_clear  the endpoint may be on another machine: ROS nodes hear and say all unencrypted there
+    endpoint      its Zenoh router, rmw_zenohd; a swarm's router has the same port by default
+    in_the_clear  true: the endpoint may be on another machine; ROS messages go there unencrypted
     domain        ROS_DOMAIN_ID of the nodes
-    distribution  of the nodes; messages of one are not heard by another whose types differ
+    distribution  ROS distribution of the nodes; types differ between distributions
     node          name of the gateway's node
     """
 
@@ -57,12 +57,12 @@ class RosSide(Section, frozen=True, kw_only=True):
 
 
 class Frames(Section, frozen=True, kw_only=True):
-    """Coordinate frames. The map frame begins in the terrain's south-west corner; those of a vehicle are
+    """Coordinate frames. The origin of the map frame is the terrain's south-west corner. A vehicle has
     VEHICLE/odom, at the same place, and VEHICLE/base_link.
 
     map   name of the map frame
-    bare  transforms of a vehicle go under /VEHICLE/tf, with the names odom and base_link, as Nav2 in a namespace
-          expects them; otherwise all go under /tf
+    bare  true: transforms of a vehicle go to /VEHICLE/tf, with the names odom and base_link, as Nav2 in a namespace
+          expects; false: all go to /tf
     """
 
     map: FrameName = "map"
@@ -72,13 +72,13 @@ class Frames(Section, frozen=True, kw_only=True):
 class SwarmSide(Section, frozen=True, kw_only=True):
     """The swarm's side. Options of the command take precedence.
 
-    connect      endpoint of a router of the swarm; if not given, the newest run of this machine that runs
-    namespace    first chunk of the swarm's keys; if not given, that of the run, or `swarm`
+    connect      endpoint of a router of the swarm; default: your newest running run on this machine
+    namespace    first part of the swarm's keys; default: that of the run, or `swarm`
     ca           certificate of the swarm's authority, beyond this machine; all three or none
     certificate  the gateway's certificate
     key          its private key
-    terrain      folder of the run, or any with its prepared terrain, for /map; if not given, that of the run if it
-                 is on this machine. Without one the map holds marks alone
+    terrain      folder of the run, or any with its prepared terrain, for /map; default: that of the run on this
+                 machine. Without terrain the map has marks only
     """
 
     connect: str | None = None
@@ -92,8 +92,8 @@ class SwarmSide(Section, frozen=True, kw_only=True):
 class TopicSettings(Section, frozen=True, kw_only=True):
     """Changes to a topic of the table.
 
-    topic  its name in ROS, with {vehicle} or {target} where the table has them; empty: as in the table
-    hz     how often, at most; 0: as in the table
+    topic  its name in ROS, with {vehicle} or {target} as in the table; default: as in the table
+    hz     highest rate; 0: as in the table
     """
 
     topic: str = ""
@@ -101,22 +101,22 @@ class TopicSettings(Section, frozen=True, kw_only=True):
 
 
 class Robots(Section, frozen=True, kw_only=True):
-    """Robots of ROS that are vehicles of the swarm, from the first message on which says where they are.
+    """Robots of ROS which are vehicles of the swarm, from their first position on.
 
-    id             of the one robot; not given where the topic has {robot}: then every robot that has such a topic
-    topic          where each says where it is
-    type           of this topic: odometry, pose, pose_with_covariance
-    frame          in which it says so, beside the map frame
-    offset_m       where the origin of that frame lies in the map frame: x, y
-    turn_rad       how far that frame is turned against the map frame, counter-clockwise
-    radius_m       others keep clear of it
-    lease_s        it is no vehicle any more so long after its last message
-    hz             the swarm hears of it at most so often
-    group          whose it is
-    vehicle_class  whose routes it gets: one of the scenario's classes
-    target         the target that it follows; not given: none, until it is given a goal
+    id             id of one robot; default, with {robot} in the topic: each robot with such a topic
+    topic          topic of its position
+    type           type of this topic: odometry, pose, pose_with_covariance
+    frame          frame of its position, beside the map frame
+    offset_m       origin of that frame in the map frame: x, y
+    turn_rad       rotation of that frame against the map frame, counter-clockwise
+    radius_m       distance which others keep from it
+    lease_s        time after its last message until it counts as absent
+    hz             highest rate of its positions in the swarm
+    group          its group
+    vehicle_class  class of its routes: one of the scenario
+    target         target which it follows; default: none, until it gets a goal
     plan           topic of its route
-    goal           topic of the goal: published when it follows a target, subscribed when another program gives it a
+    goal           topic of its goal: published when it follows a target, subscribed when another program sets the
                    goal
     """
 
@@ -149,12 +149,12 @@ class Robots(Section, frozen=True, kw_only=True):
 
 
 class ZoneSettings(Section, frozen=True, kw_only=True):
-    """A zone that ROS draws by a polygon, as operators order one. A polygon without corners takes it away.
+    """A zone which ROS draws by a polygon, like an order. A polygon without corners removes it.
 
-    name          of the zone
-    topic         of the polygon, geometry_msgs/PolygonStamped
-    pace_s_per_m  pace there; not given: lethal
-    for_s         it ends by itself so long after it was drawn last; not given: it stands until it is taken away
+    name          name of the zone
+    topic         topic of the polygon, geometry_msgs/PolygonStamped
+    pace_s_per_m  pace there; default: lethal
+    for_s         duration after it was last drawn; default: until it is removed
     """
 
     name: RosName
@@ -164,12 +164,12 @@ class ZoneSettings(Section, frozen=True, kw_only=True):
 
 
 class GridSettings(Section, frozen=True, kw_only=True):
-    """Cells that ROS closes by a grid. The next grid opens those that it does not close.
+    """Cells which ROS closes by a grid. The next grid opens those which it does not close.
 
-    name      of the author of the marks
-    topic     of the grid, nav_msgs/OccupancyGrid
-    occupied  from this value on, up to 100, its cells are closed
-    for_s     they open by themselves so long after the last grid; not given: they stay closed
+    name      author of the marks
+    topic     topic of the grid, nav_msgs/OccupancyGrid
+    occupied  least value of a closed cell
+    for_s     duration after the last grid; default: without end
     """
 
     name: RosName
@@ -181,12 +181,12 @@ class GridSettings(Section, frozen=True, kw_only=True):
 class IncomingSettings(Section, frozen=True, kw_only=True):
     """Allowed incoming topics.
 
-    robots    vehicles of the swarm which ROS moves. Goals which are places need `planner.places` in the scenario
-    targets   external targets of the scenario that ROS moves
+    robots    vehicles of the swarm which ROS moves. Goals at places need `planner.places` in the scenario
+    targets   external targets of the scenario which ROS moves
     set_pose  topic of a target's place, geometry_msgs/PoseStamped
-    zones     polygons that become zones
-    grids     grids that become marks
-    orders    whether ROS may pause the swarm and let it go on
+    zones     polygons which become zones
+    grids     grids which become marks
+    orders    true: ROS may pause and resume the swarm, and send vehicles to places
     """
 
     robots: tuple[Robots, ...] = ()
@@ -211,12 +211,12 @@ EXAMPLE = IncomingSettings(
 
 
 class Settings(Section, frozen=True, kw_only=True):
-    """Settings of `swarm gateway ros2`. Each key has a default, so that an empty file is one.
+    """Settings of `swarm gateway ros2`. Each key has a default, so an empty file is valid.
 
-    vehicles  ids of vehicles that ROS hears of, with * and ?
-    forward   names of topics of the table that are forwarded; empty: all
+    vehicles  ids of vehicles which ROS receives, with * and ?
+    forward   names of forwarded topics of the table; empty: all
     topics    changes to topics of the table, by name
-    incoming  what may come in from ROS; nothing unless it is named
+    incoming  allowed incoming topics; by default none
     """
 
     vehicles: tuple[str, ...] = ("*",)

@@ -51,21 +51,21 @@ class TopicRow:
 _OUT, _IN, _SERVICE = Direction.OUT, Direction.IN, Direction.SERVICE
 TABLE: tuple[TopicRow, ...] = (
     TopicRow("map", "/map", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _OUT, None,
-             "How fast each cell may be driven; put again now and then while it changes."),
+             "Pace of each cell; repeated while it changes."),
     TopicRow("map_updates", "/map_updates", "map_msgs/msg/OccupancyGridUpdate", Qos.DEFAULT, _OUT, 1.0,
-             "Windows of the map that marks have changed."),
+             "Windows of the map which marks have changed."),
     TopicRow("tf", "/tf", "tf2_msgs/msg/TFMessage", Qos.TRANSFORMS, _OUT, 10.0,
-             "Where each vehicle is: odom frame to base frame."),
+             "Pose of each vehicle: odom frame to base frame."),
     TopicRow("tf_static", "/tf_static", "tf2_msgs/msg/TFMessage", Qos.LATCHED, _OUT, None,
-             "The map frame to the odom frame of each vehicle, which is the same place."),
+             "Map frame to the odom frame of each vehicle, at the same place."),
     TopicRow("odom", "/{vehicle}/odom", "nav_msgs/msg/Odometry", Qos.DEFAULT, _OUT, 10.0,
              "Pose and velocity; the velocity is the difference of two reports."),
     TopicRow("pose", "/{vehicle}/pose", "geometry_msgs/msg/PoseStamped", Qos.DEFAULT, _OUT, 10.0,
              "Pose in the map frame."),
     TopicRow("plan", "/{vehicle}/plan", "nav_msgs/msg/Path", Qos.LATCHED, _OUT, None,
-             "The route that the vehicle follows, when it begins another one; at most once a second."),
+             "Each route which the vehicle begins; at most one a second."),
     TopicRow("fix", "/{vehicle}/fix", "sensor_msgs/msg/NavSatFix", Qos.SENSOR, _OUT, 1.0,
-             "Latitude and longitude, where the terrain has coordinates and pyproj is installed."),
+             "Latitude and longitude, on terrain with coordinates; needs pyproj."),
     TopicRow("poses", "/swarm/poses", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
              "Poses of all vehicles, in order of their ids."),
     TopicRow("targets", "/targets", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
@@ -73,7 +73,7 @@ TABLE: tuple[TopicRow, ...] = (
     TopicRow("target_pose", "/targets/{target}/pose", "geometry_msgs/msg/PoseStamped", Qos.DEFAULT, _OUT, 5.0,
              "Pose of a target, while it is tracked."),
     TopicRow("markers", "/swarm/markers", "visualization_msgs/msg/MarkerArray", Qos.LATCHED, _OUT, 1.0,
-             "For RViz: routes, marked cells, zones, windows of the map that have just changed."),
+             "For RViz: routes, marked cells, zones, windows of the map which have just changed."),
     TopicRow("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Qos.DEFAULT, _OUT, 1.0,
              "Number of vehicles per state, targets, links, dropped messages."),
 )  # fmt: skip
@@ -84,34 +84,34 @@ FRAMES = ("tf", "tf_static")
 _POSE, _TRIGGER = "geometry_msgs/msg/PoseStamped", "std_srvs/srv/Trigger"
 ROBOT_TABLE: tuple[TopicRow, ...] = (
     TopicRow("robot", "/{robot}/odom", "nav_msgs/msg/Odometry", Qos.SENSOR, _IN, 10.0,
-             "A robot is a vehicle there."),
-    TopicRow("goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _IN, 10.0, "Gives a robot a goal."),
+             "Position of a robot, which is then a vehicle of the swarm."),
+    TopicRow("goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _IN, 10.0, "Goal of a robot."),
     TopicRow("robot_plan", "/{robot}/plan", "nav_msgs/msg/Path", Qos.LATCHED, _OUT, None,
              "The robot's route, on change."),
     TopicRow("robot_goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _OUT, None,
-             "Where the target is that a robot without a goal follows, when its cell changes."),
+             "Cell of the target which a robot without a goal follows, on change."),
     TopicRow("certificate", "/{robot}/plan_certificate", "diagnostic_msgs/msg/DiagnosticStatus", Qos.LATCHED, _OUT,
-             None, "Cost of each plan and its lower bound; or the reason why there is none."),
+             None, "Cost of each plan and its lower bound, or why there is none."),
     TopicRow("get_plan", "/{robot}/get_plan", "nav_msgs/srv/GetPlan", Qos.DEFAULT, _SERVICE, None,
              "A route to a place or a target."),
 )  # fmt: skip
 """For each robot, where the settings let it in."""
 VEHICLE_GOAL = TopicRow("vehicle_goal", "/{vehicle}/goal_pose", _POSE, Qos.DEFAULT, _IN, 1.0,
-                        "Sends a vehicle of the swarm to a place, where it stays.")  # fmt: skip
+                        "Sends a vehicle of the swarm to a place, where it holds.")  # fmt: skip
 ORDER_TABLE: tuple[TopicRow, ...] = (
     TopicRow("pause", "/swarm/pause", _TRIGGER, Qos.DEFAULT, _SERVICE, None,
-             "Stops all vehicles of the swarm; answers when they obey."),
+             "Stops all vehicles of the swarm; replies when they obey."),
     TopicRow("hold", "/swarm/hold", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "The same."),
-    TopicRow("resume", "/swarm/resume", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "Lets them go on."),
+    TopicRow("resume", "/swarm/resume", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "Starts them again."),
     VEHICLE_GOAL,
 )  # fmt: skip
 SET_POSE = TopicRow("set_pose", "/targets/{target}/set_pose", _POSE, Qos.DEFAULT, _IN, 10.0,
                     "Moves an external target.")  # fmt: skip
 ZONE = TopicRow("zone", "", "geometry_msgs/msg/PolygonStamped", Qos.LATCHED, _IN, 1.0,
-                "Draws a zone; without corners it is taken away.")  # fmt: skip
+                "Draws a zone; without corners it is removed.")  # fmt: skip
 GRID = TopicRow("grid", "", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _IN, 1.0, "Closes cells by marks.")
 MAP_SERVER = TopicRow("map_server", "/map_server/map", "nav_msgs/srv/GetMap", Qos.DEFAULT, _SERVICE, None,
-                      "The map as it is now.")  # fmt: skip
+                      "The current map.")  # fmt: skip
 POSE_TYPES = {
     "odometry": "nav_msgs/msg/Odometry",
     "pose": "geometry_msgs/msg/PoseStamped",
