@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import re
+import tomllib
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -183,3 +184,14 @@ def test_different_ids_have_different_labels_of_dns(ids: list[str]) -> None:
 @pytest.mark.parametrize(("id", "label"), [("planner-t3", "planner-t3"), ("planner-t3.r1", "planner-t3--r1")])
 def test_usual_ids_stay_readable(id: str, label: str) -> None:
     assert dns_label(id) == label
+
+
+def test_pages_and_examples_name_images_of_this_version() -> None:
+    root = Path(__file__).parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+    version = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["version"]
+    pages = [*root.glob("docs/**/*.md"), *root.glob("docs/examples/**/*.yaml")]
+    named = {
+        tag for page in pages for tag in re.findall(r"terrain-swarm:([\d.]+\d)", page.read_text(encoding="utf-8"))
+    }
+    assert named == {version}
