@@ -37,8 +37,11 @@ _QOS = {
     "TRANSFORMS": "reliable, volatile, last 100",
 }
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
-SWARM = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`, `--connect`, `--namespace`, `--run`, `--runs`"
+_TLS = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`"
+SWARM = f"{_TLS}, `--connect`, `--namespace`, `--run`, `--runs`"
 """The options by which a command finds the swarm."""
+PROCESS = f"{_TLS}, `SCENARIO`, `--connect`, `--namespace`, `--runs`, `--health-port`, `--signals-address`"
+"""The options of a process which is started by hand."""
 
 
 def command_line() -> str:
@@ -47,7 +50,7 @@ def command_line() -> str:
     times = Counter(row for _, _, rows in commands for row in rows)
     first = {f"{about}{rows}": words for words, about, rows in reversed(commands)}
     shared = sorted(row for row in times if times[row] > 1)
-    return filled("cli", commands=commands, first=first, shared=shared, swarm=SWARM)
+    return filled("cli", commands=commands, first=first, shared=shared, swarm=SWARM, process=PROCESS)
 
 
 def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:
@@ -108,9 +111,7 @@ PAGES: dict[Path, Callable[[], str]] = {
 
 def main() -> int:
     """Writes or checks the pages; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m docs.generate", description="Write the generated pages of the reference."
-    )
+    parser = argparse.ArgumentParser(prog="docs.generate", description="Write the pages of the reference.")
     parser.add_argument("--check", action="store_true", help="only tell whether the files are current")
     check = parser.parse_args().check
     stale = 0
