@@ -184,13 +184,13 @@ OBEYING = "agent planner targets keeper"
 OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
 
 RUN = Topic(
-    "run", "run/{role}/{id}", processes.RunInfo, "which run and terrain a process belongs to",
+    "run", "run/{role}/{id}", processes.RunInfo, "run and terrain of a process",
     "asked at every start", access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing, published=False,
     ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", map_data.MarkSet,
-    "an author's whole set for a tile; the author and the keeper answer for it",
+    "an author's whole set for a tile, served by the author and the keeper",
     "on change, at most 10 Hz a tile",
     access(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
@@ -200,54 +200,53 @@ MARKS = Topic(
     answer_bytes=2 * _LONG,
 )  # fmt: skip
 DIGEST = Topic(
-    "digest", "digest/{author}", map_data.Digest, "which sets a replica holds", "1 Hz, and on change",
+    "digest", "digest/{author}", map_data.Digest, "sets of a replica", "1 Hz, and on change",
     access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
-    "base-map", "base/{keeper}", map_data.BaseMap, "what a keeper has of the terrain, for those who lack its files",
+    "base-map", "base/{keeper}", map_data.BaseMap, "terrain of a keeper, for machines without its files",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
     request=Nothing, published=False, priority=Priority.BACKGROUND,
     ask_bytes=_SHORT, answer_bytes=_FILE,
 )  # fmt: skip
 BASE_TILES = Topic(
-    "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain itself, by layer and region",
+    "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain, by layer and region",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
     request=map_data.BaseMapRequest, published=False, priority=Priority.BACKGROUND,
     ask_bytes=_LONG, answer_bytes=_FILE,
 )  # fmt: skip
 FLEET = Topic(
-    "fleet", "fleet/{region}/{author}", vehicles.Fleet, "where the vehicles of an agent are; newest only",
+    "fleet", "fleet/{region}/{author}", vehicles.Fleet, "positions of an agent's vehicles",
     "every tick", access(put="agent:author", hear="targets monitor planner"),
     put_bytes=_LONG,
 )  # fmt: skip
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", vehicles.Chasers,
-    "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
-    "when a vehicle takes or leaves the target or has driven past the published cell; else 1 Hz",
+    "vehicles of an agent which chase a target, and where their routes may begin",
+    "on change, and after a vehicle has passed the published cell; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
     put_bytes=_LONG,
 )  # fmt: skip
 SENT = Topic(
     "sent", "place/{places}/sent/{author}", vehicles.Chasers,
-    "which vehicles of an agent go to which places, for the process that plans there, and where routes may begin",
+    "vehicles of an agent which are sent to places, and where their routes may begin",
     "as chasers",
     access(put="agent:author", hear="places:places"),
     put_bytes=_LONG,
 )  # fmt: skip
 SHARED_COSTS = Topic(
     "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts,
-    "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
-    "only where `groups[].assignment` asks for it",
+    "costs from an agent's vehicles to each target", "per `vehicles.reassign_s`, if `groups[].assignment` needs it",
     access(put="agent:author", hear="agent"), echoed=False,
     put_bytes=2 * _LONG,
 )  # fmt: skip
 HOST_STATE = Topic(
     "host_state", "host_state/{shard}/{member}/{agent}", traffic.HostState,
-    "where a host's vehicles are in a shard and where they would go; for its leader, or all of its members where "
-    "none is heard; each counts, as two generations of a host must not hide each other's words",
+    "positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; "
+    "each counts, because two generations of a host must not replace each other's messages",
     "on change, else 5 Hz",
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
@@ -255,41 +254,41 @@ HOST_STATE = Topic(
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{shard}/{member}/{agent}", traffic.Table,
-    "which cells the leader of a shard has granted, for one of its members; a member that is asked promises an "
-    "epoch and answers with what it has stored", "on change, and at 5 Hz until both others have it on file",
+    "granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies "
+    "with its stored table", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=traffic.Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 GRANTED = Topic(
     "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,
-    "which cells of a shard its leader has granted to one host, on file with its members", "on change, else 5 Hz",
+    "cells of a shard granted to one host, on file with its members", "on change, else 5 Hz",
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
 WORD = Topic(
     "word", "word/{shard}/{host}/{agent}", traffic.Word,
-    "a member's word on what it has on file for a host, which counts a grant with those of a majority; sent where "
-    "certificates prove names", "on change, else 5 Hz",
+    "digest of a member's file for a host, which uses a grant that a majority confirms; only with certificates",
+    "on change, else 5 Hz",
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 LEFT = Topic(
     "left", "left/{host}/{agent}", traffic.Left,
-    "which cells vehicles of a host have left, for another host whose vehicles follow them; each counts",
+    "cells which vehicles of a host have left, for a host whose vehicles follow; each counts",
     "on change, and at 5 Hz until the leader has counted it",
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another",
-    "per table by one member, 5 Hz by the other; 5 Hz by the leader, instead of a table that both have on file",
+    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "number of a member's table on file",
+    "per table by one member, 5 Hz by the other; 5 Hz by the leader instead of an unchanged table",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", traffic.Known,
-    "what an agent has on file about another, or an external vehicle, for its next generation",
+    "an agent's file on another host, for its next generation",
     "asked at a start",
     access(serve="agent:agent", ask="agent rover"),
     request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
@@ -297,7 +296,7 @@ KNOWN = Topic(
 )  # fmt: skip
 LEAVE = Topic(
     "leave", "leave/{agent}", vehicles.Removed,
-    "vehicles that have left, for an operator who asked an agent to remove them", "asked",
+    "vehicles which an agent has removed for an operator", "asked",
     access(serve="agent:agent"),
     request=vehicles.RemoveVehicles, published=False, trusted=True, priority=Priority.INTERACTIVE,
     ask_bytes=_LONG, answer_bytes=_LONG,
@@ -311,34 +310,34 @@ FOLLOWED = Topic(
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", planning.PushedRoute,
-    "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
+    "a newer route for a vehicle", "per update",
     access(put="planner places", hear="agent:agent rover:agent"),
     put_bytes=_LONG,
 )  # fmt: skip
 POSE = Topic(
     "pose", "target/{target}/pose", planning.TargetPose,
-    "where a target is, by a tracker of it; each counts, as one tracker must not hide another's words",
+    "position of a target, from a tracker; each counts, because trackers must not replace each other's messages",
     "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
     put_bytes=_SHORT,
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", planning.TargetPose,
-    "position of an untracked target: for simulated sensors, not for planners", "as poses",
+    "position of an untracked target, for simulated sensors only", "as poses",
     access(put="targets", hear="agent targets"),
     put_bytes=_SHORT,
 )  # fmt: skip
 SIGHTED = Topic(
-    "sighted", "sighted/{target}/{author}", planning.Sighted, "where a vehicle of this author saw a target",
+    "sighted", "sighted/{target}/{author}", planning.Sighted, "position of a target, seen by a vehicle",
     "while it is in sight, at most 2 Hz",
     access(put="agent:author", hear="agent planner keeper monitor"),
     put_bytes=_SHORT,
 )  # fmt: skip
 OBSTACLE = Topic(
     "body", "body/{id}", vehicles.Obstacle,
-    "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
-    "a person; each counts, as two senders under one id must not hide each other",
-    "10 Hz while it moves, else once a second at least",
+    "position of an obstacle, such as an outside vehicle or a person; each counts, because two senders under one "
+    "id must not replace each other's messages",
+    "10 Hz in motion, else at least 1 Hz",
     access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
     priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
@@ -362,7 +361,7 @@ COST = Topic(
     request=planning.CostRequest, published=False, costly=True,
     ask_bytes=_LONG, answer_bytes=2 * _LONG,
 )  # fmt: skip
-_NAMELESS = "the same for askers that are not named, such as people; they share one turn"
+_NAMELESS = "the same for askers without a name, which share one turn"
 NAMELESS_ROUTE = replace(
     ROUTE, name="nameless-route", key="target/{target}/route", what=_NAMELESS,
     access=access(serve="planner:target", ask="agent rover"),
@@ -372,78 +371,78 @@ NAMELESS_COST = replace(
     access=access(serve="planner:target", ask="agent targets monitor rover"),
 )  # fmt: skip
 STATUS = Topic(
-    "status", "target/{target}/status", planning.PlannerStatus, "how a planner is doing", "2 Hz",
+    "status", "target/{target}/status", planning.PlannerStatus, "state of a planner", "2 Hz",
     access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
     put_bytes=_SHORT,
 )  # fmt: skip
 BELIEVED = Topic(
-    "believed", "target/{target}/believed", planning.Believed, "where a target may be that is searched for",
+    "believed", "target/{target}/believed", planning.Believed, "likely places of a target which is searched for",
     "1 Hz during a search",
     access(put="planner:target", hear="monitor"),
     priority=Priority.BACKGROUND,
     put_bytes=_USUAL // 4,
 )  # fmt: skip
 LEAD = Topic(
-    "lead", "lead/{role}/{id}", processes.Heartbeat, "which processes of one job are ready, and which leads",
+    "lead", "lead/{role}/{id}", processes.Heartbeat, "readiness and leadership among processes with one job",
     "10 Hz, where there are standbys",
     access(put="planner:role,id places:role,id targets:role,id", hear="planner places targets monitor"),
     priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 ZONES = Topic(
-    "zones", "order/{keeper}/zone", orders.Zones, "adds, removes and lists zones: areas that operators close",
+    "zones", "order/{keeper}/zone", orders.Zones, "adds, removes and lists zones",
     "asked by people", access(serve="keeper:keeper"),
     request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
     answer_bytes=_FILE,
 )  # fmt: skip
 GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders,
-    "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
+    "gives an order: pause, stop, targets of a group, added targets, settings", "asked by people",
     access(serve="keeper:keeper"), request=orders.GiveOrder, published=False, trusted=True,
     priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 ORDERS = Topic(
     "orders", "orders/{role}/{id}", orders.Orders,
-    "orders in force: of keepers, and of all processes to a starting one without a keeper", "1 Hz, and on change",
+    "orders in force, from keepers; without a keeper, from any process to a starting one", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
     request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
 OBEYED = Topic(
-    "obeyed", "obeyed/{role}/{id}", orders.Obeyed, "that a process obeys an order, as soon as it does",
+    "obeyed", "obeyed/{role}/{id}", orders.Obeyed, "reply as soon as a process obeys an order",
     "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
     request=orders.Obey, published=False, priority=Priority.INTERACTIVE,
     ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
 SEND_VEHICLE = Topic(
     "send-vehicle", "order/{keeper}/send", orders.Goals,
-    "sends a vehicle to places, recalls it, and lists what is sent where", "asked by people",
+    "sends a vehicle to places, recalls it, and lists sent vehicles", "asked by people",
     access(serve="keeper:keeper"), request=orders.SendVehicle, published=False, trusted=True,
     priority=Priority.INTERACTIVE, answer_bytes=_FILE,
 )  # fmt: skip
 GOALS = Topic(
     "goals", "goals/{id}/{agent}", orders.Goals,
-    "where an agent's vehicles are sent, as a keeper has it on its disk",
+    "places to which an agent's vehicles are sent, as on a keeper's disk",
     "1 Hz for agents with goals, and on change",
     access(put="keeper:id", serve="keeper:id", ask="agent:agent keeper", hear="agent:agent keeper"),
     request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
     put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
 GOAL_STATES = Topic(
-    "goal-states", "reached/{agent}", orders.GoalStates, "how far an agent's vehicles are with their goals",
+    "goal-states", "reached/{agent}", orders.GoalStates, "progress of an agent's vehicles towards their places",
     "1 Hz for agents with goals, and on change", access(put="agent:agent", hear="keeper monitor"), trusted=True,
     put_bytes=_LONG,
 )  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", processes.Stats,
-    "what a process has counted; keepers answer with the last words of processes that are gone", "1 Hz",
+    "counts of a process; keepers serve the last ones of ended processes", "1 Hz",
     access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
     request=Nothing, priority=Priority.BACKGROUND,
     put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 NOTE = Topic(
-    "note", "note/{role}/{id}", processes.Note, "something worth telling a person", "as it happens",
+    "note", "note/{role}/{id}", processes.Note, "event for people", "as it happens",
     access(put=MEMBERS_OWN, hear="monitor"),
     newest=False, priority=Priority.BACKGROUND,
     put_bytes=_USUAL // 4,
