@@ -120,6 +120,7 @@ class Host:
         if now_ns - self._alone_since_ns < _ALONE_NS:
             return False
         self._alone_since_ns = None
+        self._told_by.clear()  # the successor may have driven into other shards
         self._known_generation = max(self._known_generation, self.holdings.newest)
         self.holdings.end()
         return True

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from support.simulated import agents, vehicles
 
-from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
+from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import WIDE, seeded
@@ -59,3 +59,18 @@ def test_agents_that_drove_alone_and_died_are_not_driven_into():
     simulation.run_until(SECONDS)
     assert laws.collisions == laws.lethal == []
     assert len(vehicles(simulation)) == 24
+
+
+def test_agents_that_begin_while_they_are_cut_off_find_all_their_vehicles_afterwards():
+    """No other agent can say then in which shards they are, so the question is repeated."""
+    crashed = ["agent-a0", "agent-a3"]
+    plan = FaultPlan(
+        crashes=tuple(Crash(6.0, name) for name in crashed), partitions=(Partition(6.05, 8.0, tuple(crashed)),)
+    )
+    simulation = Simulation(seeded(3, WIDE), faults=plan)
+    laws = LawBook(simulation)
+    simulation.run_until(SECONDS)
+    assert {name: len(service.agent.vehicles) for name, service in agents(simulation).items()} == {
+        f"agent-a{n}": 3 for n in range(8)
+    }
+    assert laws.never_routed() == laws.collisions == laws.lethal == []

@@ -99,11 +99,15 @@ class RightOfWay:
 
     @property
     def settled(self) -> bool:
-        """True if no recovery query about us is pending: we live, all other agents have noted our file (an external
-        vehicle's is not noted; it has to know its shards), and no later generation leaves it to us to state,
-        wherever cells of ours are shut, that we have stopped."""
-        noted = self.host.informed if self._is_external else len(self.own.noted_by) >= len(self._spawns) - 1
-        return self.holdings.generation > 0 and noted and not self.holdings.replaced
+        """True if no recovery query about us is pending: our generation knows every shard with cells of ours, all
+        other agents have noted our file (an external vehicle's is not noted), and no later generation leaves it to
+        us to state, wherever cells of ours are shut, that we have stopped.
+
+        A generation may begin before others could answer, as beside a router that restarts. Without a later query
+        it would never speak to the leaders of shards of which we are no member, and its vehicles there would have
+        no place."""
+        noted = self._is_external or len(self.own.noted_by) >= len(self._spawns) - 1
+        return self.holdings.generation > 0 and self.host.informed and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a generation. The last action is what to answer.
