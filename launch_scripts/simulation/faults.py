@@ -256,6 +256,10 @@ def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
         one_way = chance.random() < 0.4
         partitions.append(Partition(*span(chance.choice((0.5, 2.0, 4.0))), tuple(sorted(cut_off)), one_way))
     crashes = [Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(names)) for _ in range(chance.randrange(7))]
+    cut_off_at_start = random.Random(f"cut off at its start/{seed}")  # as beside a router that restarts with it
+    for each in partitions:
+        if cut_off_at_start.random() < 0.5:
+            crashes.append(Crash(each.from_s, cut_off_at_start.choice(each.nodes)))
     for _ in range(chance.randrange(3)):
         hangs.append(Hang(*span(chance.choice((0.3, 1.5, 4.0))), chance.choice(names)))
     # With fewer than three agents no shard has a majority without the one that is cut off.
