@@ -17,9 +17,8 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from launch_scripts.simulation.many_seeds import SECONDS, replay_of
 from launch_scripts.simulation.study.study import Case, Study
-from launch_scripts.simulation.study.trials import Result, Trial
+from launch_scripts.simulation.trials import SECONDS, Result, Trial, replay_of
 
 LEVEL = 0.95
 MOST_BOOTSTRAPPED = 1000

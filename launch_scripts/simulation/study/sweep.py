@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
 from launch_scripts.simulation.study.summary import Summary, document, name_of, pictures_of, summarise
-from launch_scripts.simulation.study.trials import Result, Trial
+from launch_scripts.simulation.trials import Result, Trial
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 from swarm.files import check_writable, write_file, writing

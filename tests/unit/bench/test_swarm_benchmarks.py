@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import time
 from typing import Any
 
 import msgspec
@@ -21,7 +19,6 @@ from support.benchmarks import bench
 from support.makers import fleet_of
 
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.simulation.many_seeds import in_processes
 from swarm.config.agents import plan_agents
 from swarm.errors import SwarmError
 from swarm.runtime.stats import Counters
@@ -169,23 +166,3 @@ def test_a_simulated_swarm_is_measured() -> None:
     assert sum(each["bytes_per_s"] for each in topics.values()) == pytest.approx(figures["bytes_in_per_s"])
     assert figures["collisions"] == figures["lethal_entries"] == 0
     assert figures["not_measured"] == []
-
-
-# --- many processes ----------------------------------------------------------------------------------------------
-
-
-def nap(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
-
-
-def test_work_in_processes_ends_with_those_who_stop_to_read() -> None:
-    results = in_processes(nap, [0.01, 60.0, 60.0, 60.0], 2)
-    assert next(results) == 0.01
-    running = multiprocessing.active_children()
-    assert running
-    results.close()  # type: ignore[attr-defined]
-    until_s = time.monotonic() + 10
-    while any(child.is_alive() for child in running) and time.monotonic() < until_s:
-        time.sleep(0.05)
-    assert not any(child.is_alive() for child in running)

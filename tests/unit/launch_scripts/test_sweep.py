@@ -31,7 +31,7 @@ from launch_scripts.simulation.study.study import (
 )
 from launch_scripts.simulation.study.summary import Summary
 from launch_scripts.simulation.study.sweep import ResultStore, Sweep
-from launch_scripts.simulation.study.trials import Result, Trial, run_trial
+from launch_scripts.simulation.trials import Result, Trial, run_trial
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError, StoreError
 
