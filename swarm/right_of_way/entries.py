@@ -6,7 +6,7 @@ An entry is over by the word `Left` of the host that had it, or by a usable tabl
 facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
 cell while another leaves it, and stops at the border of its own cell until the word is there.
 
-Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
+Rules, without each of which two vehicles meet (`tests/laws/test_right_of_way.py`):
 
 1. The number of an entry is used once: (cell, epoch, sequence). A table adds one entry to a cell at most.
 2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
