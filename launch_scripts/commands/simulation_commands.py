@@ -271,8 +271,8 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print_summary(summary: Summary, folder: Path) -> None:
-    from launch_scripts.simulation.study.summary import outcome_table
-    from launch_scripts.simulation.study.sweep import PAGE, RESULTS
+    from launch_scripts.simulation.study.summary import METHOD, outcome_table
+    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS
 
     for name in summary.cases[0].outcomes:
         typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
@@ -280,4 +280,4 @@ def _print_summary(summary: Summary, folder: Path) -> None:
         typer.echo(f"failed: {failure.replay}")
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""
     typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
-    typer.echo(f"summary: {folder / PAGE}, results: {folder / RESULTS}")
+    typer.echo(f"{METHOD}\nsummary: {folder / NUMBERS}, results: {folder / RESULTS}")

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
-from launch_scripts.simulation.study.summary import Summary, document, name_of, pictures_of, summarise
+from launch_scripts.simulation.study.summary import Summary, name_of, summarise
 from launch_scripts.simulation.trials import Result, Trial
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
@@ -71,7 +71,7 @@ def _end(content: bytes) -> bytes:
     return _DIGEST + digest_of(content).hex().encode() + b'"}'
 
 
-RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
+RESULTS, NUMBERS, SCENARIOS = "results.parquet", "summary.json", "scenarios"
 SETTING = "set."
 """Begins the name of a column that holds a setting of a case."""
 _Told = Callable[[Case, Trial, Result], Any]
@@ -137,12 +137,6 @@ class Sweep:
             cases.append(case)
         summary = summarise(self.study, cases, self.store.results)
         write_file(self.folder / RESULTS, self._table())
-        pictures = pictures_of(summary)
-        for name, file in pictures.items():
-            from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
-
-            write_file(self.folder / file, draw_outcome(summary.cases, name))
-        write_file(self.folder / PAGE, document(summary, pictures).encode())
         numbers = msgspec.to_builtins(summary, str_keys=True)
         write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
         return summary
