@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from launch_scripts.process_table import SIMULATED_ROLES
-from launch_scripts.simulation.node import Outside, built
+from launch_scripts.simulation.node import built
 from planner_service.prepared_costs import PreparedCosts
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth
@@ -175,8 +175,7 @@ def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replayi
     terrain, truth = ground
     nobody: Any = boundary.nobody
     prepared = cast(PreparedCosts, _Costs(terrain, setup.scenario))
-    outside = Outside(bus=nobody, worker=nobody, prepared=prepared)
-    return built(setup, terrain, truth, boundary, outside, lambda event: None)
+    return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None, prepared=prepared)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:

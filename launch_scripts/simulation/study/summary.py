@@ -141,7 +141,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
 
     results  key of a trial -> result
     """
-    told: list[CaseSummary] = []
+    summaries: list[CaseSummary] = []
     failing: list[Failure] = []
     first: dict[str, dict[str, dict[int, float]]] = {}
     for case in cases:
@@ -153,7 +153,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
         base = first.setdefault(case.scenario, values)
         failures = [_failure(case, trial, result) for trial, result in pairs if result.broken]
         failing += failures
-        told.append(
+        summaries.append(
             CaseSummary(
                 scenario=case.scenario,
                 label=case.label,
@@ -174,7 +174,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
         missing=len(every) - len(there),
         simulated_s=sum(trial.seconds for trial in there),
         cpu_s=sum(results[trial.key].cpu_s for trial in there),
-        cases=told,
+        cases=summaries,
         failing=failing,
     )
 
