@@ -87,15 +87,8 @@ def test_a_process_that_fails_is_told_in_a_sentence() -> None:
         ("swarm --vehicles 0", "--vehicles is '0', expected numbers of at least 1"),
         ("swarm --vehicles 10,many", "--vehicles is '10,many'"),
         ("swarm --vehicles 100001", "--vehicles is 100001, expected 1 to 100000"),
-        ("swarm --vehicles 10 --series", "--series is --vehicles 100,300,1000,3000,10000: give one of the two"),
         ("swarm --targets 0", "--targets is 0, expected 1 to 1000"),
-        ("swarm --agents 3 --per-agent 4", "--agents and --per-agent: give at most one"),
-        ("swarm --vehicles 10 --agents 11", "--agents is 11, expected 1 to 10"),
-        ("swarm --vehicles 5000 --agents 4", "--agents is 4, expected 5 or more"),
-        ("swarm --per-agent 1001", "--per-agent is 1001, expected 1 to 1000"),
-        ("swarm --size 20", "--size is 20, expected 32 to 16384"),
-        ("swarm --vehicles 1000 --size 40", "--size is 40, expected 64 or more for 1000 vehicles"),
-        ("swarm --tick-hz nan", "--tick-hz is nan"),
+        ("swarm --vehicles 1000 --size 40", "--size is 40, expected 64 to 16384"),
     ],
 )
 def test_bad_input_is_one_sentence(words: str, complaint: str) -> None:
