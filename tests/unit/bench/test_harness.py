@@ -73,12 +73,11 @@ def test_a_process_that_fails_is_told_in_a_sentence() -> None:
     ("words", "complaint"),
     [
         ("peers --field moon", "field 'moon' is neither of terrain, uniform, maze nor a file"),
-        ("peers --edge 4", "--edge is '4', expected paper or octile"),
         ("gap --dem no/such.tif", "field 'no/such.tif' is neither of"),
         ("gap --walk fly", "--walk: 'fly' is not one of random, waypoints, evade"),
         ("gap --strategies best", "--strategies: 'best' is not one of auto, exact, full"),
         ("gap --strategies ,", "--strategies is ','"),
-        ("gap --dem maze --vehicles 999999", "--vehicles is 999999; the field has"),
+        ("scale --sizes 16 --vehicles 999", "--vehicles is 999; the field has"),
         ("wire --parts latency,speed", "'speed' is not one of latency, throughput"),
         ("crowd --worlds open,sea", "--worlds: 'sea' is not one of open, doors, corridor, maze"),
         ("crowd --seeds 5", "--seeds: '5' is not A:B"),
