@@ -185,8 +185,3 @@ class HostEntries:
         asked = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
         new = [number for number in asked if number[1] and number[1:] > knows]
         self.disclaimed[shard] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
-
-    def holds(self, shard: int) -> dict[str, list[Number]]:
-        """Returns vehicle -> its entries in a shard: all others that its newest table lists are over."""
-        held = {vehicle: self.of(vehicle).get(shard, []) for vehicle in self.paths}
-        return {vehicle: numbers for vehicle, numbers in held.items() if numbers}
