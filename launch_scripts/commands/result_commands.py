@@ -162,7 +162,6 @@ def replay(
     run: RunArgument = "LAST",
     process: str | None = None,
     until_s: Annotated[float | None, typer.Option(min=0)] = None,
-    keep: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> int:
@@ -170,23 +169,17 @@ def replay(
 
     swarm demo --record-inputs, then swarm runs replay
 
-    swarm runs replay LAST --process planner-t3 --until-s 34.5 --keep my-case
+    swarm runs replay LAST --process planner-t3 --until-s 34.5
 
     A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
 
     process  Only this process, such as planner-t3.
     until_s  Stop at this time (s) of the run's own clock.
-    keep     Copy the replayed files into a folder: a test case.
     """
-    from launch_scripts.simulation.replay import keep as keep_recorded
     from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 
     logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
     folder = find_run(run, runs)
-    if keep is not None:
-        for recorded in recordings_of(folder, process):
-            typer.echo(f"kept {keep_recorded(recorded, keep, until_s)}", err=as_json)
-        folder = keep
     refused = unreadable(folder, process)
     others = {
         name: two for recorded in recordings_of(folder, process) for name, two in other_versions(recorded).items()

@@ -7,9 +7,9 @@ import json
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
@@ -25,10 +25,9 @@ from swarm.files import writing
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.many_seeds import Verdict
     from launch_scripts.simulation.study.summary import Summary
     from launch_scripts.simulation.study.sweep import Sweep
-    from launch_scripts.simulation.study.trials import Result, Trial
+    from launch_scripts.simulation.trials import Result, Trial
 
 app = typer.Typer()
 study_app = family_app("Run scenarios with many settings and seeds, on many processes and machines.")
@@ -46,7 +45,6 @@ def simulate(
     seed: Seed = None,
     seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1)] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=256)] = 1,
     runs: Runs = Path("runs"),
     trace: Path | None = None,
     as_json: AsJson = False,
@@ -61,7 +59,7 @@ def simulate(
     Without a name each seed takes the next of the small worlds. Exit code 1 if a law broke in any seed, such as by
     a collision, a lost mark or a vehicle without a route.
 
-    swarm simulate --seeds 0:100 --jobs 2
+    swarm simulate --seeds 0:100
 
     swarm simulate doors --seeds 17:18
 
@@ -69,7 +67,6 @@ def simulate(
     seed      Seed of everything random.
     seeds     Try the seeds A to B - 1, each with faults of every kind.
     seconds   Simulated seconds.
-    jobs      With --seeds: seeds that run at the same time.
     trace     Write the event log here; the same seed writes the same log.
     """
     if seeds is None:
@@ -79,7 +76,7 @@ def simulate(
         return 0
     if seed is not None or trace is not None:
         raise ConfigError("--seeds goes with neither --seed nor --trace")
-    return int(not simulate_seeds(scenario, seeds, seconds, jobs, as_json))
+    return int(not simulate_seeds(scenario, seeds, seconds, as_json))
 
 
 def _simulate_once(
@@ -135,63 +132,59 @@ def _simulate_once(
         raise StoreError(f"the event log {trace} has no end: {done.log.cut}")
 
 
-def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:
+def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json: bool) -> bool:
     """Runs many seeds with faults, and prints what they break. True if every law held in all of them."""
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.simulation.many_seeds import MIX, SECONDS, parse_seeds, run_seeds
+    from launch_scripts.simulation.trials import MIX, SECONDS, Trial, parse_seeds, replay_of, run_trial, world_of
     from launch_scripts.simulation.worlds import WORLDS
 
-    some = parse_seeds(seeds)
-    name = MIX if name is None else name
+    some, name = parse_seeds(seeds), name or MIX
     given = None if name in (MIX, *WORLDS) else find_scenario(name)
-    began_s = time.monotonic()
-    verdicts: list[Verdict] = []
-    for verdict in run_seeds(name, some, jobs, SECONDS if seconds is None else seconds, given):
-        verdicts.append(verdict)
-        typer.echo(_line(verdict, len(verdicts), len(some)), err=as_json)
-    verdicts.sort(key=lambda verdict: verdict.seed)
-    total = _total(verdicts, time.monotonic() - began_s)
+    seconds = SECONDS if seconds is None else seconds
+    failing, results = [], []
+    for seed in some:
+        trial = Trial("", world_of(name, seed), given, seed, seconds, True)
+        result = run_trial(trial)
+        results.append(result)
+        if result.broken:
+            again = replay_of(trial.world, seed, seconds, SECONDS)
+            broken = list(map(str, result.broken))
+            failing.append({"world": trial.world, "seed": seed, "broken": broken, "replay": again})
+        typer.echo(f"{len(results)}/{len(some)} {_line(trial, result)}", err=as_json)
+    figures = [result.figures for result in results]
+    waits_s, routed_s = (
+        max(each.get(figure, 0.0) for each in figures) for figure in ("longest_wait_s", "routed_after_s")
+    )
     if as_json:
-        typer.echo(json.dumps({**total, "verdicts": msgspec.to_builtins(verdicts)}, indent=2))
-        return not total["failing"]
-    faults = ", ".join(f"{many} {kind.replace('_', ' ')}" for kind, many in total["faults"].items())
+        total = {"seeds": len(some), "longest_wait_s": waits_s, "routed_after_s": routed_s, "failing": failing}
+        typer.echo(json.dumps({**total, "results": msgspec.to_builtins(results)}, indent=2))
+        return not failing
+    faults = sum((Counter(each) for each in figures), Counter())
+    told = ", ".join(
+        f"{many:.0f} {name.removeprefix('faults.').replace('_', ' ')}"
+        for name, many in faults.items()
+        if name.startswith("faults.")
+    )
     typer.echo(
-        f"{total['seeds']} seeds, {total['simulated_s']:g} simulated seconds, {total['deliveries']:,} deliveries "
-        f"in {total['wall_s']:.0f} s; {faults}\n"
-        f"longest wait without a reason {total['longest_wait_s']:.1f} s, all routed at most "
-        f"{total['routed_after_s']:.2f} s after the last fault"
+        f"{len(some)} seeds, {len(some) * seconds:g} simulated seconds in "
+        f"{sum(each.wall_s for each in results):.0f} s; {told}\n"
+        f"longest wait without a reason {waits_s:.1f} s, all routed at most {routed_s:.2f} s after the last fault"
     )
-    for failure in total["failing"]:
+    for failure in failing:
         typer.echo(f"failed: {failure['replay']}")
-    typer.echo(f"{len(total['failing'])} of {total['seeds']} seeds broke a law")
-    return not total["failing"]
+    typer.echo(f"{len(failing)} of {len(some)} seeds broke a law")
+    return not failing
 
 
-def _line(verdict: Verdict, done: int, many: int) -> str:
-    routed = "never" if verdict.routed_after_s is None else f"{verdict.routed_after_s:.2f} s"
+def _line(trial: Trial, result: Result) -> str:
+    figures = result.figures
+    routed = f"{figures['routed_after_s']:.2f} s" if "routed_after_s" in figures else "never"
     text = (
-        f"{done}/{many} {'FAILED' if verdict.broken else 'held  '} {verdict.world} seed {verdict.seed}: "
-        f"longest wait {verdict.longest_wait_s:.1f} s, routed after {routed}, {verdict.captures} captures, "
-        f"{verdict.wall_s:.0f} s"
+        f"{'FAILED' if result.broken else 'held  '} {trial.world} seed {trial.seed}: "
+        f"longest wait {figures['longest_wait_s']:.1f} s, routed after {routed}, "
+        f"{figures.get('captures', 0):.0f} captures, {result.wall_s:.0f} s"
     )
-    return "\n".join([text, *(f"    {law}" for law in verdict.broken)])
-
-
-def _total(verdicts: Sequence[Verdict], wall_s: float) -> dict[str, Any]:
-    failing = [each for each in verdicts if each.broken]
-    return {
-        "seeds": len(verdicts),
-        "failing": [
-            {"world": each.world, "seed": each.seed, "broken": list(map(str, each.broken)), "replay": each.replay}
-            for each in failing
-        ],
-        "longest_wait_s": max(each.longest_wait_s for each in verdicts),
-        "routed_after_s": max(each.routed_after_s or 0.0 for each in verdicts),
-        "simulated_s": sum(each.seconds for each in verdicts),
-        "deliveries": sum(each.deliveries for each in verdicts),
-        "faults": dict(sum((Counter(each.faults) for each in verdicts), Counter())),
-        "wall_s": wall_s,
-    }
+    return "\n".join([text, *(f"    {law}" for law in result.broken)])
 
 
 @command(study_app)
@@ -278,8 +271,8 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print_summary(summary: Summary, folder: Path) -> None:
-    from launch_scripts.simulation.study.summary import outcome_table
-    from launch_scripts.simulation.study.sweep import PAGE, RESULTS
+    from launch_scripts.simulation.study.summary import METHOD, outcome_table
+    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS
 
     for name in summary.cases[0].outcomes:
         typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
@@ -287,4 +280,4 @@ def _print_summary(summary: Summary, folder: Path) -> None:
         typer.echo(f"failed: {failure.replay}")
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""
     typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
-    typer.echo(f"summary: {folder / PAGE}, results: {folder / RESULTS}")
+    typer.echo(f"{METHOD}\nsummary: {folder / NUMBERS}, results: {folder / RESULTS}")

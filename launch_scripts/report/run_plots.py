@@ -7,8 +7,7 @@ time, states of all vehicles in a stack, or the share of all that is at most so 
 from __future__ import annotations
 
 import contextlib
-import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -200,7 +199,7 @@ def halo() -> list[Any]:
 
 
 @contextlib.contextmanager
-def saved(path: Path | io.BytesIO, size_in: tuple[float, float], dpi: int = 120, **look: Any) -> Iterator[Figure]:
+def saved(path: Path, size_in: tuple[float, float], dpi: int = 120, **look: Any) -> Iterator[Figure]:
     """A figure in the style of all pictures, which is written at the end. Raises StoreError if it cannot be.
 
     look  as `Figure` takes it
@@ -210,39 +209,7 @@ def saved(path: Path | io.BytesIO, size_in: tuple[float, float], dpi: int = 120,
         FigureCanvasAgg(figure)
         yield figure
         try:
-            with contextlib.nullcontext(path) if isinstance(path, io.BytesIO) else replacing(path) as target:
+            with replacing(path) as target:
                 figure.savefig(target, format="png", pil_kwargs={"compress_level": 4})
         except ValueError as error:  # too many pixels
             raise StoreError(f"cannot write {path}: {error}") from error
-
-
-# --- of a study ---------------------------------------------------------------------------------------------------
-
-
-def draw_outcome(cases: Sequence[Any], outcome: str) -> bytes:
-    """A picture (PNG) of an outcome of a study: every seed a dot, and the mean of each case with its interval.
-
-    cases  each a `CaseSummary`, a row from the top in the order of the study
-    """
-    several = len({case.scenario for case in cases}) > 1
-    labels = [f"{case.scenario}: {case.label}" if several else case.label for case in cases]
-    chance, content = np.random.default_rng(0), io.BytesIO()
-    with saved(content, (8.0, 1.3 + 0.42 * len(cases)), 110, layout="constrained") as figure:
-        axes = figure.subplots()
-        for row, found in enumerate(case.outcomes[outcome] for case in cases):
-            values = np.array(list(found.values.values()))
-            faint = max(0.08, min(0.5, 20 / max(len(values), 1)))
-            heights = row + chance.uniform(-0.28, 0.28, len(values))
-            axes.plot(values, heights, ".", color=palette.BLUE, ms=5, alpha=faint, mew=0)
-            if found.mean is not None:
-                axes.plot(found.mean.value, row, "D", color=palette.ORANGE, ms=6, mec="white", mew=0.8, zorder=3)
-                if found.mean.low is not None and found.mean.high is not None:
-                    axes.plot([found.mean.low, found.mean.high], [row, row], "-", color=palette.ORANGE, lw=2.5)
-        axes.set_yticks(range(len(cases)), labels)
-        axes.set_ylim(len(cases) - 0.5, -0.5)
-        axes.grid(visible=False, axis="y")
-        axes.set_title(outcome)
-        axes.set_xlabel(
-            "a dot is a seed; the diamond is their mean, the bar its 95 % interval", color=palette.FAINT
-        )
-    return content.getvalue()

@@ -246,14 +246,14 @@ class LawBook:
         """Returns the laws that broke. At the end the agents die, so that nothing new is said."""
         simulation = self.simulation
         simulation.run_until(seconds - SETTLED_S)
-        said: Sets = {}
+        published: Sets = {}
         for name, replica in self._replicas().items():
             if simulation.nodes[name].spec.role == "agent":
-                said |= sets_of(replica.own_digest())
+                published |= sets_of(replica.own_digest())
         simulation.run_until(seconds)
         broken: list[BrokenLaw] = []
         for name, replica in self._replicas().items() if simulation.scenario.map.interest == "all" else ():
-            if lacks := missing(sets_of(replica.held.ledger.held()), said):
+            if lacks := missing(sets_of(replica.held.ledger.held()), published):
                 first = f"{len(lacks)} sets that were said {SETTLED_S:g} s ago, such as {lacks[0]}"
                 broken.append(BrokenLaw("marks reach everybody", f"{name} lacks {first}"))
         for node in simulation.nodes.values():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
@@ -43,39 +42,40 @@ EPOCH_NS = 1_800_000_000 * NS_PER_S
 """Start of every simulation: a date, so that times look as in a real run."""
 
 
-@dataclass(frozen=True)
-class Outside:
-    """External objects of a service; None where there is none, as in a replay, which takes recorded readings."""
-
-    bus: Bus
-    worker: Worker
-    store: KeeperStore | None = None
-    promises: PromiseStore | None = None
-    prepared: PreparedCosts | None = None
-
-
 def built(
-    setup: RoleSetup, terrain: Terrain, truth: Floats, boundary: Boundary, outside: Outside, post: Post
+    setup: RoleSetup,
+    terrain: Terrain,
+    truth: Floats,
+    boundary: Boundary,
+    bus: Bus,
+    worker: Worker,
+    post: Post,
+    store: KeeperStore | None = None,
+    promises: PromiseStore | None = None,
+    prepared: PreparedCosts | None = None,
 ) -> Service:
-    """The service of a process that is simulated or replayed. Raises StoreError on a role that has none."""
-    bus = boundary.bus(outside.bus)
+    """The service of a process that is simulated or replayed. Raises StoreError on a role that has none.
+
+    store, promises  external objects; None in a replay, which takes recorded readings
+    """
+    bus = boundary.bus(bus)
     match setup.role:
         case "keeper":
             Modules(ZONE_MODULES).wait()
             # In the order of `shared_map.keeper.main`, in which a recording has them.
             modules: Callable[[], bool] | None = boundary.function("modules of zones", None, bool)
-            store = boundary.external(cast(KeeperStore, outside.store), KEEPER_STORE)
+            store = boundary.external(cast(KeeperStore, store), KEEPER_STORE)
             return KeeperService(setup, terrain, bus, post, store, modules)
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-            prepared = boundary.external(outside.prepared, PREPARED_COSTS)
-            worker = boundary.worker(outside.worker)
+            prepared = boundary.external(prepared, PREPARED_COSTS)
+            worker = boundary.worker(worker)
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
             return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, prepared)
         case "places":
-            worker = boundary.worker(outside.worker)
+            worker = boundary.worker(worker)
             of_places: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
@@ -84,7 +84,7 @@ def built(
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)
         case "agent":
-            promises = boundary.external(cast(PromiseStore, outside.promises), PROMISE_STORE)
+            promises = boundary.external(cast(PromiseStore, promises), PROMISE_STORE)
             return AgentService(setup, terrain, truth, bus, post, promises)
     raise StoreError(f"no process of role {setup.role!r} is simulated or replayed")
 
@@ -181,51 +181,54 @@ class Node:
             simulation.terrain,
             simulation.truth,
             boundary,
-            Outside(bus=bus, worker=worker, store=self.store, promises=self.promises),
+            bus,
+            worker,
             post,
+            self.store,
+            self.promises,
         )
         self._shell = boundary.service(self.service)
         self._shell.start(self.now_ns())
-        for look in simulation.after_boot:
-            look(self)
+        for callback in simulation.after_boot:
+            callback(self)
         simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
 
     def _tick(self, bus: MemoryBus) -> None:
         if self.bus is not bus or self._shell is None:
             return
         if self.ticking and self._waiting is None:
-            self._call(bus, self._shell.tick, looks=True)
+            self._call(bus, self._shell.tick, ticked=True)
         self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
 
-    def _call(self, bus: MemoryBus, work: Callable[[int], None], *, looks: bool = False) -> None:
+    def _call(self, bus: MemoryBus, work: Callable[[int], None], *, ticked: bool = False) -> None:
         """Calls the service as `Process` does: inbox, clock, work. It may be stopped anywhere between."""
         links, scheduler = self._simulation.links, self._simulation.scheduler
         stop = links.stop(self._clock.now_ns())
         bus.gather()
         if stop is None:
-            return self._work(work, self.now_ns(), looks)
+            return self._work(work, self.now_ns(), ticked)
         self.hang()
         timed_ns = self.now_ns()
         until_ns = self._clock.now_ns() + stop.lasts_ns
         if stop.sends is not None:
             links.hold(self.name, stop.sends, until_ns)
-            self._work(work, timed_ns, looks)
+            self._work(work, timed_ns, ticked)
 
         def go_on() -> None:
             if self.bus is bus:
                 if stop.sends is None:
-                    self._work(work, timed_ns if stop.timed else self.now_ns(), looks)
+                    self._work(work, timed_ns if stop.timed else self.now_ns(), ticked)
                 self.wake()
 
         scheduler.at(until_ns, go_on)
         return None
 
-    def _work(self, work: Callable[[int], None], now_ns: int, looks: bool) -> None:
+    def _work(self, work: Callable[[int], None], now_ns: int, ticked: bool) -> None:
         driven = self._driven
         with in_loop(None):
             work(now_ns)
-        for look in self._simulation.after_tick if looks or driven != self._driven else ():
-            look(self)
+        for callback in self._simulation.after_tick if ticked or driven != self._driven else ():
+            callback(self)
 
     @property
     def _driven(self) -> int:

@@ -1,5 +1,5 @@
 """Replay of a run's recordings: each recorded process is built again as this build makes it, fed with what it was
-fed, and compared with what it did; a part of a recording is copied for a test."""
+fed, and compared with what it did."""
 
 from __future__ import annotations
 
@@ -11,21 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from launch_scripts.observe.run_folder import SCENARIO_FILE
 from launch_scripts.process_table import SIMULATED_ROLES
-from launch_scripts.simulation.node import Outside, built
+from launch_scripts.simulation.node import built
 from planner_service.prepared_costs import PreparedCosts
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
-from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
-from swarm.files import write_file
-from swarm.recording.recording import path_of, versions
-from swarm.recording.records import FOLDER, SUFFIX, Called, Cut, Handled, Head, RecordReader, RecordWriter
+from swarm.recording.recording import versions
+from swarm.recording.records import FOLDER, SUFFIX, Head, RecordReader
 from swarm.recording.replaying import Outcome, Replaying, replay
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
@@ -178,8 +175,7 @@ def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replayi
     terrain, truth = ground
     nobody: Any = boundary.nobody
     prepared = cast(PreparedCosts, _Costs(terrain, setup.scenario))
-    outside = Outside(bus=nobody, worker=nobody, prepared=prepared)
-    return built(setup, terrain, truth, boundary, outside, lambda event: None)
+    return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None, prepared=prepared)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
@@ -190,34 +186,3 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
         for name, version in recorded.head.versions.items()
         if version != here.get(name)
     }
-
-
-def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
-    """Copies a recording, up to a time, into a folder which `swarm runs replay` and a test can replay. Raises
-    StoreError."""
-    head, scenario = recorded.head, folder / SCENARIO_FILE
-    path = path_of(folder, head.role, head.id, head.incarnation)
-    until_ns = None if until_s is None else head.started_ns + int(until_s * NS_PER_S)
-    if path.exists():
-        raise StoreError(f"{path} is there already: choose another folder")
-    if scenario.exists() and scenario.read_bytes() != head.scenario.encode():
-        raise StoreError(f"{scenario} is there already, and of another run: choose another folder")
-    with RecordReader(recorded.path) as reader:
-        writer = RecordWriter(path)
-        writer.write(head)
-        for record in reader:
-            if isinstance(record, Called | Handled) and until_ns is not None and record.now_ns > until_ns:
-                writer.write(Cut(f"kept until {until_s:g} s", whole=True))
-                break
-            writer.write(record)
-        writer.close()
-    try:
-        if writer.cut is not None:
-            raise StoreError(writer.cut)
-        if reader.damaged is not None:
-            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until-s")
-        write_file(scenario, head.scenario.encode())
-    except StoreError:
-        path.unlink(missing_ok=True)
-        raise
-    return path

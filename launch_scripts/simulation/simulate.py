@@ -216,18 +216,18 @@ class Simulation:
 
 
 def run_to_end(
-    simulation: Simulation, tell: Callable[[str, float], None] = lambda what, share: None
+    simulation: Simulation, progress: Callable[[str, float], None] = lambda what, share: None
 ) -> dict[str, Any]:
     """Runs a simulation for the seconds of its scenario. Returns the numbers of report.json; the same for the same
     seed.
 
-    tell  called after each tenth of a second with what is done, and the share of it
+    progress  called after each tenth of a second with what is done, and the share of it
     """
     seconds = simulation.scenario.seconds
     with collected_rarely():
         for step in range(1, round(seconds * _STEPS_PER_S)):
             simulation.run_until(step / _STEPS_PER_S)
-            tell("simulating", step / _STEPS_PER_S / seconds)
+            progress("simulating", step / _STEPS_PER_S / seconds)
         simulation.run_until(seconds)
         simulation.finish()
     simulation.log.flush()

@@ -129,13 +129,9 @@ class Outputs(Record, frozen=True, tag=4):
 
 
 class Cut(Record, frozen=True, tag=5):
-    """The last record of a recording that does not go on to the end, though the process did.
-
-    whole  whether all that the last call let out is there
-    """
+    """The last record of a recording that does not go on to the end, though the process did."""
 
     why: str
-    whole: bool = False
 
 
 class Ended(Record, frozen=True, tag=6):

@@ -211,8 +211,6 @@ class _Replay:
                 self.ended = "ended as asked"
                 return
             elif isinstance(record, Cut):
-                if record.whole:
-                    yield step
                 self.ended = record.why
                 return
             else:

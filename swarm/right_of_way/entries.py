@@ -6,7 +6,7 @@ An entry is over by the word `Left` of the host that had it, or by a usable tabl
 facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
 cell while another leaves it, and stops at the border of its own cell until the word is there.
 
-Rules, without each of which two vehicles meet (`tests/laws/test_entries.py`):
+Rules, without each of which two vehicles meet (`tests/laws/test_right_of_way.py`):
 
 1. The number of an entry is used once: (cell, epoch, sequence). A table adds one entry to a cell at most.
 2. A vehicle enters once *all* entries before its own are over, not only the last: that one may have been given
@@ -185,8 +185,3 @@ class HostEntries:
         asked = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
         new = [number for number in asked if number[1] and number[1:] > knows]
         self.disclaimed[shard] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
-
-    def holds(self, shard: int) -> dict[str, list[Number]]:
-        """Returns vehicle -> its entries in a shard: all others that its newest table lists are over."""
-        held = {vehicle: self.of(vehicle).get(shard, []) for vehicle in self.paths}
-        return {vehicle: numbers for vehicle, numbers in held.items() if numbers}

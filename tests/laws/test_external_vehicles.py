@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from support.careless_hosts import takes_what_an_older_table_added
 from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
@@ -144,6 +143,30 @@ def a_cell_that_was_shut_for_a_external_is_anybodys(patch: pytest.MonkeyPatch) -
     patch.setattr(Orders, "_open", lambda self, host, generation, bodies: opened(self, host, generation, {}))
 
 
+def forgets_those_before_in_earlier_generations(patch: pytest.MonkeyPatch) -> None:
+    before = Orders.before
+    patch.setattr(
+        Orders, "before", lambda self, *of: (each for each in before(self, *of) if each[0] not in self._fences)
+    )
+
+
+def frees_what_the_host_did_not_know_of(patch: pytest.MonkeyPatch) -> None:
+    remove = Orders.remove
+    patch.setattr(Orders, "remove", lambda self, host, holds, _: remove(self, host, holds, (1 << 60, 0)))
+
+
+def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
+    take = Orders.take_host_state
+    patch.setattr(Orders, "take_host_state", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
+
+
+def says_of_each_generation_before_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
+    begin = Host.begin
+    patch.setattr(
+        Host, "begin", lambda self, dead, chance: begin(self, sorted({*dead, self._known_generation} - {0}), chance)
+    )
+
+
 def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPatch) -> None:
     carry = ExternalWorld.carry_away
 
@@ -158,10 +181,13 @@ def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPat
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     first_cells_are_entered_while_others_are_there,
     a_silent_external_loses_its_cells,
-    takes_what_an_older_table_added,
     a_robot_that_is_replaced_says_that_it_has_ended,
     a_robot_drives_on_though_it_is_replaced,
     a_cell_that_was_shut_for_a_external_is_anybodys,
+    forgets_those_before_in_earlier_generations,
+    frees_what_the_host_did_not_know_of,
+    forgets_where_bodies_are,
+    says_of_each_generation_before_that_it_has_ended,
     an_operator_says_gone_of_one_that_still_stands_there,
 ]
 

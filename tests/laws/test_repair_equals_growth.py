@@ -5,19 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.kernel_oracle import inner
-from support.planner_strategies import RULES, random_pace
+from support.planner_strategies import RULES, random_climb, random_pace
 from support.repaired_tree import FACTORS, Patchwork
 
-from swarm.grid import Window
+from shared_map.array_files import Floats
+from swarm.grid import GridSpec, Window
 
 
-def trials(count: int, seed: int, shape: tuple[int, int], most_side: int) -> int:
+def patchwork(rng: np.random.Generator, pace: Floats, n: int, directed: bool) -> Patchwork:
+    """A map by the nth rules, directed or not."""
+    grid = GridSpec(*pace.shape, 1.0)
+    climb = random_climb(rng, grid, (0.0, 0.1, 0.4)[n % 3], (0.3, 0.6)[n % 2]) if directed else None
+    return Patchwork(rng, pace, RULES[n % 5], climb)
+
+
+def trials(count: int, seed: int, shape: tuple[int, int], most_side: int, directed: bool = False) -> int:
     """Number of changes, on maps of all kinds, that were repaired without a fallback."""
     mended = 0
     for n in range(0, count, 12):
         rng = np.random.default_rng([seed, n])
         ratio, walls = (1.0, 4.0, 30.0, 1000.0)[n // 12 % 4], (0.0, 0.15, 0.35)[n // 48 % 3]
-        work = Patchwork(rng, random_pace(rng, *shape, ratio, walls), RULES[n // 12 % 5])
+        work = patchwork(rng, random_pace(rng, *shape, ratio, walls), n // 12, directed)
         for m in range(12):
             # Every other time several patches at once, of different kinds and sizes.
             parts = [FACTORS[(m + part) % 6] for part in range(1 if m % 2 else 3)]
@@ -31,8 +39,11 @@ def trials(count: int, seed: int, shape: tuple[int, int], most_side: int) -> int
     return mended
 
 
-def test_six_hundred_repaired_trees_are_those_that_would_have_grown() -> None:
-    assert trials(600, 1, (48, 53), 9) > 200
+@pytest.mark.parametrize(("count", "directed"), [(600, False), (180, True)])
+def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(
+    count: int, directed: bool
+) -> None:
+    assert trials(count, 1, (48, 53), 9, directed) > count // 3
 
 
 @pytest.mark.slow
@@ -52,8 +63,7 @@ def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
 
 def test_a_wall_across_the_map_takes_the_way_from_all_behind_it_and_a_door_gives_it_back() -> None:
     work = Patchwork(np.random.default_rng(1), np.ones((30, 30), np.float32), RULES[0])
-    work.root = work.grid.cell(2, 2)
-    work.tree.grow(work.root)
+    work.tree.grow(work.grid.cell(2, 2))
     work.pace[15] = np.inf
     work.mend([Window(15, 0, 16, 30)])
     work.check()
@@ -85,8 +95,8 @@ def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float, cou
     work.check()
 
 
-@pytest.mark.parametrize("rules", RULES)
-def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(rules: dict) -> None:
+@pytest.mark.parametrize("directed", [False, True])
+def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(directed: bool) -> None:
     rng = np.random.default_rng(6)
-    for _ in range(20):
-        Patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), rules).check_lowered()
+    for n in range(60):
+        patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), n, directed).check_lowered()

@@ -14,10 +14,9 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.careless_hosts import takes_what_an_older_table_added
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
-from swarm.right_of_way.entries import HostEntries
+from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Entry
 from vehicle_agent.traffic.cell_orders import Orders
@@ -231,6 +230,32 @@ def says_that_it_has_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Holdings, "lefts", early)
 
 
+def takes_what_an_older_table_added(patch: pytest.MonkeyPatch) -> None:
+    """A host takes again what it gave back, passed over, or never knew."""
+    hear = HostEntries.hear_granted
+
+    def greedy(self: HostEntries, shard, stamp, generation, grants):  # type: ignore[no-untyped-def]
+        knows = self.knows.pop(shard, BEFORE_ALL)
+        changed = hear(self, shard, stamp, generation, grants) if stamp > knows else set()
+        self.knows[shard] = max(knows, self.knows.get(shard, knows))
+        return changed
+
+    patch.setattr(HostEntries, "hear_granted", greedy)
+
+
+def believes_that_another_vehicle_of_the_cell_has_left(patch: pytest.MonkeyPatch) -> None:
+    def careless(self: HostEntries, host: str, numbers) -> None:  # type: ignore[no-untyped-def]
+        cells = {number[0] for number in numbers}
+        for path in self.paths.values():
+            path[:] = [Entry(each.number) if each.cell in cells else each for each in path]
+
+    patch.setattr(HostEntries, "hear_left", careless)
+
+
+def forgets_who_is_before(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Orders, "before", lambda self, number, vehicle: iter(()))
+
+
 def a_new_generation_takes_what_the_last_one_held(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Orders, "_fence", lambda self, host, generation: None)
 
@@ -271,6 +296,8 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
     follows_on_the_word_of_the_last_before_it,
     says_that_it_has_left_when_it_sets_out,
     takes_what_an_older_table_added,
+    believes_that_another_vehicle_of_the_cell_has_left,
+    forgets_who_is_before,
     a_new_generation_takes_what_the_last_one_held,
     seats_a_file_that_is_not_the_first,
     acts_on_a_table_that_is_not_the_newest,

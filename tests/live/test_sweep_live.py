@@ -18,7 +18,7 @@ from launch_scripts.simulation.study import cluster
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import load_study, plan
 from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep
-from launch_scripts.simulation.study.trials import run_trial
+from launch_scripts.simulation.trials import run_trial
 from swarm.errors import BusError
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(280)]

@@ -12,34 +12,32 @@ import pytest
 from launch_scripts.commands.simulation_commands import simulate_seeds
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
-from launch_scripts.simulation.many_seeds import MIX, Verdict, run_seeds, try_seed, world_of
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trials import MIX, SECONDS, Result, Trial, replay_of, run_trial, world_of
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
+from swarm.config.scenario import Scenario
 from vehicle_agent.traffic.steering import Steering
 
 
-def same(verdict: Verdict) -> Verdict:
-    return msgspec.structs.replace(verdict, wall_s=0.0)
+def result_of(seed: int, name: str = "small", given: Scenario | None = None) -> Result:
+    """The result of four simulated seconds of a seed, without the time that they take."""
+    result = run_trial(Trial("", name, given, seed, 4.0, True))
+    return msgspec.structs.replace(result, wall_s=0.0, cpu_s=0.0)
 
 
-def test_seeds_do_the_same_one_by_one_and_side_by_side():
-    alone = {v.seed: same(v) for v in run_seeds("small", range(2), jobs=1, seconds=4)}
-    beside = {v.seed: same(v) for v in run_seeds("small", range(2), jobs=2, seconds=4)}
-    assert alone == beside
-    assert alone[0] != alone[1]
+def test_a_seed_does_the_same_again_and_another_does_not():
+    assert result_of(0) == result_of(0) != result_of(1)
 
 
 def test_the_mix_takes_every_world_in_turn_and_a_replay_names_it():
     assert [world_of(MIX, seed) for seed in range(6)] == list(MIXED)
-    verdict = Verdict(world=world_of(MIX, 9), seed=9, seconds=30.0, broken=[])
-    assert verdict.replay == "swarm simulate doors --seeds 9:10"
-    assert msgspec.structs.replace(verdict, seconds=5.0).replay.endswith("--seconds 5")
+    assert replay_of("doors", 9, 30.0, SECONDS) == "swarm simulate doors --seeds 9:10"
+    assert replay_of("doors", 9, 5.0, SECONDS).endswith("--seconds 5")
 
 
 def test_a_scenario_of_ones_own_is_tried_too():
-    given = msgspec.structs.replace(SMALL, name="mine")
-    [verdict] = run_seeds("mine", range(3, 4), jobs=1, seconds=4, given=given)
-    assert same(verdict) == same(msgspec.structs.replace(try_seed("small", 3, 4)[0], world="mine"))
+    mine = result_of(3, "mine", msgspec.structs.replace(SMALL, name="mine"))
+    assert mine.figures["deliveries"] == result_of(3).figures["deliveries"]
 
 
 def test_a_process_that_never_comes_back_breaks_a_law():
@@ -85,14 +83,15 @@ def test_a_wait_counts_as_long_as_every_process_works(works: bool, monkeypatch: 
 
 
 def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
-    assert simulate_seeds("small", "3:4", 8, 1, as_json=True)
+    assert simulate_seeds("small", "3:4", 8, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed["seeds"] == 1
     assert printed["failing"] == []
-    assert printed["deliveries"] > 1000
-    broken = Verdict(world="small", seed=3, seconds=30.0, broken=[BrokenLaw("a law", "it broke")])
-    monkeypatch.setattr("launch_scripts.simulation.many_seeds.try_seed", lambda *_: (broken, {}))
-    assert not simulate_seeds("small", "3:4", None, 1, as_json=False)
+    assert printed["results"][0]["figures"]["deliveries"] > 1000
+    broken = [BrokenLaw("a law", "it broke")]
+    result = Result(key="", figures={"longest_wait_s": 1.0}, broken=broken, wall_s=1.0, cpu_s=1.0)
+    monkeypatch.setattr("launch_scripts.simulation.trials.run_trial", lambda trial: result)
+    assert not simulate_seeds("small", "3:4", None, as_json=False)
     out = capsys.readouterr().out
     assert "FAILED small seed 3" in out
     assert "it broke" in out

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.replay import keep, recordings_of, replay_run
+from launch_scripts.simulation.replay import recordings_of, replay_run
 from launch_scripts.simulation.worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
@@ -28,7 +28,7 @@ from swarm.errors import ConfigError, StoreError
 from swarm.recording import records
 from swarm.recording.external_calls import ExternalCalls
 from swarm.recording.recording import Recording
-from swarm.recording.records import MAGIC, Called, Cut, Handled, Output, Outputs, Record, RecordReader, packed
+from swarm.recording.records import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
 from swarm.recording.replaying import Outcome
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
@@ -285,25 +285,11 @@ def test_a_full_disk_cuts_the_recording_and_not_the_run(tmp_path: Path) -> None:
         recordings_of(tmp_path)
 
 
-def test_what_is_kept_of_a_recording_is_replayed_by_itself(run: Path, tmp_path: Path) -> None:
-    recorded = recordings_of(run, "agent-a1")[0]
-    keep(recorded, tmp_path, 3.0)
-    assert any(isinstance(each, Cut) for each in records_of(recordings_of(tmp_path)[0].path))
-    (kept,) = replay_run(tmp_path)
+def test_a_replay_ends_at_the_time_that_is_asked_for(run: Path) -> None:
     (until, *_) = replay_run(run, "agent-a1", 3.0)
-    assert kept.same
-    assert kept.outcome is not None
+    assert until.same
     assert until.outcome is not None
-    assert kept.outcome.events == until.outcome.events
-    assert 2.5 < kept.outcome.seconds <= 3.0
-    with pytest.raises(StoreError, match="is there already"):
-        keep(recorded, tmp_path, 3.0)
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "scenario.toml").write_text("name = 'mine'\n")
-    with pytest.raises(StoreError, match=r"scenario\.toml is there already"):
-        keep(recorded, other, 3.0)
-    assert [each.name for each in other.iterdir()] == ["scenario.toml"]
+    assert 2.5 < until.outcome.seconds <= 3.0
 
 
 def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_differs(

@@ -12,8 +12,8 @@ from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_all_examples, write_example
 from support.simulated import simulate
 
-from launch_scripts.simulation.many_seeds import try_seed
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trials import Trial, run_trial
 from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.wire.messages.processes import Note
@@ -160,8 +160,8 @@ def test_whatever_plugins_say_under_all_faults_no_law_of_safety_breaks(seed: int
     """Sensors that lie put walls around vehicles, and dynamics let them stand: they may wait, and nothing else."""
     (tmp_path / "wild.py").write_text(WILD)
     (tmp_path / "scenario.toml").write_text(WILD_SCENARIO)
-    verdict, _ = try_seed("wild", seed, 12.0, load_scenario(tmp_path / "scenario.toml"))
-    assert [law for law in verdict.broken if " waits " not in law.sentence] == []
+    result = run_trial(Trial("", "wild", load_scenario(tmp_path / "scenario.toml"), seed, 12.0, True))
+    assert [law for law in result.broken if " waits " not in law.sentence] == []
 
 
 def test_a_seed_replays_a_run_with_plugins(tmp_path: Path) -> None:

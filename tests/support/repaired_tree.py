@@ -39,9 +39,12 @@ class Patchwork:
         self.config = PlannerConfig(**rules)
         self.costs = self._fresh()
         self.tree = CostToGoTree(self.costs)
-        self.root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-        self.tree.grow(self.root)
+        self.tree.grow(int(rng.choice(np.flatnonzero(np.isfinite(pace)))))
         self.mended = 0
+
+    @property
+    def root(self) -> int:
+        return self.tree.root
 
     def _fresh(self) -> CostGrid:
         costs = CostGrid(self.grid, self.config, self.climb)
@@ -88,12 +91,13 @@ class Patchwork:
         np.testing.assert_array_equal(inner(self.tree, self.tree.parent), inner(fresh, fresh.parent))
         assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
 
-    def check_lowered(self) -> None:
-        """A heuristic without parents that is lowered is the tree of the map that got cheaper."""
+    def check_lowered(self) -> int:
+        """A heuristic without parents that is lowered is the tree of the map that got cheaper. Returns how many
+        cells changed."""
         changes = self.costs.apply(self.pace, [self.change(factor, 6) for factor in (0.5, 0.25, 0.9)])
         heuristic = self.tree.cost.copy()
         given = self._given((heuristic, np.empty(0, np.uint8), 0), changes)
         done, _ = kernels.repair(*given, self.costs.buckets, (0, 0, NO_LIMIT), self.costs.repair_scratch)
-        assert done > 0
         self.tree.grow(self.root)
         np.testing.assert_array_equal(inner(self.tree, heuristic), inner(self.tree, self.tree.cost))
+        return int(done)

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from launch_scripts.simulation.study.trials import Result, Trial, run_trial
+from launch_scripts.simulation.trials import Result, Trial, run_trial
 
 SCENARIO = """
 name = "hill"

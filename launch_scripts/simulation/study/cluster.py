@@ -13,7 +13,7 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
 
-from launch_scripts.simulation.study.trials import Result, Trial, run_trial
+from launch_scripts.simulation.trials import Result, Trial, run_trial
 from swarm.errors import BusError
 
 AHEAD = 3

@@ -23,8 +23,7 @@ from msgspec import Meta
 
 from launch_scripts.deploy.host_scenario import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
-from launch_scripts.simulation.many_seeds import MIX, SECONDS, parse_seeds, world_of
-from launch_scripts.simulation.study.trials import Trial, code_version
+from launch_scripts.simulation.trials import MIX, SECONDS, Trial, code_version, parse_seeds, world_of
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
@@ -118,8 +117,8 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
     try:
         study = msgspec.convert(raw, Study)
     except msgspec.ValidationError as error:
-        said = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
-        raise ConfigError(f"{source}: {said}") from error
+        fault = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
+        raise ConfigError(f"{source}: {fault}") from error
     seeds = parse_seeds(study.seeds, f"{source}: seeds")
     if fault := next(_faults(study, len(seeds)), None):
         raise ConfigError(f"{source}: {fault}")

@@ -1,13 +1,8 @@
-"""The findings of a study: each outcome of each case with its 95 % interval, and the trials in which a law broke.
-
-As Markdown they have a picture of each outcome: every seed a dot, the mean and its interval. The columns of tables
-are aligned, as the command prints them, too.
-"""
+"""The findings of a study: each outcome of each case with its interval, and the trials in which a law broke."""
 
 from __future__ import annotations
 
 import math
-import re
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,9 +12,8 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from launch_scripts.simulation.many_seeds import SECONDS, replay_of
 from launch_scripts.simulation.study.study import Case, Study
-from launch_scripts.simulation.study.trials import Result, Trial
+from launch_scripts.simulation.trials import SECONDS, Result, Trial, replay_of
 
 LEVEL = 0.95
 MOST_BOOTSTRAPPED = 1000
@@ -147,7 +141,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
 
     results  key of a trial -> result
     """
-    told: list[CaseSummary] = []
+    summaries: list[CaseSummary] = []
     failing: list[Failure] = []
     first: dict[str, dict[str, dict[int, float]]] = {}
     for case in cases:
@@ -159,7 +153,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
         base = first.setdefault(case.scenario, values)
         failures = [_failure(case, trial, result) for trial, result in pairs if result.broken]
         failing += failures
-        told.append(
+        summaries.append(
             CaseSummary(
                 scenario=case.scenario,
                 label=case.label,
@@ -180,7 +174,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
         missing=len(every) - len(there),
         simulated_s=sum(trial.seconds for trial in there),
         cpu_s=sum(results[trial.key].cpu_s for trial in there),
-        cases=told,
+        cases=summaries,
         failing=failing,
     )
 
@@ -204,48 +198,7 @@ def _failure(case: Case, trial: Trial, result: Result) -> Failure:
     )
 
 
-# --- as a page, which the command prints in part --------------------------------------------------------------
-
-SHOWN_FAILURES = 100
-MOST_ROWS = 60
-"""With more cases there is no picture: it could not be read."""
-
-
-def document(summary: Summary, pictures: Mapping[str, str]) -> str:
-    """The page.
-
-    pictures  outcome -> file name of its picture, beside the page
-    """
-    done = summary.trials - summary.missing
-    told = (
-        f"{done:,} of {summary.trials:,} trials, {summary.simulated_s:,.0f} simulated seconds in "
-        f"{summary.cpu_s:,.0f} s of CPU. {len(summary.failing):,} trials broke a law."
-    )
-    parts = [
-        f"# {summary.study}",
-        summary.about,
-        told,
-        _table(
-            ("scenario", "case", "trials", "broke a law", "share"),
-            [
-                (case.scenario, case.label, f"{case.trials:,}", f"{case.broken:,}", _percent(case.share_broken))
-                for case in summary.cases
-            ],
-        ),
-    ]
-    for name in summary.cases[0].outcomes:
-        parts += [f"## {name}", f"![{name}]({pictures[name]})" if name in pictures else ""]
-        parts.append(outcome_table(summary, name))
-    if summary.failing:
-        rows = [
-            (each.scenario, each.label, str(each.seed), ", ".join(each.laws), each.sentences[0], f"`{each.replay}`")
-            for each in summary.failing[:SHOWN_FAILURES]
-        ]
-        headings = ("scenario", "case", "seed", "laws", "first sentence", "again")
-        parts += ["## Trials that broke a law", _table(headings, rows)]
-    if (left := len(summary.failing) - SHOWN_FAILURES) > 0:
-        parts.append(f"{left:,} more are in `results.parquet`.")
-    return "\n\n".join(filter(None, [*parts, METHOD])) + "\n"
+# --- as tables ---------------------------------------------------------------------------------------------------
 
 
 def outcome_table(summary: Summary, name: str) -> str:
@@ -263,13 +216,8 @@ def outcome_table(summary: Summary, name: str) -> str:
         for outcome in [case.outcomes[name]]
     ]
     headings = ("scenario", "case", "n", "mean", "95 %", "median", "95 %", "to the first case", "95 %")
-    return _table(headings, rows)
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    escaped = [[cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in (headings, *rows)]
-    widths = [max(map(len, column)) for column in zip(*escaped, strict=True)]
-    first, *rest = (f"| {' | '.join(map(str.ljust, row, widths))} |" for row in escaped)
+    widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
+    first, *rest = (f"| {' | '.join(map(str.ljust, row, widths))} |" for row in (headings, *rows))
     return "\n".join([first, f"|{'|'.join('-' * (width + 2) for width in widths)}|", *rest])
 
 
@@ -281,22 +229,9 @@ def _number(value: float | None, sign: str = "") -> str:
     return f"{value:{sign},.0f}" if abs(value) >= 1000 else f"{value:{sign}.4g}"
 
 
-def _percent(share: Estimate | None) -> str:
-    if share is None:
-        return "-"
-    return f"{100 * share.value:.3g} % ({100 * (share.low or 0.0):.3g} to {100 * (share.high or 0.0):.3g})"
-
-
 def _cells(estimate: Estimate | None, sign: str = "") -> tuple[str, str]:
     """A value, and the two ends of its interval."""
     if estimate is None:
         return "-", "-"
     low, high = _number(estimate.low, sign), _number(estimate.high, sign)
     return _number(estimate.value, sign), "-" if estimate.low is None else f"{low} to {high}"
-
-
-def pictures_of(summary: Summary) -> dict[str, str]:
-    """The outcomes of which there is a picture -> its file name."""
-    names = summary.cases[0].outcomes if len(summary.cases) <= MOST_ROWS else ()
-    drawn = (name for name in names if any(case.outcomes[name].values for case in summary.cases))
-    return {name: f"{re.sub('[^A-Za-z0-9_.-]', '-', name)}.png" for name in drawn}

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
-from launch_scripts.simulation.study.summary import Summary, document, name_of, pictures_of, summarise
-from launch_scripts.simulation.study.trials import Result, Trial
+from launch_scripts.simulation.study.summary import Summary, name_of, summarise
+from launch_scripts.simulation.trials import Result, Trial
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 from swarm.files import check_writable, write_file, writing
@@ -71,11 +71,11 @@ def _end(content: bytes) -> bytes:
     return _DIGEST + digest_of(content).hex().encode() + b'"}'
 
 
-RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
+RESULTS, NUMBERS, SCENARIOS = "results.parquet", "summary.json", "scenarios"
 SETTING = "set."
 """Begins the name of a column that holds a setting of a case."""
-_Told = Callable[[Case, Trial, Result], Any]
-_COLUMNS: dict[str, tuple[pa.DataType, _Told]] = {
+_OfTrial = Callable[[Case, Trial, Result], Any]
+_COLUMNS: dict[str, tuple[pa.DataType, _OfTrial]] = {
     "scenario": (pa.string(), lambda case, trial, result: name_of(case, trial)),
     "variant": (pa.string(), lambda case, trial, result: case.variant or None),
     "seed": (pa.int64(), lambda case, trial, result: trial.seed),
@@ -110,11 +110,11 @@ class Sweep:
         self.trials = len(unique)
         self.missing = [trial for key, trial in unique.items() if key not in self.store.results]
 
-    def run(self, workers: int, scheduler: str | None, told: Callable[[Trial, Result | None], None]) -> None:
+    def run(self, workers: int, scheduler: str | None, on_result: Callable[[Trial, Result | None], None]) -> None:
         """Simulates missing trials. Results are kept as they come, whatever ends this.
 
         scheduler  address of an existing cluster; None: local workers of this number
-        told       called with each trial that has ended; None: it was given up
+        on_result  called with each trial that has ended; None: it was given up
         """
         if not self.missing:
             return
@@ -122,7 +122,7 @@ class Sweep:
             for trial, result in run_trials(client, self.missing):
                 if result is not None:
                     self.store.add(result)
-                told(trial, result)
+                on_result(trial, result)
 
     def finish(self) -> Summary:
         """Writes the results, scenarios and summary. Raises StoreError."""
@@ -137,21 +137,15 @@ class Sweep:
             cases.append(case)
         summary = summarise(self.study, cases, self.store.results)
         write_file(self.folder / RESULTS, self._table())
-        pictures = pictures_of(summary)
-        for name, file in pictures.items():
-            from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
-
-            write_file(self.folder / file, draw_outcome(summary.cases, name))
-        write_file(self.folder / PAGE, document(summary, pictures).encode())
         numbers = msgspec.to_builtins(summary, str_keys=True)
         write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
         return summary
 
     def _table(self) -> bytes:
         """A row for each trial that has a result, as Parquet."""
-        told = [(case, trial) for case in self.cases for trial in case.trials if trial.key in self.store.results]
+        pairs = [(case, trial) for case in self.cases for trial in case.trials if trial.key in self.store.results]
         rows, types = [], {name: kind for name, (kind, _) in _COLUMNS.items()}
-        for case, trial in told:
+        for case, trial in pairs:
             result = self.store.results[trial.key]
             settings = {f"{SETTING}{key}": json.dumps(value) for key, value in case.settings.items()}
             figures = {f"{FIGURE}{name}": value for name, value in sorted(result.figures.items())}

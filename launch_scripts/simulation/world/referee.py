@@ -68,7 +68,7 @@ class ObstacleHit:
     """A vehicle and an obstacle on one cell at one time; reported once per encounter.
 
     by_vehicle  the vehicle is at fault: it entered the cell, though the obstacle had closed it in time
-    said_s      how long the obstacle had closed the cell when the vehicle entered it; negative if the vehicle was
+    closed_s    how long the obstacle had closed the cell when the vehicle entered it; negative if the vehicle was
                 first
     """
 
@@ -77,17 +77,17 @@ class ObstacleHit:
     cell: int
     stamp_ns: int
     by_vehicle: bool
-    said_s: float
+    closed_s: float
     evidence: tuple[Stay, Cover] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
         """Returns the finding and the reports which prove it."""
         if self.by_vehicle:
-            found = f"{self.vehicle} drove into obstacle {self.obstacle}, known for {self.said_s:.1f} s"
-        elif self.said_s < 0.0:
+            found = f"{self.vehicle} drove into obstacle {self.obstacle}, known for {self.closed_s:.1f} s"
+        elif self.closed_s < 0.0:
             found = f"obstacle {self.obstacle} drove into {self.vehicle}, which was there first"
         else:
-            found = f"obstacle {self.obstacle} met {self.vehicle} {self.said_s:.2f} s after its first report"
+            found = f"obstacle {self.obstacle} met {self.vehicle} {self.closed_s:.2f} s after its first report"
         return found + _proven(self.evidence, began_ns)
 
 
@@ -123,13 +123,13 @@ def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
     """Returns when each was on the cell, in seconds since the run began, and the reports that say so: their numbers
     and their key. A recording of the run has them."""
 
-    def said(each: Stay | Cover) -> str:
+    def on_cell(each: Stay | Cover) -> str:
         begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
         reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
         name = each.vehicle if isinstance(each, Stay) else f"obstacle {each.obstacle}"
         return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
 
-    return f": {' and '.join(map(said, evidence))}"
+    return f": {' and '.join(map(on_cell, evidence))}"
 
 
 Encounters = dict[tuple[str, str], int]

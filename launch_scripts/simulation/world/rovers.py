@@ -21,7 +21,7 @@ TURN_S = 0.6
 _LONGEST_REST_S = 8.0
 """Rests are drawn from half a second up to this. Vehicles wait for an obstacle at rest for a second and then drive
 around it (docs/design/reported-obstacles.md): both are to happen, the second more often."""
-_TOLD_AGAIN_NS = NS_PER_S // 2
+_PUBLISHED_AGAIN_NS = NS_PER_S // 2
 """Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every obstacle
 (docs/design/reported-obstacles.md), and a report that is lost must not end the lease."""
 _LONGEST_TICK_S = 1.0
@@ -52,8 +52,8 @@ class Rover:
     rests_s: float = 0.0
     turns: bool = False
     seq: int = 0
-    told_ns: int = field(default=-_TOLD_AGAIN_NS)
-    told: tuple[float, ...] = ()
+    published_ns: int = field(default=-_PUBLISHED_AGAIN_NS)
+    published: tuple[float, ...] = ()
 
 
 class Rovers:
@@ -88,17 +88,17 @@ class Rovers:
         self._time_scale = time_scale
         passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
         self._ticked_ns = now_ns
-        said = []
+        reports = []
         for rover in self.all.values():
             if time_scale > 0.0:
                 self._move(rover, min(passed_s, _LONGEST_TICK_S))
             speed = self._speed(rover) if self._goes(rover) else 0.0
             state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
-            if state == rover.told and 0 <= now_ns - rover.told_ns < _TOLD_AGAIN_NS:
+            if state == rover.published and 0 <= now_ns - rover.published_ns < _PUBLISHED_AGAIN_NS:
                 continue
-            rover.told, rover.told_ns = state, now_ns
+            rover.published, rover.published_ns = state, now_ns
             rover.seq += 1
-            said.append(
+            reports.append(
                 Obstacle(
                     id=rover.id,
                     group="rovers",
@@ -113,7 +113,7 @@ class Rovers:
                     lease_s=LEASE_S,
                 )
             )
-        return said
+        return reports
 
     def _speed(self, rover: Rover) -> float:
         """By the wall clock; none is quicker than what vehicles believe."""

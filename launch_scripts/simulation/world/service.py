@@ -42,18 +42,18 @@ class PoseThrottle:
 
     def __init__(self, resolution_m: float) -> None:
         self._moved_m = _MOVED_CELLS * resolution_m
-        self._told: dict[str, TargetPose] = {}
+        self._published: dict[str, TargetPose] = {}
 
     def is_news(self, pose: TargetPose) -> bool:
         """Returns True if this pose is to be published; if so, later ones are compared with it."""
-        told = self._told.get(pose.target)
-        if told is not None:
-            late = not 0 <= pose.stamp_ns - told.stamp_ns < _AGAIN_NS
-            counts = (told.incarnation, told.cell, told.captures, told.jumps)
+        last = self._published.get(pose.target)
+        if last is not None:
+            late = not 0 <= pose.stamp_ns - last.stamp_ns < _AGAIN_NS
+            counts = (last.incarnation, last.cell, last.captures, last.jumps)
             changed = counts != (pose.incarnation, pose.cell, pose.captures, pose.jumps)
-            if not (late or changed or math.hypot(pose.x_m - told.x_m, pose.y_m - told.y_m) >= self._moved_m):
+            if not (late or changed or math.hypot(pose.x_m - last.x_m, pose.y_m - last.y_m) >= self._moved_m):
                 return False
-        self._told[pose.target] = pose
+        self._published[pose.target] = pose
         return True
 
 
@@ -90,7 +90,7 @@ class TargetsService:
         self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
         self._anew, self._began_ns = setup.anew, setup.started_ns
-        self._heard: set[str] = set()
+        self._subscribed: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._throttle = PoseThrottle(terrain.grid.resolution_m)
         self._planners = Roster()
@@ -109,14 +109,14 @@ class TargetsService:
         self._bus.subscribe(OBSTACLE, self._post)
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
-        self._hear_targets()
+        self._subscribe_targets()
         self._obedience.start(now_ns)
         self._candidacy.start()
 
-    def _hear_targets(self) -> None:
+    def _subscribe_targets(self) -> None:
         for id, target in self._obedience.book.targets(self._scenario).items():
-            if id not in self._heard and (not target.is_simulated or self._scenario.standbys.targets):
-                self._heard.add(id)
+            if id not in self._subscribed and (not target.is_simulated or self._scenario.standbys.targets):
+                self._subscribed.add(id)
                 self._bus.subscribe(self._topic(id), self._post, target=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -172,7 +172,7 @@ class TargetsService:
             self._perform(obeyed, now_ns)
             if version is None and self._anew:
                 self._world.begin_anew()
-            self._hear_targets()
+            self._subscribe_targets()
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:

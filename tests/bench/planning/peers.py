@@ -1,7 +1,8 @@
 """Full trees of our library and of others: time, memory, agreement.
 
-All pay for the cell that a step enters. The others grow outward from the root, so that they charge the far end
-where we charge the root: their costs are brought over by exactly these two cells, outside the measured time.
+All steps are equally long, and pay for the cell that they enter. The others grow outward from the root, so that
+they charge the far end where we charge the root: their costs are brought over by exactly these two cells, outside
+the measured time.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -24,10 +25,8 @@ from support.kernel_oracle import inner
 
 from bench.harness import FieldOption, Seed, benchmark, track
 from bench.isolated import isolated, peak_bytes
-from swarm.errors import ConfigError
 
 Costs = NDArray[np.floating[Any]]
-Edge = Literal["paper", "octile"]
 
 
 @benchmark()
@@ -35,7 +34,6 @@ def peers(
     size: Annotated[int, typer.Option(min=16, max=8192, help="Cells a side; a file has its own.")] = 512,
     field: FieldOption = "terrain",
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs, each from another root.")] = 7,
-    edge: Annotated[str, typer.Option(help="paper (the rule all share) or octile.")] = "paper",
     memory: Annotated[bool, typer.Option(help="Measure peak memory too, a process for each.")] = True,
     seed: Seed = 1,
 ) -> dict[str, Any]:
@@ -49,11 +47,8 @@ def peers(
     little below 512 x 512; and the largest relative difference of a cell's cost from ours. tcod counts in whole
     numbers and finds no parents, nor does dijkstra3d.distance_field.
     """
-    if edge not in ("paper", "octile"):
-        raise ConfigError(f"--edge is {edge!r}, expected paper or octile")
-    rule = cast(Edge, edge)
     made = Field(make_field(field, size, seed))
-    names = ["ours", *present_peers(rule), "breadth_first"]
+    names = ["ours", *present_peers(), "breadth_first"]
     roots = made.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
     memory_mb: dict[str, float | None] = {}
     if memory:
@@ -61,10 +56,10 @@ def peers(
             saved = Path(folder) / "field.npy"
             np.save(saved, made.pace)
             for name in track(names):
-                memory_mb[name] = isolated(tree_memory_mb, str(saved), name, roots[0], edge)
+                memory_mb[name] = isolated(tree_memory_mb, str(saved), name, roots[0])
     took_ms: dict[str, list[float]] = {name: [] for name in names}
     differs: dict[str, float] = {}
-    tools = {name: MAKERS[name](made.pace, rule) for name in names}
+    tools = {name: MAKERS[name](made.pace) for name in names}
     for turn, root in enumerate(track(roots)):
         grown: Costs | None = None
         for name, tool in tools.items():
@@ -82,7 +77,6 @@ def peers(
     return {
         "field": field,
         "shape": list(made.pace.shape),
-        "edge": edge,
         "repeats": repeats,
         "rows": [
             {
@@ -102,15 +96,15 @@ def peers(
     }
 
 
-def tree_memory_mb(field: str, name: str, root: int, edge: Edge) -> float | None:
+def tree_memory_mb(field: str, name: str, root: int) -> float | None:
     """The rise of resident memory from the bare field to a grown tree: preparation counts, the code of a library
     does not. None where the system does not tell the peak."""
     make = MAKERS[name]
-    make(np.ones((24, 24), np.float32), edge).grow(5)  # libraries are loaded, kernels compiled
+    make(np.ones((24, 24), np.float32)).grow(5)  # libraries are loaded, kernels compiled
     pace = np.load(field)
 
     def grow() -> object:
-        tool = make(pace, edge)
+        tool = make(pace)
         return tool, tool.grow(root)
 
     try:
@@ -139,34 +133,34 @@ class Tool:
     costs: Callable[[Any, int], Costs | None]
 
 
-def ours(pace: Pace, edge: Edge) -> Tool:
-    tree = _our_tree(pace, edge)
+def ours(pace: Pace) -> Tool:
+    tree = _our_tree(pace)
     return Tool(tree.grow, lambda _, root: inner(tree, tree.cost).copy())
 
 
-def breadth_first(pace: Pace, edge: Edge) -> Tool:
+def breadth_first(pace: Pace) -> Tool:
     """A plain breadth-first search over the same arrays: a lower bound for any search that visits every cell."""
     from bench.planning.breadth_first import breadth_first as search
 
-    cost_grid = _our_tree(pace, edge).cost_grid
+    cost_grid = _our_tree(pace).cost_grid
     cost, queue = np.empty(cost_grid.size, np.float32), np.empty(cost_grid.size, np.uint32)
     return Tool(lambda root: search(cost_grid.padded, cost, cost_grid.pad(root), queue), lambda *_: None)
 
 
-def _our_tree(pace: Pace, edge: Edge) -> Any:
+def _our_tree(pace: Pace) -> Any:
     from planner_service.tree.cost_grid import CostGrid
     from planner_service.tree.cost_to_go import CostToGoTree
     from swarm.config.scenario import PlannerConfig
     from swarm.grid import GridSpec
 
     # No other library forbids diagonals past lethal corners.
-    config = PlannerConfig(edge=edge, corner_cutting=True)
+    config = PlannerConfig(edge="paper", corner_cutting=True)
     cost_grid = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
     cost_grid.load(pace)
     return CostToGoTree(cost_grid)
 
 
-def parental_field(pace: Pace, edge: Edge) -> Tool:
+def parental_field(pace: Pace) -> Tool:
     import dijkstra3d
 
     # It needs Fortran order: the transposed field has it without a copy.
@@ -179,7 +173,7 @@ def parental_field(pace: Pace, edge: Edge) -> Tool:
     return Tool(lambda root: dijkstra3d.parental_field(mirrored, divmod(root, cols)[::-1], connectivity=8), costs)
 
 
-def distance_field(pace: Pace, edge: Edge) -> Tool:
+def distance_field(pace: Pace) -> Tool:
     import dijkstra3d
 
     mirrored, cols = pace.T, pace.shape[1]
@@ -189,31 +183,28 @@ def distance_field(pace: Pace, edge: Edge) -> Tool:
     )
 
 
-def dijkstra2d(pace: Pace, edge: Edge) -> Tool:
+def dijkstra2d(pace: Pace) -> Tool:
     import tcod.path
 
     passable = np.isfinite(pace)
     low, high = float(pace[passable].min()), float(pace[passable].max())
-    straight, diagonal = (1, 1) if edge == "paper" else (5, 7)
     # Costs are 32-bit integers: scaled as finely as the longest path allows.
-    unit = max(low / 1000, high * straight * 8 * sum(pace.shape) / 2**31)
+    unit = max(low / 1000, high * 8 * sum(pace.shape) / 2**31)
     whole = np.where(passable, np.maximum(np.rint(pace / unit), 1), 0).astype(np.int32)
 
     def grow(root: int) -> Any:
         distance = tcod.path.maxarray(pace.shape, dtype=np.int32)
         distance.flat[root] = 0
-        return tcod.path.dijkstra2d(distance, whole, straight, diagonal, out=distance)
+        return tcod.path.dijkstra2d(distance, whole, 1, 1, out=distance)
 
-    def costs(found: Any, root: int) -> Costs | None:
-        if edge == "octile":
-            return None  # 5 to 7 is not 1 to the root of two
+    def costs(found: Any, root: int) -> Costs:
         reached = passable & (found < np.iinfo(np.int32).max)
         return _from_outward(np.where(reached, found * unit, np.inf), whole * unit, root)
 
     return Tool(grow, costs)
 
 
-def csgraph(pace: Pace, edge: Edge) -> Tool:
+def csgraph(pace: Pace) -> Tool:
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -230,8 +221,7 @@ def csgraph(pace: Pace, edge: Edge) -> Tool:
             legal = free[here] & free[there]
             out.append(cells[here][legal])
             into.append(cells[there][legal])
-            length = np.sqrt(2.0) if edge == "octile" and dr and dc else 1.0
-            costs.append(pace[there][legal].astype(np.float64) * length)
+            costs.append(pace[there][legal].astype(np.float64))
     edges = (np.concatenate(costs), (np.concatenate(into), np.concatenate(out)))
     del into, out, costs
     graph = csr_matrix(edges, shape=(pace.size, pace.size))
@@ -242,24 +232,17 @@ def csgraph(pace: Pace, edge: Edge) -> Tool:
     )
 
 
-def mcp(pace: Pace, edge: Edge) -> Tool:
-    from skimage.graph import MCP, MCP_Geometric
+def mcp(pace: Pace) -> Tool:
+    from skimage.graph import MCP
 
-    kind = MCP_Geometric if edge == "octile" else MCP
-
-    def costs(found: Any, root: int) -> Costs | None:
-        if edge == "octile":
-            return None  # it charges the mean of both cells
-        # The start is charged too, so that only the far end is charged too much.
-        return _from_outward(found, pace, root) - pace.flat[root]
-
+    # The start is charged too, so that only the far end is charged too much.
     return Tool(
-        lambda root: kind(pace, fully_connected=True).find_costs([divmod(root, pace.shape[1])])[0],
-        costs,
+        lambda root: MCP(pace, fully_connected=True).find_costs([divmod(root, pace.shape[1])])[0],
+        lambda found, root: _from_outward(found, pace, root) - pace.flat[root],
     )
 
 
-PEERS: dict[str, tuple[str, Callable[[Pace, Edge], Tool]]] = {
+PEERS: dict[str, tuple[str, Callable[[Pace], Tool]]] = {
     "dijkstra3d.parental_field": ("dijkstra3d", parental_field),
     "dijkstra3d.distance_field": ("dijkstra3d", distance_field),
     "tcod.dijkstra2d": ("tcod", dijkstra2d),
@@ -269,8 +252,6 @@ PEERS: dict[str, tuple[str, Callable[[Pace, Edge], Tool]]] = {
 """Name -> its package, and the function that prepares it."""
 
 MAKERS = {"ours": ours, "breadth_first": breadth_first, **{name: make for name, (_, make) in PEERS.items()}}
-PAPER_ONLY = {"dijkstra3d.parental_field", "dijkstra3d.distance_field"}
-"""Libraries in which all steps are equally long."""
 EXTRA = ("dijkstra3d", "tcod")
 """Packages of the `bench` extra."""
 
@@ -279,14 +260,10 @@ def missing_packages() -> list[str]:
     return [name for name in EXTRA if importlib.util.find_spec(name) is None]
 
 
-def present_peers(edge: Edge) -> list[str]:
-    """Names of the peers which are installed and support the edge rule."""
+def present_peers() -> list[str]:
+    """Names of the peers which are installed."""
     absent = missing_packages()
-    return [
-        name
-        for name, (package, _) in PEERS.items()
-        if package not in absent and not (edge == "octile" and name in PAPER_ONLY)
-    ]
+    return [name for name, (package, _) in PEERS.items() if package not in absent]
 
 
 def versions() -> dict[str, str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
-from support.fields import FIELDS, Field, make_field
+from support.fields import Field, make_field
 
 from bench.harness import FieldOption, Seed, benchmark, names_of, numbers_of, track
 from bench.planning.chase import Plan, Tally, chase
@@ -20,7 +20,6 @@ from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy, Walk
-from swarm.errors import ConfigError
 
 PAPERS: Strategy = "variable_range+multi_resolution"
 TABLE_1 = [(targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)]
@@ -40,6 +39,10 @@ Point = tuple[int, int, int]
 
 _ALLOWED = get_args(Strategy)
 _ALL = ",".join(_ALLOWED)
+_SCALE_S, _SCALE_CELLS = 6.0, 256
+"""CPU time (s) that a strategy gets at each point of `scale`, and the steps that a vehicle is given."""
+_ROUTES = 200
+"""Routes judged in each frame of `gap`."""
 _GAPS = ("gap_mean", "gap_p95", "gap_max")
 Frames = Annotated[int, typer.Option(min=1, help="Frames; each target moves one cell a frame.")]
 Strategies = Annotated[str, typer.Option(help="Strategies, several with commas.")]
@@ -112,10 +115,8 @@ def _of_table_2(name: Strategy, rows: dict[Strategy, dict[str, Any]]) -> dict[st
     }
 
 
-def points_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int], full: bool) -> list[Point]:
-    """Every combination; or, unless `full`, one thing at a time varied from `base_of`."""
-    if full:
-        return sorted(itertools.product(sizes, targets, vehicles))
+def points_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int]) -> list[Point]:
+    """One thing at a time varied from `base_of`."""
     size, many, count = base_of(sizes, targets, vehicles)
     return sorted(
         {(each, many, count) for each in sizes}
@@ -133,18 +134,10 @@ def base_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int
     columns=("size", "targets", "vehicles", "strategy", "frame_ms_mean", "gap_p95", "proven_p95", "frames"),
 )
 def scale(
-    sizes: Annotated[
-        str | None,
-        typer.Option(help="Cells a side, several with commas.", show_default="512,1024,2048; --full: and 4096"),
-    ] = None,
+    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
     targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10,100",
     vehicles: Annotated[str, typer.Option(help="Numbers of vehicles.")] = "10,100,1000,10000",
-    strategies: Strategies = _ALL,
-    full: Annotated[bool, typer.Option("--full", help="Every combination: takes hours.")] = False,
-    field: Annotated[str, typer.Option(help="terrain, uniform or maze.")] = "terrain",
     frames: Frames = 40,
-    seconds: Annotated[float, typer.Option(min=0.01, help="CPU time a strategy gets at each point.")] = 6.0,
-    max_cells: Annotated[int, typer.Option(min=0, help="Steps given to a vehicle; 0 is the whole route.")] = 256,
     within: Annotated[int, typer.Option(min=0, help="Cells from a target to its vehicles; 0: anywhere.")] = 0,
     seed: Seed = 1,
 ) -> dict[str, Any]:
@@ -155,36 +148,32 @@ def scale(
     ./launch_scripts/bench scale --sizes 128,512,2048 --targets 1 --vehicles 10 --within 60
 
     Varies one thing at a time, from the smallest size and the middle numbers of targets and vehicles: some four
-    minutes on a quiet machine, and six more for a size of 4096. --full takes every combination. Trees that do not
-    fit into half of the free memory are run in groups.
+    minutes on a quiet machine, and six more for a size of 4096. A strategy gets some seconds of CPU at each point.
+    Trees that do not fit into half of the free memory are run in groups.
     """
-    if field not in FIELDS:
-        raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
-    sizes = sizes or ("512,1024,2048,4096" if full else "512,1024,2048")
     axes = (numbers_of(sizes, "sizes", 16), numbers_of(targets, "targets"), numbers_of(vehicles, "vehicles"))
-    chosen = names_of(strategies, "strategies", _ALLOWED)
     load_all()
     rows: list[dict[str, Any]] = []
-    entrants = {name: PlannerConfig(strategy=name) for name in chosen}
+    entrants = {name: PlannerConfig(strategy=name) for name in _ALLOWED}
     stage: Field | None = None
-    for side, many, count in track(points_of(*axes, full)):
+    for side, many, count in track(points_of(*axes)):
         if stage is None or stage.pace.shape[0] != side:
             stage = None  # the older one is let go before the next is made
-            stage = Field(make_field(field, side, seed))
+            stage = Field(make_field("terrain", side, seed))
         plan = Plan(
             targets=many,
             vehicles=count,
             frames=frames,
-            max_cells=max_cells,
+            max_cells=_SCALE_CELLS,
             judge_every=min(2, frames),
             within=within,
-            seconds=seconds,
+            seconds=_SCALE_S,
             seed=seed,
         )
         for name, tally in chase(stage, entrants, plan).items():
             rows.append({"size": side, "targets": many, "vehicles": count, "strategy": name, **tally.row()})
     base = dict(zip(("size", "targets", "vehicles"), base_of(*axes), strict=True))
-    return {"field": field, "seconds": seconds, "max_cells": max_cells, "base": base, "rows": rows}
+    return {"seconds": _SCALE_S, "max_cells": _SCALE_CELLS, "base": base, "rows": rows}
 
 
 @benchmark(columns=("walk", "strategy", *_GAPS, "proven_p50", "proven_p95", "frame_ms_mean", "growths_a_frame"))
@@ -193,36 +182,27 @@ def gap(
     walk: Annotated[str, typer.Option(help="random, waypoints, evade; several with commas.")] = "random",
     frames: Frames = 120,
     runs: Annotated[int, typer.Option(min=1, help="Runs from different roots, taken together.")] = 3,
-    vehicles: Annotated[int, typer.Option(min=1, help="Routes judged in each frame.")] = 200,
-    speed: Annotated[
-        int | None,
-        typer.Option(min=0, max=64, help="Cells a vehicle drives a frame; 0 stands. After an evader 1, else 0."),
-    ] = None,
     strategies: Strategies = _ALL,
-    k_min: Annotated[int, typer.Option(min=0, max=12, help="Smallest block exponent of windows.")] = 3,
-    cpu_budget: Annotated[float, typer.Option(min=1e-4, max=1, help="auto: share of a core it may use.")] = 0.1,
     seed: Seed = 1,
 ) -> dict[str, Any]:
     """Driven cost over optimum for a moving target, and the gap that certificates prove.
 
     \b
     ./launch_scripts/bench gap --dem ridge.tif --walk random,evade
-    ./launch_scripts/bench gap --dem ridge.tif --strategies auto --cpu-budget 0.01
+    ./launch_scripts/bench gap --dem ridge.tif --strategies auto
 
     Gap: cost over the optimum; proven: over a certificate's lower bound; - is no bound. Every judged route is
-    driven step by step, and what breaks a law is counted.
+    driven step by step, and what breaks a law is counted. Vehicles stand, but drive a cell a frame after an evader.
     """
     walks = names_of(walk, "walk", WALKS)
     chosen = names_of(strategies, "strategies", _ALLOWED)
     stage = Field(make_field(dem, 512, seed))
     load_all()
     tallies = {(path, name): Tally() for path in walks for name in chosen}
-    entrants = {name: PlannerConfig(strategy=name, k_min=k_min, cpu_budget=cpu_budget) for name in chosen}
-    drives = {path: int(path == "evade") if speed is None else speed for path in walks}
+    entrants = {name: PlannerConfig(strategy=name) for name in chosen}
+    drives = {path: int(path == "evade") for path in walks}
     for path, run in track(list(itertools.product(walks, range(runs)))):
-        plan = Plan(
-            vehicles=vehicles, frames=frames, walk=path, speed=drives[path], probes=vehicles, seed=seed + run
-        )
+        plan = Plan(vehicles=_ROUTES, frames=frames, walk=path, speed=drives[path], probes=_ROUTES, seed=seed + run)
         for name, tally in chase(stage, entrants, plan).items():
             tallies[path, name].add(tally)
     rows = []
@@ -235,9 +215,6 @@ def gap(
         "shape": list(stage.pace.shape),
         "frames": frames,
         "runs": runs,
-        "vehicles": vehicles,
-        "k_min": k_min,
-        "cpu_budget": cpu_budget,
         "rows": rows,
         "notes": _violations(rows),
     }

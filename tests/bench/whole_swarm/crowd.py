@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import multiprocessing
 import time
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -18,7 +19,7 @@ from bench.harness import benchmark, names_of, track
 from bench.isolated import TimeLimit
 from bench.whole_swarm.ideal_crowd import drive_ideal
 from launch_scripts.simulation import worlds as crowded
-from launch_scripts.simulation.many_seeds import in_processes, parse_seeds
+from launch_scripts.simulation.trials import parse_seeds
 from launch_scripts.simulation.worlds import CROWDS
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
@@ -179,8 +180,10 @@ def crowd(
         raise ConfigError(f"--vehicles is {vehicles}, expected at most a quarter of {size} x {size} cells")
     items = [(kind, seed) for seed in some for kind in chosen]
     work = functools.partial(drive_crowd, vehicles, agents, size, seconds)
-    results = in_processes(work, items, jobs)
-    drives = [next(results) for _ in track(items)]
+    # Processes of their own, not forks: numpy and numba have threads. They end with the block.
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        results = pool.imap_unordered(work, items)
+        drives = [next(results) for _ in track(items)]
     drives.sort(key=lambda each: (chosen.index(each["world"]), each["seed"]))
     rows = [row_of(kind, [each for each in drives if each["world"] == kind]) for kind in chosen]
     if len(chosen) > 1:

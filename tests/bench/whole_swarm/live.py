@@ -161,7 +161,7 @@ class _Run:
             client = self._helpers[1]
             self._listen(SETTLE_S)
             cells, route_cells = sorted(self._cells.values()), self._scenario.vehicles.route_cells
-            question = (self._scenario.target_ids, cells, route_cells, self._seconds, self._size.seed)
+            question = (self._scenario.target_ids, cells, route_cells, self._seconds, self._scenario.seed)
             tell(f"measuring for {self._seconds:g} s")
             self._window.begin()
             before = self._cpu()

@@ -36,7 +36,7 @@ def simulate(fields: dict[str, Any], seconds: float, limit_s: float) -> dict[str
     end_with_parent(signal.SIGKILL)
     size = Size(**fields)
     # A small one first, in which kernels are loaded, or compiled.
-    Simulation(scenario_of(size_of(20, 2, seed=size.seed))).run_until(_LOADING_S)
+    Simulation(scenario_of(size_of(20, 2))).run_until(_LOADING_S)
     began_s = time.perf_counter()
     simulation = Simulation(scenario_of(size))
     built_s = time.perf_counter() - began_s

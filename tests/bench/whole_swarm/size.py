@@ -27,11 +27,9 @@ _SCENARIO = Path(__file__).with_name("scale.toml.in")
 class Size(msgspec.Struct, frozen=True, kw_only=True):
     """A swarm of one size.
 
-    agents     processes that host the vehicles; see `agents_of`
+    agents     processes that host the vehicles: one for each five hundred, 5 at least and 40 at most
     per_agent  vehicles of each, the last may have fewer
     side       cells a side of the square map
-    tick_hz    of agents and planners
-    time_scale seconds on the terrain per second
     shard_regions  `map.shard_regions`
     """
 
@@ -40,63 +38,29 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     agents: int
     per_agent: int
     side: int
-    tick_hz: float
-    seed: int
-    time_scale: float = 2.0
     shard_regions: int = 1
 
 
-def size_of(
-    vehicles: int,
-    targets: int = 10,
-    *,
-    agents: int | None = None,
-    per_agent: int | None = None,
-    side: int | None = None,
-    tick_hz: float = 5.0,
-    seed: int = 5,
-    time_scale: float = 2.0,
-) -> Size:
+def size_of(vehicles: int, targets: int = 10, side: int | None = None) -> Size:
     """The size with everything that is not given. Raises ConfigError, which names the option.
 
-    agents, per_agent  at most one of them; by default an agent for each five hundred vehicles, 5 at least and 40
-                       at most, and a vehicle for each
-    side               by default as many cells a vehicle as `thousand` has
+    side  by default as many cells a vehicle as `thousand` has
     """
     _between("--vehicles", vehicles, 1, _MOST_VEHICLES)
     _between("--targets", targets, 1, MOST_TARGETS)
-    if agents is not None and per_agent is not None:
-        raise ConfigError("--agents and --per-agent: give at most one of them")
-    if agents is not None and not 1 <= agents <= vehicles:
-        raise ConfigError(f"--agents is {agents}, expected 1 to {vehicles}: each of them hosts a vehicle at least")
-    if per_agent is None:
-        usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS, vehicles)
-        many = agents or max(usual, -(-vehicles // MOST_PER_AGENT))
-        per_agent = -(-vehicles // many)
-        if per_agent > MOST_PER_AGENT:
-            raise ConfigError(f"--agents is {many}, expected {-(-vehicles // MOST_PER_AGENT)} or more: an agent "
-                              f"hosts at most {MOST_PER_AGENT} vehicles, and there are {vehicles}")  # fmt: skip
-    _between("--per-agent", per_agent, 1, MOST_PER_AGENT)
+    usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS, vehicles)
+    per_agent = -(-vehicles // max(usual, -(-vehicles // MOST_PER_AGENT)))
     if side is None:
         side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), LEAST_SIDE)
-    _between("--size", side, LEAST_SIDE, MOST_SIDE)
-    if side * side < 4 * vehicles:
-        raise ConfigError(
-            f"--size is {side}, expected {math.isqrt(4 * vehicles) + 1} or more for {vehicles} vehicles"
-        )
-    if not 0.1 <= tick_hz <= 100:
-        raise ConfigError(f"--tick-hz is {tick_hz:g}, expected 0.1 to 100")
-    hosts = -(-vehicles // per_agent)
+    _between("--size", side, max(LEAST_SIDE, math.isqrt(4 * vehicles) + 1), MOST_SIDE)
+    agents = -(-vehicles // per_agent)
     return Size(
         vehicles=vehicles,
         targets=targets,
-        agents=hosts,
+        agents=agents,
         per_agent=per_agent,
         side=side,
-        tick_hz=tick_hz,
-        time_scale=time_scale,
-        seed=seed,
-        shard_regions=fitting_regions(side, side, hosts),
+        shard_regions=fitting_regions(side, side, agents),
     )
 
 
@@ -110,7 +74,6 @@ def scenario_text(size: Size, endpoint: str | None = None) -> str:
     scenario, _, places = _SCENARIO.read_text(encoding="utf-8").partition(_LIVE)
     text = scenario.format(
         **msgspec.structs.asdict(size),
-        planner_hz=size.tick_hz,
         roads=min(max(round(24 * lengths), 2), 200),
         rivers=min(max(round(2 * lengths), 1), 50),
         closed_roads=min(round(20 * areas), 1000),

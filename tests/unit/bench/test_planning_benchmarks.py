@@ -35,7 +35,7 @@ STRATEGIES = (
 def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) -> None:
     report = bench("peers", "--size", "96", "--field", field, "--repeats", "3", "--no-memory")
     rows = {row["library"]: row for row in report["rows"]}
-    peers = set(rivals.present_peers("paper"))
+    peers = set(rivals.present_peers())
     assert {"scipy.csgraph.dijkstra", "skimage.graph.MCP"} <= peers
     assert set(rows) == {"ours", "breadth_first", *peers}
     for name in peers:

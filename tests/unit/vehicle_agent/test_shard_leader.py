@@ -8,6 +8,7 @@ from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_o
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.incarnations import HEARTBEAT_NS, first_generation, is_far_ahead
 from swarm.wire.messages.traffic import Stand
+from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import Leader
 
 
@@ -21,6 +22,11 @@ def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
     assert cells_of(leader.tick(2 * S), "a1-00") == [10, 11]
     leader.take_host_state(standing("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
     assert cells_of(leader.tick(3 * S), "a1-00") == [10]
+
+
+def test_entries_of_a_table_are_ordered_by_epoch_and_then_by_number() -> None:
+    table = table_of(2, 5, a1=[(9, 2, 1)], a2=[(9, 1, 8)], a3=[(9, 2, 4)])
+    assert list(Orders(table).order(9).values()) == ["a2-00", "a1-00", "a3-00"]
 
 
 def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_dead() -> None:

@@ -1,4 +1,4 @@
-"""One trial: a simulation with one seed, and what became of it. Runs on a worker."""
+"""One trial: a simulation with one seed, with all faults or none, and what it breaks. It may run on a worker."""
 
 from __future__ import annotations
 
@@ -6,19 +6,36 @@ import hashlib
 import importlib
 import importlib.metadata
 import platform
+import random
+import re
 import time
+import traceback
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from launch_scripts.simulation.laws import BrokenLaw
-from launch_scripts.simulation.many_seeds import raised, try_seed
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.laws import SLOW_MS, BrokenLaw, LawBook
 from launch_scripts.simulation.simulate import Simulation, run_to_end
+from launch_scripts.simulation.worlds import MIXED, world
+from shared_map.terrain.terrain import build_terrain
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError
+from swarm.runtime.process import collected_rarely
+
+MIX = "mix"
+"""Each seed in the world of `MIXED` that is its turn."""
+SECONDS = 30.0
+"""Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""
+_STUTTER = 0.01
+"""Share of calls within which processes are stopped, in every second seed."""
+_SLOW_SEEDS = (6, 7)
+"""Remainders by 8 of seeds with a slow link. One of the two also has processes stopped."""
+_SLOWEST_MS = 1000.0
 
 _PACKAGES = (
     "swarm",
@@ -64,7 +81,7 @@ class Trial(msgspec.Struct, frozen=True):
     key       digest of all that decides the result, the version of the code included
     world     name of a small world, or that of the scenario
     scenario  None: the world says it
-    version   of the code with which it is to run
+    version   of the code with which it is to run; None: whichever there is
     """
 
     key: str
@@ -73,7 +90,7 @@ class Trial(msgspec.Struct, frozen=True):
     seed: int
     seconds: float
     faults: bool
-    version: str
+    version: str | None = None
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -99,7 +116,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 def run_trial(trial: Trial) -> Result:
     """Simulate. A service that raises is a broken law; raises SwarmError on what the study, its files or this
     worker have wrong."""
-    if (own := code_version()) != trial.version:
+    if trial.version is not None and (own := code_version()) != trial.version:
         raise ConfigError(
             f"a worker has version {own} of the code, expected {trial.version}: install the same there"
         )
@@ -138,14 +155,62 @@ def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     except SwarmError:
         raise
     except Exception as error:
-        return {}, [raised(error, simulation.now_s)]
+        return {}, [_raised(error, simulation.now_s)]
     broken = {name: law for name, law in LAWS.items() if report.get(name)}
     return report, [BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in broken.items()]
 
 
 def _with_faults(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
-    """Runs `swarm simulate SCENARIO --seeds N:N+1`."""
-    verdict, report = try_seed(trial.world, trial.seed, trial.seconds, trial.scenario)
-    told: dict[str, Any] = msgspec.to_builtins(verdict)
-    del told["broken"], told["wall_s"]
-    return report | told, verdict.broken
+    """Runs `swarm simulate SCENARIO --seeds N:N+1`. The report also has `longest_wait_s`, see `laws.LawBook`;
+    `routed_after_s`, from when all processes work again until every vehicle has a route, None if one never has; and
+    `faults`, the number of each kind."""
+    seed, seconds = trial.seed, trial.seconds
+    if trial.scenario is None:
+        scenario, terrain = world(trial.world, seed)
+    else:
+        scenario = msgspec.structs.replace(trial.scenario, seed=seed)
+        terrain = build_terrain(scenario)
+    plan = random_plan(scenario, seed, seconds)
+    if not plan.hangs and seed % 2:  # a hang would end a stop early
+        plan = replace(plan, stutter=_STUTTER)
+    if seed % 8 in _SLOW_SEEDS:
+        plan = replace(plan, delay_ms=random.Random(f"slow/{seed}").uniform(SLOW_MS, _SLOWEST_MS))
+    simulation = Simulation(scenario, faults=plan, terrain=terrain)
+    book = LawBook(simulation)
+    try:
+        with collected_rarely():
+            broken = book.run(seconds)
+    except Exception as error:
+        broken = [_raised(error, simulation.now_s)]
+    report = simulation.report(seconds)
+    waits = {"longest_wait_s": book.longest_s, "routed_after_s": book.routed_after_s}
+    return report | waits | {"seconds": seconds, "faults": plan.counts()}, broken
+
+
+def _raised(error: Exception, now_s: float) -> BrokenLaw:
+    """Returns the violation that a service ended by an error."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
+    return BrokenLaw("a service raised", f"a service raised at {now_s:.1f} s: {text}", now_s)
+
+
+# --- seeds ------------------------------------------------------------------------------------------------------
+
+
+def parse_seeds(text: str, where: str = "--seeds") -> range:
+    """`A:B` is the seeds from A to B - 1. Raises ConfigError, which begins with `where`."""
+    match = re.fullmatch(r"([0-9]{1,15}):([0-9]{1,15})", text)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ConfigError(f"{where}: {text!r} is not A:B with A < B, such as 0:100 for the seeds 0 to 99")
+    return range(int(match[1]), int(match[2]))
+
+
+def world_of(name: str, seed: int) -> str:
+    return MIXED[seed % len(MIXED)] if name == MIX else name
+
+
+def replay_of(name: str, seed: int, seconds: float, usual_s: float, option: str = "seeds") -> str:
+    """The command that runs a seed again: with all faults, or by `option` "seed" without."""
+    seeds = f"{seed}:{seed + 1}" if option == "seeds" else f"{seed}"
+    longer = "" if seconds == usual_s else f" --seconds {seconds:g}"
+    return f"swarm simulate {name} --{option} {seeds}{longer}"
