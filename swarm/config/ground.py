@@ -115,7 +115,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
     cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
-                   own; also an image of such a map in the colours of its published legend
+                   own
     cover_codes    the legend of `cover`, if it cannot be recognised from the file: "worldcover", "corine",
                    "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to open
                    ground, or "lethal")
@@ -123,8 +123,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     resolution_m   cell size to bring everything to; the source's own if not given
     crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
     height_scale   metres per unit of height, where the file does not say it (.png)
-    elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
-                        Terrain-RGB or Terrarium tiles
+    elevation_encoding  "metres" if whole numbers which look like codes of land cover are heights
     nodata         cells without a height: "lethal", or "fill" to interpolate them from their surroundings
     nodata_values  stored values that mean "no height", in addition to the value which the file declares
     level_is       meaning of exactly flat areas of an elevation file, if no photo shows it: surveys level lakes and
