@@ -206,25 +206,6 @@ def _minetti(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return factor
 
 
-HERZOG = (1337.8, 278.19, -517.39, -78.199, 93.419, 19.825, 1.64)
-"""J per kg and metre, by the gradient."""
-
-
-def _herzog(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """Walking at constant metabolic power, by Herzog's polynomial through Minetti's data: it stays positive on all
-    slopes, and is for those of up to 50 %."""
-    # Beyond a grade of 2 the bound is reached anyway, and float32 would overflow.
-    joules = np.polyval(np.array(HERZOG, np.float32), np.clip(rise, -2, 2))
-    return np.asarray(joules / np.float32(HERZOG[-1]), np.float32)
-
-
-def _herzog_wheeled(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """1 + (slope / critical slope)^2: where slope is critical, hairpins are as good as the straight way."""
-    share = np.minimum(rise * np.float32(100 / cost.critical_slope_percent), np.float32(1e6))
-    factor: Floats = np.float32(1) + share * share
-    return factor
-
-
 def _table(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     """Straight lines over degrees. Arcus tangent is no correctly rounded operation: the points are taken as rises,
     and lines in degrees are cut into pieces of a quarter degree at most."""
@@ -285,16 +266,6 @@ SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
         "a walker of constant metabolic power: 2.5 J/kg/m on the level, least at some 15 % down",
         "A. E. Minetti et al., Energy cost of walking and running at extreme uphill and downhill slopes, Journal of"
         " Applied Physiology 93, 2002",
-    ),
-    "herzog": _by_direction(
-        _herzog,
-        "a walker of constant metabolic power, by a polynomial for slopes of up to 50 %",
-        "I. Herzog, Theory and practice of cost functions, CAA 2010",
-    ),
-    "herzog_wheeled": _by_steepness(
-        _herzog_wheeled,
-        "carts: 1 + (slope / critical_slope_percent)^2",
-        "I. Herzog, Theory and practice of cost functions, CAA 2010, after Llobera and Sluckin, 2007",
     ),
     "table": _by_direction(_table, "points of one's own: slope_table or slope_csv", "the scenario"),
 }

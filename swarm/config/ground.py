@@ -25,9 +25,7 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 
-SlopeRule = Literal[
-    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
-]
+SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "table"]
 
 
 class WayConfig(Section, frozen=True, kw_only=True):
@@ -186,7 +184,6 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
     power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
     braking_share           energy: power that the brakes can hold for long over that of the motor
-    critical_slope_percent  herzog_wheeled: the slope that doubles the pace
     slope_table             table: points [degrees, factor on the flat pace], negative is downhill; straight lines
                             between them, and beyond the last the same factor
     slope_csv               table: a .csv file with such points instead. Its first line names two columns:
@@ -214,7 +211,6 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance: Annotated[float, Meta(ge=0.01, le=1)] = 0.08
     power_reserve: Annotated[float, Meta(ge=1, le=100)] = 1.0
     braking_share: Annotated[float, Meta(ge=0.1, le=100)] = 1.0
-    critical_slope_percent: Annotated[float, Meta(ge=1, le=100)] = 12.0
     slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
     slope_csv: str | None = None
     top_speed_m_per_s: SpeedOnGround | None = None

@@ -4,7 +4,6 @@ others."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +20,7 @@ from shared_map.terrain.slope_rules import (
     slope_factor,
 )
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.terrain import build_terrain, terrain_of_pace
-from shared_map.terrain.terrain_report import doubts_about, facts_of
+from shared_map.terrain.terrain import build_terrain
 from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
 from swarm.config.ground import CostConfig
 from swarm.config.load import load_scenario, parse_scenario
@@ -85,23 +83,6 @@ def test_minetti_is_the_published_polynomial_along_the_slope_and_least_at_some_1
     # A metre of height costs the same beyond the measured range as at its end.
     steep = stepped("minetti", 0.45, 0.9, -0.45, -0.9)
     np.testing.assert_allclose(steep[1::2], 2 * steep[::2], rtol=1e-5)
-
-
-def test_herzog_follows_minetti_and_stays_positive_on_all_slopes() -> None:
-    rises = np.linspace(-0.4, 0.4, 81)
-    published = (
-        1337.8 * rises**6 + 278.19 * rises**5 - 517.39 * rises**4 - 78.199 * rises**3 + 93.419 * rises**2
-    ) + (19.825 * rises + 1.64)
-    np.testing.assert_allclose(stepped("herzog", *rises) * 1.64, published, rtol=1e-4)
-    assert -0.15 <= rises[stepped("herzog", *rises).argmin()] <= -0.05
-    every = stepped("herzog", *np.linspace(-5, 5, 2001), max_slope_deg=90)
-    assert every.min() > 0.3
-    assert every.max() == 100
-
-
-def test_a_critical_slope_doubles_the_pace_of_herzogs_carts() -> None:
-    found = stepped("herzog_wheeled", 0.12, -0.12, 0.24, critical_slope_percent=12)
-    np.testing.assert_allclose(found, [2, 2, 5], rtol=1e-5)
 
 
 def test_a_wheeled_vehicle_is_slowed_by_its_motor_uphill_and_by_its_brakes_downhill() -> None:
@@ -191,20 +172,6 @@ def test_a_step_of_just_the_limit_is_allowed_and_a_hair_more_is_not() -> None:
             climb = climb_on(np.array([[0.0, rise_m * share]]), cost)
             assert climb.allows(0, 1) == climb.allows(1, 0) == allowed
     assert "none is steeper than 60 degrees up or 60 degrees down" in climb.note
-
-
-def test_the_report_tells_how_much_of_the_ground_can_be_entered_and_left_again() -> None:
-    level = terrain_of_pace(np.full((30, 40), 0.1, np.float32))
-    heights = np.zeros((30, 40), np.float32)
-    heights[:, :20] = 3.0  # 17 degrees down, not up
-    both = CostConfig(directional=True, max_slope_deg=30.0)
-    one_way = CostConfig(directional=True, max_climb_deg=10.0, max_slope_deg=30.0)
-    for cost, share, doubts in ((both, 1.0, 0), (one_way, 0.5, 1)):
-        facts = facts_of(replace(level, elevation_m=heights, climb=climb_on(heights, cost)))
-        assert facts["both_ways_share"] == share
-        assert sum("cost.max_climb_deg" in doubt for doubt in doubts_about(facts)) == doubts
-    up_the_edge, steps = 30 + 2 * 29, 2 * (30 * 39 + 29 * 40 + 2 * 29 * 39)  # diagonal ones climb 12 degrees
-    assert facts["too_steep_steps_share"] == pytest.approx(up_the_edge / steps, abs=1e-4)
 
 
 # --- across the way ---------------------------------------------------------------------------------------------
