@@ -24,7 +24,6 @@ from launch_scripts.report.exporter import FORMATS, check_target, write_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.slope_rules import (
     SLOPE_RULES,
-    along_slope_factor,
     directional_factor,
     slope_factor,
     step_limits_deg,
@@ -429,8 +428,7 @@ class Curve(NamedTuple):
         if self.is_mean:
             factor = slope_factor(np.abs(rise), self.cost)
         else:
-            # Straight up or down: nothing of the slope lies across the way.
-            factor = directional_factor(rise, self.cost) * along_slope_factor(rise, self.cost)
+            factor = directional_factor(rise, self.cost)
         found = factor.astype(np.float64)
         return self.cost.flat_speed_m_per_s / found if self.unit == "m/s" else found
 

@@ -25,7 +25,7 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 
-SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "table"]
+SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "table"]
 
 
 class WayConfig(Section, frozen=True, kw_only=True):
@@ -189,11 +189,9 @@ class CostConfig(Section, frozen=True, kw_only=True):
     slope_csv               table: a .csv file with such points instead. Its first line names two columns:
                             slope_deg or slope_percent; factor, pace_s_per_m or speed_m_per_s
     top_speed_m_per_s       no slope makes a vehicle quicker than this on open ground
-    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down it
     max_slope_deg           steeper ground is lethal
     max_climb_deg           directional: no step climbs steeper along its way; `max_slope_deg` if not given
     max_descent_deg         directional: no step descends steeper along its way; `max_slope_deg` if not given
-    rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
     classes                 whether what covers the ground (water, forest, rock ...) counts
     class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
     vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
@@ -214,11 +212,9 @@ class CostConfig(Section, frozen=True, kw_only=True):
     slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
     slope_csv: str | None = None
     top_speed_m_per_s: SpeedOnGround | None = None
-    cross_slope_factor: Annotated[float, Meta(ge=1, le=100)] = 1.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     max_climb_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
     max_descent_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
-    rough_per_m: NotNegative = 0.0
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
