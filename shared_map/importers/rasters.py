@@ -167,9 +167,9 @@ def _heights(
         raise TerrainError(f"{what} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
     shape = dataset.height, dataset.width
     grid, target, planned = plan_grid(place.transform, *shape, place.crs, config.resolution_m, what)
-    factor, offset, told = _scale_of(dataset, place.crs, config)
+    factor, offset, scale_notes = _scale_of(dataset, place.crs, config)
     if dataset.count == 2:
-        told.append("the file has two bands; heights are taken from the first")
+        scale_notes.append("the file has two bands; heights are taken from the first")
     some = sampled(dataset, 1, MOST_SAMPLED).astype(np.float32).filled(np.nan)
     voids, found, looks = looked_at(np.where(np.isfinite(some), some, np.float32(np.nan)), config, factor, offset)
     if voids and target is not None:  # GDAL warps one value of no height only; of a second one it would make slopes
@@ -189,7 +189,7 @@ def _heights(
                 band += np.float32(offset)
             progress("reading heights", row1 / grid.rows)
     classes = np.zeros(elevation_m.shape, np.uint8)
-    return Source(grid, elevation_m, classes, level=level, notes=(*notes, *planned, *told, *looks))
+    return Source(grid, elevation_m, classes, level=level, notes=(*notes, *planned, *scale_notes, *looks))
 
 
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:

@@ -49,16 +49,16 @@ def _learned(each: MarkSet) -> dict[str, Any]:
 
 
 def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
-    said = statements(each)
-    rows, cols = np.divmod(grid_cells(grid, tile_corners(grid, each.tile), said.cells), grid.cols)
-    untils = [FOREVER] * len(said.cells) if said.untils_ns is None else said.untils_ns.tolist()
+    stated = statements(each)
+    rows, cols = np.divmod(grid_cells(grid, tile_corners(grid, each.tile), stated.cells), grid.cols)
+    untils = [FOREVER] * len(stated.cells) if stated.untils_ns is None else stated.untils_ns.tolist()
     marks: list[list[Any]] = []
     for row, col, kind, pace, stamp_ns, until_ns in zip(
         rows.tolist(),
         cols.tolist(),
-        said.kinds.tolist(),
-        said.paces.tolist(),
-        said.stamps_ns.tolist(),
+        stated.kinds.tolist(),
+        stated.paces.tolist(),
+        stated.stamps_ns.tolist(),
         untils,
         strict=True,
     ):

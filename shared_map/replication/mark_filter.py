@@ -39,15 +39,15 @@ def readable_for_target(
 
     chased_by  the targets of a group, where operators may have ordered others than the scenario says
     """
-    heard: set[str] = set()
+    groups: set[str] = set()
     for group in scenario.groups:
         targets = group.targets if chased_by is None else chased_by(group.name)
         if target in targets or (chased_by is None and not targets):
             readable = readable_groups(scenario, group.name)
             if readable is None:
                 return None
-            heard |= readable
-    return frozenset(heard)
+            groups |= readable
+    return frozenset(groups)
 
 
 class MarkFilter:

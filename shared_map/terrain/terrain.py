@@ -118,7 +118,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
         if any(zone.file for zone in cost.zones):
             classes = classes.copy()
         zones = paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m), classes)
-        notes.extend(each.told(grid.cells) for each in zones if each.file is not None)
+        notes.extend(each.sentence(grid.cells) for each in zones if each.file is not None)
     notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
@@ -195,9 +195,9 @@ def _check_passable(pace: Floats, elevation_m: Floats, classes: Bytes, cost: Cos
         f"steeper than cost.max_slope_deg = {cost.max_slope_deg:g}": (slopes > cost.max_slope_deg).mean(),
         "of a lethal class": np.isinf(class_factors(cost)[classes]).mean() if cost.classes else 0.0,
     }
-    said = ", ".join(f"{share:.0%} is {what}" for what, share in shares.items() if share > 0)
+    causes = ", ".join(f"{share:.0%} is {what}" for what, share in shares.items() if share > 0)
     raise TerrainError(
-        f"{_ALL_LETHAL} {said or 'the file itself or a forbidden zone says so of each'};"
+        f"{_ALL_LETHAL} {causes or 'the file itself or a forbidden zone says so of each'};"
         " check the units of the heights, the classes and the zones"
     )
 

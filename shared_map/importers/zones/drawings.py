@@ -64,8 +64,8 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
         facts.crs = placing.crs
         for features in read_features(layer, worth.columns):
             placed = placing.place(features)
-            said = features.columns.get(INCLUSION, np.zeros(0, object))
-            keeps |= worth.closes and bool((said == "yes").any())
+            inclusion = features.columns.get(INCLUSION, np.zeros(0, object))
+            keeps |= worth.closes and bool((inclusion == "yes").any())
             facts.features += len(features.numbers)
             facts.outside += placed.outside
             facts.mended += placed.mended
@@ -157,8 +157,8 @@ class _Worth:
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
-                said = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
-                ways[key] = way, bridge, self.closes and said.lower() in ("yes", "true", "1")
+                inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
+                ways[key] = way, bridge, self.closes and inclusion.lower() in ("yes", "true", "1")
             way, bridge, inside = ways[key]
             if way is not None:
                 if inside and not way.width_m and shape.geom_type != "Polygon":
