@@ -189,8 +189,6 @@ class _Worth:
         if kind is not None and way_classes.is_tunnel(tags):
             self._facts.skip("below the ground", id)
             return None
-        if name:
-            self._facts.classes[name] += 1
         closes = self.closes or (kind == "water" and not name)
         try:
             own_m = way_classes.width_of(tags)

@@ -43,7 +43,6 @@ class FileFacts:
     named: dict[str, list[str]] = field(default_factory=dict)
     mended: list[str] = field(default_factory=list)
     bridges: int = 0
-    classes: Counter[str] = field(default_factory=Counter)
 
     def skip(self, why: str, id: str | None = None) -> None:
         self.skipped[why] += 1

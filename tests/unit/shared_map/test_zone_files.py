@@ -185,7 +185,6 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
     assert dict(roads.file.skipped) == {"of class steps": 1, "below the ground": 1, "without a class": 5}
     assert roads.file.named["of class steps"] == ["way/17"]
     assert (roads.file.used, roads.file.bridges) == (3, 1)
-    assert dict(water.file.classes) == {"stream": 1, "water": 1}
     own = {
         "steps": WayConfig(factor=4.0, width_m=30.0),
         "path": WayConfig(factor="ignored"),
