@@ -140,10 +140,8 @@ def _whole(held: MarkSet | None, dropped: MarkSet | None) -> MarkSet | None:
     return united(held, dropped)
 
 
-def united(one: MarkSet, other: MarkSet | None = None) -> MarkSet:
+def united(one: MarkSet, other: MarkSet) -> MarkSet:
     """The union of two sets that were compacted from the same one, under the higher number."""
-    if other is None:
-        return one
     higher = max(one, other, key=lambda each: (each.epoch, each.seq))
     a, b = statements(one), statements(other)
     cells, first = np.unique(np.concatenate([a.cells, b.cells]), return_index=True)

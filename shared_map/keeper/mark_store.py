@@ -163,7 +163,8 @@ class KeeperStore(SealedDatabase):
             if each is not None and (each.epoch, base_seq(each.seq)) == base
         ]
         if before:
-            self._put(_FOLDED, (*_row(without(united(*before), compacted)), now_ns))
+            whole = before[0] if len(before) == 1 else united(*before)
+            self._put(_FOLDED, (*_row(without(whole, compacted)), now_ns))
         elif is_tombstone(compacted):
             self._put(_FOLDED, (*_row(compacted), now_ns))
         if is_tombstone(compacted):

@@ -104,8 +104,8 @@ class MarkFilter:
 class Interest:
     """The regions within `enter_cells` of any cell, and of the regions before those still within twice as many.
 
-    The hysteresis keeps a vehicle at a border from subscribing again with every crossing. Squares are numbered row by row, as
-    regions are.
+    The hysteresis keeps a vehicle at a border from subscribing again with every crossing. Squares are numbered
+    row by row, as regions are.
 
     squares  the result of the last `update`
     """

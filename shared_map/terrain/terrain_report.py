@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from shared_map.array_files import Bools
-from shared_map.terrain.layers import TerrainClass, slope_deg
+from shared_map.terrain.layers import TerrainClass, largest_part, slope_deg
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec
@@ -59,7 +58,8 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     finite = pace[~lethal]
     for name, quantile in (("pace_least_s_per_m", 0.0), ("pace_median_s_per_m", 0.5), ("pace_most_s_per_m", 1.0)):
         facts[name] = float(f"{np.quantile(finite, quantile):.4g}")
-    facts["largest_part_share"] = round(_largest_part(~lethal[::stride, ::stride]), 4)
+    passable = ~lethal[::stride, ::stride]
+    facts["largest_part_share"] = round(float(largest_part(passable).sum() / max(passable.sum(), 1)), 4)
     return facts
 
 
@@ -68,14 +68,6 @@ def bounds_deg(grid: GridSpec) -> dict[str, float]:
     box = None if grid.crs == "local" else bounds_of(MapFrame(grid))
     names = ("south_deg", "west_deg", "north_deg", "east_deg")
     return {} if box is None else dict(zip(names, (round(value, 7) for value in box), strict=True))
-
-
-def _largest_part(passable: Bools) -> float:
-    """The largest connected part of the passable cells, as a share of them."""
-    from scipy import ndimage
-
-    labels, count = ndimage.label(passable, np.ones((3, 3), np.int8))
-    return float(np.bincount(labels.reshape(-1))[1:].max() / passable.sum()) if count else 0.0
 
 
 def doubts_about(facts: dict[str, Any]) -> list[str]:
