@@ -161,7 +161,13 @@ class CostMap:
 
     def padded(self, window: Window) -> Window:
         """A window and the cells around it that inflation may reach from there."""
-        return self._padded(window, max(len(self._halves) - 1, 0))
+        by = max(len(self._halves) - 1, 0)
+        return Window(
+            max(window.row0 - by, 0),
+            max(window.col0 - by, 0),
+            min(window.row1 + by, self.grid.rows),
+            min(window.col1 + by, self.grid.cols),
+        )
 
     def inflated(self, ground: Floats, window: Window) -> Floats:
         """The pace in a window, were this the ground: float32 (rows, cols) of the whole grid."""
@@ -191,27 +197,15 @@ class CostMap:
         before = flat[where]
         flat[where] = np.where(np.isinf(before), before, ground.reshape(-1)[where])
         dirty = where[flat[where] != before]
-        reach = len(self._halves) - 1
         for window in cluster(flipped, self.grid.cols):
-            inner = self._padded(window, reach)
-            outer = self._padded(inner, reach)
-            fresh = inflate(ground[outer.row0 : outer.row1, outer.col0 : outer.col1], self._halves)
-            row0, col0 = inner.row0 - outer.row0, inner.col0 - outer.col0
-            fresh = fresh[row0 : row0 + inner.row1 - inner.row0, col0 : col0 + inner.col1 - inner.col0]
+            inner = self.padded(window)
+            fresh = self.inflated(ground, inner)
             view = pace[inner.row0 : inner.row1, inner.col0 : inner.col1]
             rows, cols = np.nonzero(view != fresh)
             view[...] = fresh
             dirty = np.concatenate([dirty, (rows + inner.row0) * self.grid.cols + cols + inner.col0])
         if len(dirty):
             self._note_dirty(dirty)
-
-    def _padded(self, window: Window, by: int) -> Window:
-        return Window(
-            max(window.row0 - by, 0),
-            max(window.col0 - by, 0),
-            min(window.row1 + by, self.grid.rows),
-            min(window.col1 + by, self.grid.cols),
-        )
 
     def _note_dirty(self, where: NDArray[np.int64]) -> None:
         self._dirty = merged(cluster(where, self.grid.cols), self._dirty)

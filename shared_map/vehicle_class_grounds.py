@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from shared_map.array_files import Bools, Floats
 from shared_map.terrain.air import air_terrain
 from shared_map.terrain.store import (
-    fetch_kept,
     homes_of,
-    keep,
-    kept_key,
     read_array,
     read_ground,
     read_meta,
@@ -152,14 +149,10 @@ the terrain of the run."""
 
 def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: Floats) -> None:
     """Leaves the ground of every class that vehicles belong to in a run's folder, as `prepare` does for the
-    terrain; made-up ones are kept for later runs."""
+    terrain."""
     for name in driven_classes(scenario):
-        folder, key = _folder(run_dir, name), _prepared_key(scenario, name)
-        kept = _kept_key(scenario, name)
-        if kept is None or not fetch_kept(kept, folder):
-            _save(folder, key, class_grounds(scenario, common, truth)[name])
-            if kept is not None:
-                keep(kept, [folder / _META, *folder.glob("*.npy")])
+        ground = _ground(scenario, common, truth, name)
+        _save(_folder(run_dir, name), _prepared_key(scenario, name), ground)
     _open(run_dir, scenario, common)
 
 
@@ -190,15 +183,6 @@ def _prepared_key(scenario: Scenario, name: str) -> str:
         scenario.wind,
     ]
     return hashlib.blake2b(msgspec.json.encode(parts, order="sorted"), digest_size=8).hexdigest()
-
-
-def _kept_key(scenario: Scenario, name: str) -> str | None:
-    common, own = kept_key(scenario), kept_key(of_class(scenario, name))
-    if common is None or own is None:
-        return None
-    # A cache entry of one name is not that of another, as the name is in the description.
-    payload = msgspec.json.encode([common, own, _prepared_key(scenario, name)])
-    return hashlib.blake2b(payload, digest_size=16).hexdigest()
 
 
 def _save(folder: Path, key: str, ground: ClassGround) -> None:

@@ -218,7 +218,7 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
 
 def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:
     """Returns the number of the first line behind the header, and the word that stands for a void, if one does."""
-    said: dict[bytes, bytes] = {}
+    header: dict[bytes, bytes] = {}
     void, number = (b"*" if driver == "GRASSASCIIGrid" else None), 1
     while line := file.readline(_HEADER_LINE_BYTES):
         words = line.replace(b":", b" ", 1).split()
@@ -228,14 +228,14 @@ def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | N
             break
         if words and words[0].lower() in (b"nodata_value", b"nodata", b"null"):
             void = words[-1]
-        said |= {words[0].lower(): words[-1]} if words else {}
+        header |= {words[0].lower(): words[-1]} if words else {}
         number += 1
-    corner = [key for key in said if key.startswith((b"xll", b"yll"))]
+    corner = [key for key in header if key.startswith((b"xll", b"yll"))]
     if driver == "AAIGrid" and len({key[3:] for key in corner}) + (len(corner) != 2) != 1:
         raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")
     if driver == "GRASSASCIIGrid":  # of which GDAL reads a part only
-        turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(said.get(key, b""))]
-        if turned or said.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
+        turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(header.get(key, b""))]
+        if turned or header.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
             raise TerrainError(f"{what}: its header has degrees and minutes or a multiplier; write it as a .tif")
     return number, void
 
@@ -293,8 +293,8 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
         _check_virtual(path, what, {})
     if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
         return f"/vsisubfile/3,{path}", driver
-    header = path.with_suffix(".hdr")
-    if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
+    beside = path.with_suffix(".hdr")
+    if driver == "EHdr" and beside.is_file() and beside.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
     return path, driver
 

@@ -6,8 +6,8 @@ those that are gone. One runs in a swarm, or several, which hold the same.
   (`sealed_database`).
 - Mark sets of dead authors shrink to the marks that can still win (`compaction`), and are restored if such an
   author turns out to live.
-- Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in a
-  book that all keepers merge (`order_service`). An answer promises that the order is on the disk.
+- Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in
+  books that all keepers merge (`order_service`). An answer promises that the order is on the disk.
 - A machine without the files of a terrain gets them from a keeper (`base_map`).
 - A store can be written as text without loss, and read again (`export`).
 

@@ -46,7 +46,7 @@ class CompactionPlan:
         self._due: dict[int, None] = dict.fromkeys(set_aside)  # tiles to compact, in order
         self._expiries_ns: dict[int, int] = {}  # tile -> when the next statement of a dead author can be dropped
 
-    def heard(self, author: str, now_ns: int) -> None:
+    def note_alive(self, author: str, now_ns: int) -> None:
         """An author lives."""
         if author in self._heard_ns or len(self._heard_ns) < _MOST_AUTHORS:
             self._heard_ns[author] = now_ns
@@ -118,13 +118,13 @@ def compact(
         of_group = {author: each for author, each in whole.items() if each.group == group}
         best_ns, best_rank = _newest_lasting(of_group)
         for rank, (author, complete) in enumerate(of_group.items()):
-            said = statements(complete)
-            counts = (said.stamps_ns > best_ns[said.cells]) | (
-                (said.stamps_ns == best_ns[said.cells]) & (rank >= best_rank[said.cells])
+            stated = statements(complete)
+            counts = (stated.stamps_ns > best_ns[stated.cells]) | (
+                (stated.stamps_ns == best_ns[stated.cells]) & (rank >= best_rank[stated.cells])
             )
-            if said.untils_ns is not None:
-                counts &= said.untils_ns > ended_ns
-            left = taken(said, np.flatnonzero(counts))
+            if stated.untils_ns is not None:
+                counts &= stated.untils_ns > ended_ns
+            left = taken(stated, np.flatnonzero(counts))
             if (new := _replacing(held.get(author), complete, left)) is not None:
                 compacted.append(new)
     return compacted
@@ -140,29 +140,26 @@ def _whole(held: MarkSet | None, dropped: MarkSet | None) -> MarkSet | None:
     return united(held, dropped)
 
 
-def united(one: MarkSet, other: MarkSet | None = None) -> MarkSet:
+def united(one: MarkSet, other: MarkSet) -> MarkSet:
     """The union of two sets that were compacted from the same one, under the higher number."""
-    if other is None:
-        return one
     higher = max(one, other, key=lambda each: (each.epoch, each.seq))
     a, b = statements(one), statements(other)
     cells, first = np.unique(np.concatenate([a.cells, b.cells]), return_index=True)
-    lasting = (np.full(len(said.cells), FOREVER) for said in (a, b))
-    untils = [u if said.untils_ns is None else said.untils_ns for said, u in zip((a, b), lasting, strict=True)]
-    said = Statements(
+    untils = [np.full(len(each.cells), FOREVER) if each.untils_ns is None else each.untils_ns for each in (a, b)]
+    stated = Statements(
         cells,
         np.concatenate([a.kinds, b.kinds])[first],
         np.concatenate([a.paces, b.paces])[first],
         np.concatenate([a.stamps_ns, b.stamps_ns])[first],
         np.concatenate(untils)[first],
     )
-    return mark_set(higher.author, higher.group, higher.tile, higher.epoch, higher.seq, said)
+    return mark_set(higher.author, higher.group, higher.tile, higher.epoch, higher.seq, stated)
 
 
 def without(whole: MarkSet, left: MarkSet) -> MarkSet:
     """Returns the marks of `whole` in cells without a mark in `left`, under the number of `left`."""
-    said = statements(whole)
-    gone = taken(said, np.flatnonzero(~np.isin(said.cells, statements(left).cells)))
+    stated = statements(whole)
+    gone = taken(stated, np.flatnonzero(~np.isin(stated.cells, statements(left).cells)))
     return mark_set(whole.author, whole.group, whole.tile, left.epoch, left.seq, gone)
 
 
@@ -170,11 +167,11 @@ def _newest_lasting(whole: Mapping[str, MarkSet]) -> tuple[NDArray[np.int64], ND
     """(stamp, rank of the author), int64 (1024,) each, of each cell's newest lasting statement; -1 if none."""
     best_ns, best_rank = np.full(TILE_AREA, -1, np.int64), np.full(TILE_AREA, -1, np.int64)
     for rank, each in enumerate(whole.values()):  # in order of author: on a tie the larger stays
-        said = statements(each)
-        if said.untils_ns is not None:
-            said = taken(said, np.flatnonzero(said.untils_ns == FOREVER))
-        newer = said.stamps_ns >= best_ns[said.cells]
-        best_ns[said.cells[newer]], best_rank[said.cells[newer]] = said.stamps_ns[newer], rank
+        stated = statements(each)
+        if stated.untils_ns is not None:
+            stated = taken(stated, np.flatnonzero(stated.untils_ns == FOREVER))
+        newer = stated.stamps_ns >= best_ns[stated.cells]
+        best_ns[stated.cells[newer]], best_rank[stated.cells[newer]] = stated.stamps_ns[newer], rank
     return best_ns, best_rank
 
 

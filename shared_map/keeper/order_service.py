@@ -1,8 +1,15 @@
-"""The keeper's book of orders: an acknowledged order is on its disk, and published to all."""
+"""The keeper's books of orders: an acknowledged order is on its disk, and published to all.
+
+One book has the orders of operators, of which all processes hear. The other has where vehicles are sent, and what
+these have reached; each agent hears of its own.
+"""
 
 from __future__ import annotations
 
-import msgspec
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from msgspec.structs import replace
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
@@ -11,13 +18,23 @@ from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post,
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
 from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
 from swarm.places import cell_of
-from swarm.runtime.order_book import FreshOrders, OrderBook, judged
+from swarm.runtime.order_book import MOST_SENT, FreshOrders, GoalBook, OrderBook, fault_of_vehicle, judged
 from swarm.wire.messages import Nothing
-from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder
-from swarm.wire.topics import GIVE_ORDER, ORDERS
+from swarm.wire.messages.orders import (
+    GiveOrder,
+    Goals,
+    GoalStates,
+    Order,
+    Orders,
+    SendVehicle,
+    VehicleGoals,
+    ZoneOrder,
+)
+from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, GOALS, ORDERS, SEND_VEHICLE
 
 _PUBLISH_NS = NS_PER_S
 _TAG = "orders"
@@ -26,15 +43,16 @@ _MOST_ADDED = 4096
 
 
 class KeptOrders:
-    """Takes orders of operators in, keeps them, and tells the book to all once a second and when it changes.
+    """Takes orders of operators in, keeps them, and publishes the books once a second and when they change.
 
-    book  the orders; those of the store from the start
+    book   the orders; those of the store from the start
+    goals  where vehicles are sent; those of the store from the start
     """
 
     def __init__(
         self, id: str, scenario: Scenario, terrain: Terrain, store: KeeperStore, bus: Bus, post: Post
     ) -> None:
-        self.book = OrderBook()
+        self.book, self.goals = OrderBook(), GoalBook()
         self._id = id
         self._scenario = scenario
         self._terrain = terrain
@@ -45,53 +63,85 @@ class KeptOrders:
         """Agents that have appeared and are not in the scenario: how many vehicles they have is theirs to know."""
         self._fresh: FreshOrders | None = None
         """None where certificates authenticate orders."""
-        self._planned = {plan.id for plan in plan_agents(scenario)}
+        plans = plan_agents(scenario)
+        self._planned = {plan.id for plan in plans}
+        self._on_ground = {plan.id for plan in plans if plan.group.vehicle_class == GROUND}
+        """Agents whose vehicles find the terrain's own lethal cells lethal."""
         self._publish_due_ns = 0
         self._unsaved: list[Order] = []
-        """Orders heard of another keeper that are not on our disk yet."""
+        self._unsaved_goals: list[VehicleGoals] = []
+        """News of other keepers and agents that is not on our disk yet."""
 
     def start(self, now_ns: int) -> None:
         self.book.merge(self._store.orders(), now_ns)
+        self.goals.merge(self._store.goals(), now_ns)
         self._fresh = FreshOrders(now_ns) if self._scenario.network.tls is None else None
         self._bus.watch_alive(self._post, role="agent")
-        self._bus.serve(GIVE_ORDER, self._post, keeper=self._id)
+        for topic in (GIVE_ORDER, SEND_VEHICLE):
+            self._bus.serve(topic, self._post, keeper=self._id)
         self._bus.serve(ORDERS, self._post, role="keeper", id=self._id)
+        self._bus.serve(GOALS, self._post, id=self._id)
         self._bus.subscribe(ORDERS, self._post, role="keeper")
-        # A store may be new while the swarm is old.
-        self._bus.ask(ORDERS, Nothing(), self._post, tag=_TAG)
+        for topic in (GOALS, GOAL_STATES):
+            self._bus.subscribe(topic, self._post)
+        for topic in (ORDERS, GOALS):  # a store may be new while the swarm is old
+            self._bus.ask(topic, Nothing(), self._post, tag=_TAG)
 
-    def take_order_event(self, event: Event, now_ns: int) -> Order | str | bool:
+    def take_order_event(self, event: Event, now_ns: int) -> Order | VehicleGoals | str | bool:
         """Returns True if the event was about orders and needs no other handler; for a given order also the order,
         or the reason for refusing it."""
         match event:
             case Appeared(peer=Peer(role="agent", id=id)):
                 if len(self._added) < _MOST_ADDED and id not in self._planned:
                     self._added.add(id)
-                return True
             case Disappeared(peer=Peer(role="agent")):
-                return True
-            case Heard(message=Orders() as heard) | Replied(message=Orders() as heard):
-                self._unsaved += self.book.merge(heard.orders, now_ns)
-                return True
-            case Asked(topic=topic) if topic is ORDERS:
-                event.answer(self._orders(), role="keeper", id=self._id)
-                event.end()
-                return True
-            case Asked(request=GiveOrder(subject=None)):
-                event.answer(self._orders(), keeper=self._id)
-                event.end()
-                return True
-            case Asked(request=GiveOrder() as given):
-                order = self._take(given, now_ns)
-                if isinstance(order, str):
-                    event.refuse(order)
-                else:
-                    self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
-                    event.answer(self._orders(order), keeper=self._id)
-                event.end()
-                return order
+                pass
+            case Heard(message=Orders() as orders) | Replied(message=Orders() as orders):
+                self._unsaved += self.book.merge(orders.orders, now_ns)
+            case Heard(message=Goals(id=id)) if id == self._id:
+                pass
+            case Heard(message=Goals() as goals) | Replied(message=Goals() as goals):
+                self._unsaved_goals += self.goals.merge(goals.goals, now_ns)
+            case Heard(message=GoalStates() as reached):
+                held = ((self.goals.get(each.name), each) for each in reached.states)
+                news = [
+                    replace(goals, done=new.done) for goals, new in held if goals and goals.stamp_ns == new.stamp_ns
+                ]
+                self._unsaved_goals += self.goals.merge(news, now_ns)
+            case Asked():
+                return self._answered(event, now_ns)
             case _:
                 return False
+        return True
+
+    def _answered(self, asked: Asked, now_ns: int) -> Order | VehicleGoals | str | bool:
+        """Answers a query about orders, as `take_order_event` returns it."""
+        given: Order | VehicleGoals | str | None = None
+        match asked.request:
+            case _ if asked.topic is ORDERS:
+                asked.answer(self._orders(), role="keeper", id=self._id)
+            case _ if asked.topic is GOALS:
+                known = {agent_of(each.name) for each in self.goals}
+                for agent in sorted(known) if asked.fields["agent"] == "*" else [asked.fields["agent"]]:
+                    asked.answer(self._goals_of(agent), agent=agent)
+            case GiveOrder() as order:
+                given = None if order.subject is None else self._take(order, now_ns)
+                if isinstance(given, Order):
+                    self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
+                if not isinstance(given, str):
+                    asked.answer(self._orders(given), keeper=self._id)
+            case SendVehicle() as order:
+                given = self._send(order, now_ns) if order.changes else None
+                if isinstance(given, VehicleGoals):
+                    self._tell(agent_of(given.name))
+                if not isinstance(given, str):
+                    asked.answer(Goals(id=self._id, goals=list(self.goals), given=given), keeper=self._id)
+            case _:
+                return False
+        if isinstance(given, str):
+            asked.refuse(given)
+        asked.end()
+        return given or True
 
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
@@ -109,11 +159,15 @@ class KeptOrders:
         try:
             self._store.save_orders(self._unsaved)
             self._unsaved = []
+            self._store.save_goals(self._unsaved_goals)
+            self._unsaved_goals = []
         except StoreError:
             return  # the alarm about marks covers it, which fare no better; meanwhile askers ask others, too
         self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
+        for agent in sorted({agent_of(goals.name) for goals in self.goals}):
+            self._tell(agent)
 
-    def vehicles_with(self, asked: str) -> list[str]:
+    def _vehicles_with(self, asked: str) -> list[str]:
         """All vehicles of the scenario, and one that was asked for if its agent has been added."""
         vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
         return [*vehicles, asked] if agent_of(asked) in self._added else vehicles
@@ -123,15 +177,15 @@ class KeptOrders:
             given = self._placed(given)
         except ConfigError as error:
             return f"{given.subject} {given.name}: {error}"
-        order = judged(given, self.book, self._scenario, self.vehicles_with(given.name), now_ns)
+        order = judged(given, self.book, self._scenario, self._vehicles_with(given.name), now_ns)
         if isinstance(order, str):
             return order
         if order.cell is not None:
             grid = self._terrain.grid
             if order.cell >= grid.cells:
                 return f"{given.subject} {given.name}: cell {order.cell} is not in {grid.rows} x {grid.cols} cells"
-            if not float(self._terrain.pace_s_per_m.reshape(-1)[order.cell]) < float("inf"):
-                return f"{given.subject} {given.name}: {list(divmod(order.cell, grid.cols))} is lethal"
+            if (fault := self._lethal([order.cell])) is not None:
+                return f"{given.subject} {given.name}: {fault}"
         try:
             self._store.save_orders([order])
         except StoreError as error:
@@ -143,13 +197,65 @@ class KeptOrders:
         """With a cell for a place, or for row and column: outside the grid that is none. Raises ConfigError."""
         grid = self._terrain.grid
         if given.at:
-            return msgspec.structs.replace(given, cell=cell_of(given.at, MapFrame(grid), "at"), at="")
+            return replace(given, cell=cell_of(given.at, MapFrame(grid), "at"), at="")
         if given.row is None or given.col is None:
             return given
         inside = grid.inside(given.row, given.col)
-        return msgspec.structs.replace(
-            given, cell=grid.cell(given.row, given.col) if inside else grid.cells, row=None, col=None
-        )
+        return replace(given, cell=grid.cell(given.row, given.col) if inside else grid.cells, row=None, col=None)
 
     def _orders(self, given: Order | None = None) -> Orders:
         return Orders(role="keeper", id=self._id, orders=list(self.book), given=given)
+
+    def _lethal(self, cells: Sequence[int]) -> str | None:
+        """The first of these cells that is lethal, in a sentence; None if none is."""
+        pace = self._terrain.pace_s_per_m.reshape(-1)
+        lethal = next((cell for cell in cells if not float(pace[cell]) < float("inf")), None)
+        return None if lethal is None else f"{list(divmod(lethal, self._terrain.grid.cols))} is lethal"
+
+    # --- vehicles that are sent -------------------------------------------------------------------------------
+
+    def _tell(self, agent: str) -> None:
+        self._bus.publish(GOALS, self._goals_of(agent), id=self._id, agent=agent)
+
+    def _goals_of(self, agent: str) -> Goals:
+        ours = [goals for goals in self.goals if agent_of(goals.name) == agent]
+        return Goals(id=self._id, agent=agent, goals=ours, shared=shared_by(self.goals, ours))
+
+    def _send(self, given: SendVehicle, now_ns: int) -> VehicleGoals | str:
+        vehicle, grid = given.vehicle, self._terrain.grid
+        if (fault := fault_of_vehicle(vehicle, self._vehicles_with(vehicle))) is not None:
+            return fault
+        if len(self.goals) >= MOST_SENT and self.goals.get(vehicle) is None:
+            return f"vehicle {vehicle}: {MOST_SENT} vehicles have been sent already, which is the limit"
+        try:
+            cells = [cell_of(place, MapFrame(grid), "place") for place in given.places]
+            if (fault := self._fault_of(given, cells)) is not None:
+                return f"vehicle {vehicle}: {fault}"
+            goals = VehicleGoals(
+                name=vehicle, stamp_ns=self.goals.stamp_after(vehicle, now_ns), off=given.off, cells=cells,
+                then=given.then,
+            )  # fmt: skip
+            self._store.save_goals([goals])
+        except ConfigError as error:
+            return f"vehicle {vehicle}: {error}"
+        except StoreError as error:
+            return str(error)
+        self.goals.merge([goals], now_ns)
+        return goals
+
+    def _fault_of(self, given: SendVehicle, cells: Sequence[int]) -> str | None:
+        """Reason why the vehicle cannot go to these cells. Planners know what is lethal for other classes."""
+        if given.then == "repeat" and len(set(cells)) < 2:
+            return "to repeat, expected two different places or more"
+        if agent_of(given.vehicle) not in self._on_ground:
+            return None
+        fault = self._lethal(cells)
+        return None if fault is None else f"place {fault}"
+
+
+def shared_by(all: Iterable[VehicleGoals], ours: Iterable[VehicleGoals]) -> list[tuple[int, int]]:
+    """(cell, how many vehicles were sent there) of each of our cells to which more than one was."""
+    sent = Counter(cell for goals in all for cell in set(goals.cells))
+    return [
+        (cell, sent[cell]) for cell in sorted({cell for goals in ours for cell in goals.cells}) if sent[cell] > 1
+    ]

@@ -10,7 +10,6 @@ import msgspec
 
 from shared_map.keeper.base_map import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
-from shared_map.keeper.goal_service import KeptGoals
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
@@ -89,7 +88,6 @@ class KeeperService:
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
-        self._goals = KeptGoals(setup.id, setup.scenario, terrain, store, bus, post, self._orders.vehicles_with)
         self._stats: dict[tuple[str, str], Stats] = {}
         """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
         self._stats_size = 0
@@ -107,7 +105,7 @@ class KeeperService:
             serves_all=True,
             committed=self._keeper.committed.held,
             on_accepted=self._accepted,
-            on_digest=lambda author, now_ns: self._plan.heard(author, now_ns),
+            on_digest=lambda author, now_ns: self._plan.note_alive(author, now_ns),
         )
         config = setup.scenario.map
         self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
@@ -138,7 +136,6 @@ class KeeperService:
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.serve(ZONES, self._post, keeper=self._id)
         self._orders.start(now_ns)
-        self._goals.start(now_ns)
         self._bus.subscribe(STATS, self._post)
         self._bus.serve(STATS, self._post)
         self._roster.appeared(self._member.peer)
@@ -169,7 +166,7 @@ class KeeperService:
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return
-        ordered = self._orders.take_order_event(event, now_ns) or self._goals.take_goal_event(event, now_ns)
+        ordered = self._orders.take_order_event(event, now_ns)
         if ordered is not False:
             if isinstance(ordered, Order | VehicleGoals):
                 self._member.note(now_ns, "order", described(ordered))
@@ -191,7 +188,6 @@ class KeeperService:
             self._save_sightings(now_ns)
         self._sync.tick(now_ns)
         self._orders.tick(now_ns)
-        self._goals.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]

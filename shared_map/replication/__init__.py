@@ -22,7 +22,7 @@
 6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has a
 budget
    of changed cells. Sets beyond the budget wait; sets beyond the bounds are refused and counted for any sender.
-7. *Interest* (`regions_of_interest`, `mark_filter`): a replica may hold only regions near its vehicles and only
+7. *Interest* (`mark_filter`): a replica may hold only regions near its vehicles and only
 groups that it may
    read. Then it hears only the digests that can concern it.
 

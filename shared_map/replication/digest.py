@@ -254,8 +254,8 @@ class PendingDigests:
         if known is None:
             if len(self._senders) >= _MAX_SENDERS and now_ns >= self._forget_due_ns:
                 self._forget_due_ns = now_ns + NS_PER_S
-                heard = self._senders.items()
-                self._senders = {name: of for name, of in heard if now_ns - of[1] < _FORGET_NS}
+                senders = self._senders.items()
+                self._senders = {name: of for name, of in senders if now_ns - of[1] < _FORGET_NS}
             if len(self._senders) >= _MAX_SENDERS:
                 return False
             self._appeared += 1

@@ -362,9 +362,9 @@ class MapReplica:
         self.counts["marks_written"] += len(cells)
         self._put_own(tile, sparse(own))
 
-    def write_learned(self, said: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
-        """State what we have learned (`shared_map.learning.measurements`), instead of what we said of it before."""
-        self._put_own(beyond_tile(self.grid), Statements(*columns_of(said, now_ns)))
+    def write_learned(self, measured: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
+        """States what we have learned (`shared_map.learning.measurements`), instead of what was stated before."""
+        self._put_own(beyond_tile(self.grid), Statements(*columns_of(measured, now_ns)))
         return self.tick(now_ns)
 
     def _own(self, tile: int) -> Statements:
@@ -374,7 +374,7 @@ class MapReplica:
         own = self.held.get(tile, self.author)
         return dense(NO_STATEMENTS if own is None else statements(own))
 
-    def _put_own(self, tile: int, said: Statements, epoch: int | None = None) -> None:
+    def _put_own(self, tile: int, stated: Statements, epoch: int | None = None) -> None:
         """Replaces our set of a tile, under the next number.
 
         epoch  of that number; None: as before
@@ -382,7 +382,7 @@ class MapReplica:
         assert self.author is not None
         held = self.held.get(tile, self.author)
         last, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
-        own = mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, said)
+        own = mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, stated)
         before = {tile: self.held.of_tile(tile)}
         self.held.put(own, own=True)
         self.counts["sets_merged"] += 1
@@ -396,8 +396,8 @@ class MapReplica:
             self.counts["sets_refused"] += 1
             return
         held = self.held.get(received.tile, self.author)
-        said = NO_STATEMENTS if held is None else statements(held)
-        self._put_own(received.tile, said, received.epoch + 1)
+        stated = NO_STATEMENTS if held is None else statements(held)
+        self._put_own(received.tile, stated, received.epoch + 1)
 
     # --- comparing with others ------------------------------------------------------------------------------
 

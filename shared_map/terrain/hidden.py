@@ -11,8 +11,7 @@ import heapq
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, CellsOf, Floats
-from shared_map.terrain.layers import LETHAL, TerrainClass
-from shared_map.terrain.row_bands import counted
+from shared_map.terrain.layers import LETHAL, TerrainClass, largest_part
 from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, HiddenConfig
@@ -76,10 +75,7 @@ class _Parts:
         """Cells of the largest part."""
 
     def _largest(self) -> int:
-        from scipy import ndimage
-
-        labels, count = ndimage.label(np.isfinite(self.truth))
-        return int(counted(labels, count + 1)[1:].max(initial=0))
+        return int(largest_part(np.isfinite(self.truth)).sum())
 
     def close(self, block: tuple[slice, slice], least: float) -> bool:
         """Makes a block lethal, unless that leaves fewer than `least` cells in the largest part. Whether it did."""

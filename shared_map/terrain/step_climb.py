@@ -144,13 +144,13 @@ class Climb:
         )
 
     def _limits(self) -> str:
-        said = []
+        limits = []
         for way, factors in (("up", self.factors[ENTRIES:]), ("down", self.factors[ENTRIES::-1])):
             allowed = int(np.isfinite(factors).sum())
             if allowed <= ENTRIES:
                 most = (allowed - 0.5) / ENTRIES * self.steepest
-                said.append(f"{math.degrees(math.atan(most)):.3g} degrees {way}")
-        return f", and none is steeper than {' or '.join(said)}" if said else ""
+                limits.append(f"{math.degrees(math.atan(most)):.3g} degrees {way}")
+        return f", and none is steeper than {' or '.join(limits)}" if limits else ""
 
     def allows(self, tail: int, head: int) -> bool:
         """Returns True if a step between neighbours (flat indices) is not too steep."""

@@ -51,7 +51,7 @@ class ZoneFacts:
     opened: int = 0
     file: FileFacts | None = None
 
-    def told(self, cells: int) -> str:
+    def sentence(self, cells: int) -> str:
         """A sentence; `cells` is how many the terrain has."""
         shape = f"{self.kind} zone" + (f" {self.name!r}" if self.name != self.kind else "")
         text = f"{self.cells} cells, {self.changed} changed"

@@ -25,9 +25,7 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 
-SlopeRule = Literal[
-    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
-]
+SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "table"]
 
 
 class WayConfig(Section, frozen=True, kw_only=True):
@@ -115,7 +113,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     photo               a colour GeoTIFF on the same ground
     labels              a TOML file of labelled polygons and points, from which the classes of the photo are learnt
     cover               a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or your own
-                        codes; also an image in the colours of a published legend
+                        codes
     cover_codes         the legend of `cover`, if the file does not show it: "worldcover", "corine",
                         "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to
                         open ground, or "lethal")
@@ -123,8 +121,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     resolution_m        cell size to which everything is resampled; default: the source's own
     crs                 coordinate system of a source which does not state it, such as "EPSG:32632"
     height_scale        metres per unit of height, where the file does not state it (.png)
-    elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
-                        Terrain-RGB or Terrarium tiles
+    elevation_encoding  "metres" if whole numbers which look like codes of land cover are heights
     nodata              cells without a height: "lethal", or "fill" to interpolate them from their surroundings
     nodata_values       stored values which mean "no height", in addition to the value which the file declares
     level_is            meaning of exactly flat areas which no photo shows: surveys level lakes and the sea
@@ -213,15 +210,12 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance: Annotated[float, Meta(ge=0.01, le=1)] = 0.08
     power_reserve: Annotated[float, Meta(ge=1, le=100)] = 1.0
     braking_share: Annotated[float, Meta(ge=0.1, le=100)] = 1.0
-    critical_slope_percent: Annotated[float, Meta(ge=1, le=100)] = 12.0
     slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
     slope_csv: str | None = None
     top_speed_m_per_s: SpeedOnGround | None = None
-    cross_slope_factor: Annotated[float, Meta(ge=1, le=100)] = 1.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     max_climb_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
     max_descent_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
-    rough_per_m: NotNegative = 0.0
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0

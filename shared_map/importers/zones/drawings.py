@@ -12,10 +12,9 @@ import numpy as np
 import shapely
 
 from shared_map.importers.zones import way_classes
-from shared_map.importers.zones.burn import POLYGON, Drawn
 from shared_map.importers.zones.shape_texts import INCLUSION
 from shared_map.importers.zones.vector_files import Features, Layer, open_layers, read_features, unusable
-from shared_map.importers.zones.vector_shapes import Placing, Shapes
+from shared_map.importers.zones.vector_shapes import POLYGON, Drawn, Placing, Shapes
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from shared_map.importers.zones.zone_files import LEAST, MOST, FileFacts
 from swarm.config.ground import ZoneConfig
@@ -65,8 +64,8 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
         facts.crs = placing.crs
         for features in read_features(layer, worth.columns):
             placed = placing.place(features)
-            said = features.columns.get(INCLUSION, np.zeros(0, object))
-            keeps |= worth.closes and bool((said == "yes").any())
+            inclusion = features.columns.get(INCLUSION, np.zeros(0, object))
+            keeps |= worth.closes and bool((inclusion == "yes").any())
             facts.features += len(features.numbers)
             facts.outside += placed.outside
             facts.mended += placed.mended
@@ -158,8 +157,8 @@ class _Worth:
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
-                said = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
-                ways[key] = way, bridge, self.closes and said.lower() in ("yes", "true", "1")
+                inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
+                ways[key] = way, bridge, self.closes and inclusion.lower() in ("yes", "true", "1")
             way, bridge, inside = ways[key]
             if way is not None:
                 if inside and not way.width_m and shape.geom_type != "Polygon":
@@ -190,8 +189,6 @@ class _Worth:
         if kind is not None and way_classes.is_tunnel(tags):
             self._facts.skip("below the ground", id)
             return None
-        if name:
-            self._facts.classes[name] += 1
         closes = self.closes or (kind == "water" and not name)
         try:
             own_m = way_classes.width_of(tags)

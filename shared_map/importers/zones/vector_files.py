@@ -75,8 +75,8 @@ class Features:
     def tags(self, feature: int) -> dict[str, str]:
         """Attributes as texts, without those that are not set."""
         values = {name: column[feature] for name, column in self.columns.items()}
-        told = {name: "" if value is None else str(value) for name, value in values.items()}
-        return {name: text for name, text in told.items() if text not in ("", "nan", "NaT")}
+        texts = {name: "" if value is None else str(value) for name, value in values.items()}
+        return {name: text for name, text in texts.items() if text not in ("", "nan", "NaT")}
 
     def id(self, feature: int) -> str:
         """The name of a feature to people, such as way/4711, or its number in the file."""

@@ -43,7 +43,6 @@ class FileFacts:
     named: dict[str, list[str]] = field(default_factory=dict)
     mended: list[str] = field(default_factory=list)
     bridges: int = 0
-    classes: Counter[str] = field(default_factory=Counter)
 
     def skip(self, why: str, id: str | None = None) -> None:
         self.skipped[why] += 1
@@ -77,8 +76,8 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
         raise TerrainError(f"{where}: {error}") from error
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
-    from shared_map.importers.zones.burn import burn
     from shared_map.importers.zones.drawings import closed_shapes, draw_zone
+    from shared_map.importers.zones.vector_shapes import burn
 
     drawn = draw_zone(zone, grid, what)
     closed, closes = burn(closed_shapes(drawn, grid), grid, what, everywhere=True)

@@ -132,7 +132,6 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("plugin", "check", "se") == ["sensor"]
     assert offered("runs", "export", "LAST", "--what", "ma") == ["marks"]
     assert offered("runs", "export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
-    assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 
 def test_ids_come_from_the_scenario_that_is_named_or_from_the_newest_run(newest_run: Path) -> None:

@@ -218,7 +218,7 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
     replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
     plan = CompactionPlan(10, started_ns=100)
     plan.update(replica.held.ledger, 105)
-    plan.heard("a", 108)
+    plan.note_alive("a", 108)
     plan.update(replica.held.ledger, 110)
     assert plan.take_due(9, 110) == []
     plan.update(replica.held.ledger, 111)
@@ -234,12 +234,12 @@ def test_a_tile_is_due_when_an_author_dies_or_is_alive_after_all_or_an_earlier_o
     replica = MapReplica(GRID)
     replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
     plan = CompactionPlan(10, 100, set_aside=[2])
-    plan.heard("a", 111)
+    plan.note_alive("a", 111)
     plan.update(replica.held.ledger, 111)
     assert plan.take_due(9, 111) == [2, 3]
     plan.update(replica.held.ledger, 122)
     assert plan.take_due(9, 122) == [0]
-    plan.heard("b", 123)
+    plan.note_alive("b", 123)
     plan.accepted(set_of("b", 5, 2, {}))  # nothing left of what it stated there before
     plan.update(replica.held.ledger, 123)
     assert plan.take_due(9, 123) == [5, 3]

@@ -57,7 +57,7 @@ def test_a_geopackage_of_several_layers_asks_which_and_views_are_no_layers(tmp_p
         painted([ZoneConfig(kind="forbidden", file=file, layer="lake")])
     _, (facts,) = painted([ZoneConfig(kind="factor", factor=2.0, file=file, layer="lakes")])
     assert facts.cells == 16
-    assert "from a.gpkg layer 'lakes' in EPSG:32632: 1 of 1 features" in facts.told(UTM.cells)
+    assert "from a.gpkg layer 'lakes' in EPSG:32632: 1 of 1 features" in facts.sentence(UTM.cells)
     database = sqlite3.connect(file)
     with database:
         database.execute("DROP TABLE lakes")
@@ -86,7 +86,7 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
     file = raster(tmp_path / "a.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), UTM.crs)
     pace, (facts,) = painted([ZoneConfig(kind="factor", file=file)])
     np.testing.assert_allclose(pace[[9, 10, 11, 12, 29, 30], 20], [0.1, 0.1, np.inf, 0.3, 0.3, 0.1])
-    assert "factor zone from a.tif in EPSG:32632: 475 of 475 values" in facts.told(UTM.cells)
+    assert "factor zone from a.tif in EPSG:32632: 475 of 475 values" in facts.sentence(UTM.cells)
     pace, _ = painted([ZoneConfig(kind="pace", file=file)])
     np.testing.assert_allclose(pace[[11, 12], 20], [np.inf, 3.0])
     degrees = to_crs(UTM.crs, "EPSG:4326", [500_000.0, 500_500.0], [5_200_000.0, 5_199_600.0])

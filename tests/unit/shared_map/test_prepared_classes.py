@@ -1,4 +1,4 @@
-"""Grounds of classes of vehicles: prepared in a run's folder, mapped by every process, kept for later runs."""
+"""Grounds of classes of vehicles: prepared in a run's folder, mapped by every process."""
 
 from __future__ import annotations
 

@@ -185,7 +185,6 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
     assert dict(roads.file.skipped) == {"of class steps": 1, "below the ground": 1, "without a class": 5}
     assert roads.file.named["of class steps"] == ["way/17"]
     assert (roads.file.used, roads.file.bridges) == (3, 1)
-    assert dict(water.file.classes) == {"stream": 1, "water": 1}
     own = {
         "steps": WayConfig(factor=4.0, width_m=30.0),
         "path": WayConfig(factor="ignored"),
@@ -193,7 +192,7 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
     }
     pace, _ = painted([ZoneConfig(kind="road", file=file, classes=own)], ground=1.0)
     np.testing.assert_allclose(pace[[6, 9, 10, 11, 18], 20], [1.0, 0.2, 0.2, 0.2, np.inf])
-    assert "left out: 5 without a class, 1 of class steps (feature way/17)" in roads.told(UTM.cells)
+    assert "left out: 5 without a class, 1 of class steps (feature way/17)" in roads.sentence(UTM.cells)
 
 
 def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path) -> None:
@@ -209,7 +208,7 @@ def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path)
     np.testing.assert_allclose(pace[[3, 8, 12, 3, 3], [3, 8, 12, 22, 32]], [0.2, 0.3, 0.3, 0.1, 0.1])  # the slower
     assert facts.file is not None
     assert sum(facts.file.skipped.values()) == 2
-    assert "4 (-1.0)" in facts.told(UTM.cells)
+    assert "4 (-1.0)" in facts.sentence(UTM.cells)
     own = {"mud": WayConfig(factor=5.0), "ice": WayConfig(factor="lethal")}
     pace, _ = painted([ZoneConfig(kind="factor", file=file, attribute="kind", classes=own)])
     np.testing.assert_allclose(pace[[3, 12, 3, 3], [3, 12, 22, 32]], [0.5, 0.1, 0.5, np.inf])
