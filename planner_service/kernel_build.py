@@ -79,7 +79,6 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     stride_network.join_nodes,
     stride_growth.tighten,
     stride_network.write_paths,
-    route_walk.relabel,
     partition_search.improve_tiles,
     partition.relabel_tiles,
     partition_totals.add_up,

@@ -454,7 +454,7 @@ class TargetTree:
         """A tree before a window makes its costs upper bounds: they are taken for a heuristic if they are exact."""
         if tree.fine:
             if not tree.precise:
-                tree.relabel()
+                tree.mend()
             if self._is_better_bound and tree.exact:
                 self._bounds.take(tree.cost.copy())
             self._is_better_bound = False

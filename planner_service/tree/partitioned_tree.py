@@ -248,5 +248,4 @@ def in_cells(tree: AnyTree) -> CostToGoTree:
         return tree
     whole = CostToGoTree(tree.cost_grid)
     whole.take_parents(tree.root, tree.parent)
-    whole.exact = tree.exact
     return whole

@@ -99,7 +99,7 @@ def test_a_window_holds_the_old_root_and_the_new_one(tree: CostToGoTree, root: i
 
 def test_a_tree_that_was_never_grown_says_so() -> None:
     tree = CostToGoTree(CostGrid(GRID, PlannerConfig()))
-    for attempt in (tree.relabel, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
+    for attempt in (tree.mend, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
         with pytest.raises(ValueError, match="no root"):
             attempt()
 
