@@ -27,9 +27,9 @@ MODEL_NS_PER_CELL = 15
 """Model cost of a full search per cell, for choices that must be the same on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
-MODEL_PIECES_NS_PER_ROW = 5_000
-"""The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096. It counts
-until a move has been measured."""
+MODEL_PIECES_NS_PER_ROW = 2_400
+"""The same of a tree in pieces, for each row of a square map: `bench moves` measures 1.2 ms at 512 x 512, 4 at 2048,
+10 at 4096. It counts until a move has been measured."""
 PIECES_CELLS = 1 << 18
 """Maps of this number of cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as
 by the parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
@@ -83,6 +83,9 @@ class GrowthTimes:
         self._tick_hz = config.tick_hz
         self._has_worker = has_worker
         self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
+        strategy = self._chosen_by
+        self.may_stop = not isinstance(strategy, StrategyRow) or strategy.stops_at_askers
+        """True if a row may come into force by which growths stop: askers are then noted under the others, too."""
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
@@ -123,8 +126,10 @@ class GrowthTimes:
         median_ns = _median_with(self._full_took_ns, took_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
-        # growth, and twice the memory.
-        if not self._exact_took_ns and not self.in_pieces:
+        # growth, and twice the memory. Beside windows, no exact move is measured, and growths tell that a load of
+        # the machine has ended.
+        if not self.row.is_exact or not (self._exact_took_ns or self.in_pieces):
+            self._exact_took_ns.clear()
             self.exact_ns = self.exact_ns * median_ns // self.full_ns
         self.full_ns = max(1, median_ns)
         self._choose()
