@@ -95,24 +95,26 @@ class _Question:
 class _News(NamedTuple):
     """Changes of the map for the worker, in copies: the map goes on changing meanwhile.
 
-    pace  of the whole map; only what lies in the windows counts
+    pace       of the whole map; only what lies in the windows counts
+    following  vehicles with a route, the cells where they are and to which they go
     """
 
     version: int
     pace: Floats
     windows: list[Window]
+    following: list[tuple[str, int, int]]
 
 
 class _Slice(NamedTuple):
     """Work done on a question.
 
     changed   windows of the map that have changed
-    cheaper   whether some cell costs less than before: any route may be worse than another now
+    outdone   vehicles whose routes may cost more than another, as some cell costs less than before
     """
 
     grown: int
     changed: Sequence[Window] = ()
-    cheaper: bool = False
+    outdone: Sequence[str] = ()
 
 
 class _ClassTrees:
@@ -134,28 +136,36 @@ class _ClassTrees:
         self.kept_up_ns = now_ns
         pace, windows = self.cost_map.pace_s_per_m, self.cost_map.take_dirty()
         if self._version < 0:
-            return _News(self.cost_map.version, pace.copy(), [self.cost_map.grid.window])
+            return _News(self.cost_map.version, pace.copy(), [self.cost_map.grid.window], [])
         if not windows:
             return None
+        following = [
+            (id, each.cell, each.goal)
+            for id, each in self.followers.all_items()
+            if each.goal is not None and not each.stale
+        ]
         copied = np.empty_like(pace)  # of which only what is written becomes memory
         for window in windows:
             part = np.s_[window.row0 : window.row1, window.col0 : window.col1]
             copied[part] = pace[part]
-        return _News(self.cost_map.version, copied, windows)
+        return _News(self.cost_map.version, copied, windows, following)
 
     def work(self, question: _Question, news: _News | None) -> _Slice:
         """Takes the news, and answers as much of a question as a slice of cells gives."""
         changed: Sequence[Window] = ()
-        cheaper = False
+        outdone: list[str] = []
         if news is not None and self._version < 0:
             self.trees.costs.load(news.pace)
         elif news is not None:
             changes = self.trees.costs.apply(news.pace, news.windows)
             self.trees.changed(changes)
-            changed, cheaper = news.windows, bool((changes.after < changes.before).any())
+            changed = news.windows
+            if changes.any_lower:
+                keeps = self.trees.still_cheapest
+                outdone = [id for id, cell, goal in news.following if not keeps(goal, cell)]
         if news is not None:
             self._version = news.version
-        return _Slice(self._answer(question), changed, cheaper)
+        return _Slice(self._answer(question), changed, outdone)
 
     def _answer(self, question: _Question) -> int:
         request, grown = question.request, 0
@@ -328,8 +338,9 @@ class PlacesService(PlanningProcess):
         self._going_on.discard(id(question))
         trees = self._trees(question.request.vehicle_class)
         self.counters.count("place_cells_grown", done.grown)
-        whole = trees.cost_map.grid.window
-        trees.followers.touch(whole if done.cheaper else Window(0, 0, 0, 0), done.changed)
+        trees.followers.touch(Window(0, 0, 0, 0), done.changed)
+        for vehicle in done.outdone:
+            trees.followers.mark_stale(vehicle)
         if not question.done and (question.event is None or now_ns - question.asked_ns < _HOLD_NS):
             self._going_on.add(id(question))
             self._wait(question)
@@ -364,7 +375,7 @@ class PlacesService(PlanningProcess):
             return
         followers = self._trees(question.request.vehicle_class).followers
         for vehicle in question.request.vehicles:
-            followers.is_stale(vehicle)
+            followers.mark_stale(vehicle)
 
     def _refuse(self, event: Asked, reason: str) -> None:
         self.counters.count("place_questions_refused")

@@ -157,6 +157,23 @@ def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_o
     assert {each.vehicle for each in world.pushed} <= {"a0-00"}, "who goes nowhere is pushed nothing"
 
 
+def test_a_cheaper_cell_has_only_those_vehicles_asked_for_again_whose_route_it_may_outdo() -> None:
+    world = PlacesWorld(flat())
+    writer = world.writer("all.a0.1")
+    goals = {f"a0-{row:02d}": (GRID.cell(row, 2), GRID.cell(row, 14)) for row in (2, 14, 26, 38)}
+    for id, (cell, to) in goals.items():
+        world.answer(to, cell, vehicles=[id], asker="agent.a0")
+    world.tell(goals)
+    asked: list[str] = []
+    wait = world.service._wait
+    world.service._wait = lambda question: (asked.extend(question.request.vehicles), wait(question))[1]  # type: ignore[method-assign]
+    for row, col, outdone in ((20, 45, []), (13, 8, ["a0-14"])):
+        writer.sync.publish(writer.replica.write([GRID.cell(row, col)], MarkKind.PACE, 0.05, world.now_ns))
+        world.run(2.0)
+        world.tell(goals)
+        assert asked == outdone
+
+
 def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
     groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
     world = PlacesWorld(flat(), groups, "red")
