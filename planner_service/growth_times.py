@@ -28,8 +28,8 @@ MODEL_NS_PER_CELL = 15
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
 MODEL_PIECES_NS_PER_ROW = 2_400
-"""The same of a tree in pieces, for each row of a square map: `bench moves` measures 1.2 ms at 512 x 512, 4 at 2048,
-10 at 4096. It counts until a move has been measured."""
+"""The same of a tree in pieces, for each row of a square map: `bench moves` measures 1.2 ms at 512 x 512, 4 at
+2048, 10 at 4096. It counts until a move has been measured."""
 PIECES_CELLS = 1 << 18
 """Maps of this number of cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as
 by the parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""

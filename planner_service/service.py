@@ -10,7 +10,7 @@ import msgspec
 
 from planner_service.planner import Answer, Planner
 from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
-from planner_service.planning_process import PlanningProcess
+from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
@@ -21,13 +21,11 @@ from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_filter import readable_for_target
 from shared_map.sightings import Presence, Sightings, pose_of
-from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, Heard, LinkChanged, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, Heard, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
     Believed,
@@ -73,23 +71,20 @@ class PlannerService(PlanningProcess):
 
     def __init__(
         self,
-        setup: RoleSetup,
-        terrain: Terrain,
-        bus: Bus,
-        post: Post,
-        worker: Worker,
-        stopwatch: Callable[[], int] | None = None,
+        planning: Planning,
         all_kernels: Callable[[], bool] | None = None,
+        stopwatch: Callable[[], int] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
+        setup, grid = planning.setup, planning.terrain.grid
         scenario, self._target = setup.scenario, job_of(setup.id)
         self._heard_groups = readable_for_target(scenario, self._target)
         key = {"target": self._target}
         served = dict.fromkeys((ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST), key)
-        super().__init__(setup, terrain, bus, post, worker, self._heard_groups, served, all_kernels)
+        super().__init__(planning, self._heard_groups, served, all_kernels)
         self._stopwatch, self._prepared = stopwatch, prepared
         # Position of the target.
-        self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
+        self._watch = TargetWatch(self._target, grid, self.counters, scenario.time_scale, leads=False)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(self._mark_filter)
         self._presence = Presence(_PRESENCE_NS, self._mark_filter)
@@ -99,7 +94,7 @@ class PlannerService(PlanningProcess):
         # The planners, one of each class with queries.
         self._faults: list[str] = []
         """Faults of the strategy's plug-in that are not reported yet."""
-        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
+        world = StrategyWorld(self._target, grid, scenario.planner)
         self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
         tree = self._new_tree(self._cost_maps[GROUND])
         if prepared is not None:

@@ -632,7 +632,7 @@ class TargetTree:
     @property
     def _can_mend(self) -> bool:
         """Returns True if the tree can be made exact here and now, by its parents. Where exact trees are in pieces,
-        to mend another takes as long as to grow it."""
+        to make another exact takes as long as to grow it."""
         fits = isinstance(self._tree, PieceTree) or not self.times.in_pieces
         return fits and self.times.mends_quickly and self._all_kernels() and self._tree.fine
 

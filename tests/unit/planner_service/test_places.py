@@ -11,8 +11,9 @@ import pytest
 from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, rough
 from support.swarm_model import SwarmModel
 
-import planner_service.places.service as places
-from planner_service.places.service import PlacesService, _ClassTrees
+import planner_service.place_planner as places
+from planner_service.place_planner import PlacesService, _ClassTrees
+from planner_service.planning_process import Planning
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
@@ -37,8 +38,10 @@ class PlacesWorld(SwarmModel):
     def __init__(self, pace: Pace, groups: str = "[[groups]]", job: str = "all") -> None:
         super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario(f"[[targets]]\n{groups}"))
         setup, self._job = self.setup("places", job), job
+        worker = InlineWorker(self.scheduler)
         self.service = self.start(
-            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+            "places",
+            lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)),
         )
         self.client = self.bus("client")
         self.pushed: list[PushedRoute] = []

@@ -1,4 +1,4 @@
-"""The shell of `places`: routes between any two cells of the map, for groups that share their marks.
+"""The process `places`: routes between any two cells of the map, for groups that share their marks.
 
 A place is a goal without a process of its own: its tree is grown as far as its askers are and is kept for the next
 (`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
@@ -21,12 +21,11 @@ import numpy as np
 from planner_service.followers import Followers
 from planner_service.goal_trees import GoalTrees
 from planner_service.planner import FOLLOWER_LEASE_NS, MOST_ROUTES, MOST_STEPS
-from planner_service.planning_process import PlanningProcess
+from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
-from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, LinkChanged, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.agents import (
     PLACE_TREES_BYTES,
@@ -42,7 +41,6 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.liveness import job_of
 from swarm.runtime.fair_queue import FairQueue
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
@@ -195,23 +193,15 @@ class _ClassTrees:
 class PlacesService(PlanningProcess):
     """Serves routes between any two cells. The process is named after the first group that it serves."""
 
-    def __init__(
-        self,
-        setup: RoleSetup,
-        terrain: Terrain,
-        bus: Bus,
-        post: Post,
-        worker: Worker,
-        all_kernels: Callable[[], bool] | None = None,
-    ) -> None:
-        job, groups = job_of(setup.id), readable_groups(setup.scenario, job_of(setup.id))
+    def __init__(self, planning: Planning, all_kernels: Callable[[], bool] | None = None) -> None:
+        job, scenario = job_of(planning.setup.id), planning.setup.scenario
         served = {PLACE_ROUTE: {"places": job}}
-        super().__init__(setup, terrain, bus, post, worker, groups, served, all_kernels)
-        self._push_ns = int(setup.scenario.planner.push_s * NS_PER_S)
+        super().__init__(planning, readable_groups(scenario, job), served, all_kernels)
+        self._push_ns = int(scenario.planner.push_s * NS_PER_S)
         self._foreign = {
             asker_of("agent", plan.id): plan.group.name
-            for plan in plan_agents(setup.scenario)
-            if place_job(setup.scenario, plan.group.name) != job
+            for plan in plan_agents(scenario)
+            if place_job(scenario, plan.group.name) != job
         }
         """The agents which may not know what this process knows, and their groups. Routers hold an asker's name
         against its certificate."""
