@@ -8,16 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from planner_service.strategy import (
-    AHEAD,
-    STRATEGIES,
-    FullGrowth,
-    Growths,
-    OnMove,
-    Strategy,
-    StrategyRow,
-    WidestWindow,
-)
+from planner_service.strategy import AHEAD, STRATEGIES, Growths, OnMove, Strategy, StrategyRow
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
@@ -143,7 +134,7 @@ class GrowthTimes:
         self._choose()
 
     def _choose(self) -> None:
-        widest = self.widest(WidestWindow.WHILE_CHEAPER)
+        widest = self.widest(thins_far_cells=False)
         exact_ns = min(self.exact_ns if self.mends_quickly else math.inf, self.near_ns)
         self._chosen_at = self._moves_per_tick
         times = Growths(
@@ -151,9 +142,9 @@ class GrowthTimes:
         )
         self.row = self._chosen_by.row(times)
 
-    def widest(self, rule: WidestWindow) -> int:
+    def widest(self, thins_far_cells: bool) -> int:
         """Half width of the widest window that is searched without a worker, in cells."""
-        if rule is WidestWindow.SHARE_OF_MAP:
+        if thins_far_cells:
             side = max(self._grid.rows, self._grid.cols)
             return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
@@ -324,7 +315,7 @@ class WindowLimit:
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, new, self._config.k_min)
             return (min(half, max(fine, least)) if has_strides else half), half
-        widest = self._times.widest(row.widest_window)
+        widest = self._times.widest(row.thins_far_cells)
         if has_strides and self._schedule.beyond(new, widest):
             return max(widest, fine, least), self._side
         half = max(self._schedule.half(new, widest), least)
@@ -333,4 +324,4 @@ class WindowLimit:
     def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
         """Returns True if the whole tree is due to become exact, which takes this time."""
         within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
-        return row.full_growth is FullGrowth.WITHIN_BUDGET and within_budget
+        return row.renews_within_budget and within_budget

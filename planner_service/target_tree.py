@@ -19,13 +19,22 @@ from numpy.typing import NDArray
 from planner_service.growth_times import Askers, GrowthTimes, WindowLimit, exact_half
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.route_walk import UNREACHABLE
-from planner_service.planner_actions import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import HYSTERESIS, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
-from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
+from planner_service.tree.partitioned_tree import (
+    AnyTree,
+    GrownTree,
+    PieceTree,
+    can_be_root,
+    empty_tree,
+    growth_job,
+    in_cells,
+    in_pieces,
+    offered_gaps,
+)
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import StrideNetwork, find_strides
 from shared_map.array_files import Floats
@@ -299,7 +308,7 @@ class TargetTree:
         window = self._grid.around(target, half)
         grown_cells = 0
         has_windows = self.strategy.on_move is not OnMove.WHOLE_TREE
-        if half <= self.times.widest(self.strategy.widest_window) and has_windows and self._tree.precise:
+        if half <= self.times.widest(thins_far_cells=False) and has_windows and self._tree.precise:
             grown_cells = self._tree.move(target, window)
         if not grown_cells:
             return Update("none", wants_full=not self._job_out)

@@ -13,13 +13,11 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service import planner_actions as actions
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
 from planner_service.strategy import (
     ROWS,
     STAGES,
     STRATEGIES,
-    FullGrowth,
     Growths,
     OnMove,
     Stage,
@@ -29,6 +27,7 @@ from planner_service.strategy import (
     whole_trees_only,
 )
 from planner_service.target_tree import TargetTree
+from planner_service.tree import partitioned_tree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
@@ -61,7 +60,7 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
         (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
         (StrategyRow(OnMove.SCHEDULED_WINDOW), ["window"] * 5),
         (StrategyRow(OnMove.EXACT_MOVE), ["exact"] * 5),
-        (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET), ["window", "window", "exact"] * 2),
+        (StrategyRow(OnMove.SCHEDULED_WINDOW, renews_within_budget=True), ["window", "window", "exact"] * 2),
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
@@ -144,7 +143,7 @@ ASKED = Growths(1e6, 1e7, 64, GRID.cells, 4e5)
 
 
 def test_a_plugins_row_is_in_force() -> None:
-    row = StrategyRow(OnMove.BLOCK_WINDOW, FullGrowth.WITHIN_BUDGET)
+    row = StrategyRow(OnMove.BLOCK_WINDOW, renews_within_budget=True)
     strategy, told = plugged(row)
     assert strategy.row(ASKED) == row
     assert TargetTree(GRID, PlannerConfig(strategy="my:Own"), chosen_by=strategy).strategy == row
@@ -243,7 +242,7 @@ def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_
     for _ in range(3):
         tree.times.observe_exact_ns(300_000_000)
     assert tree.strategy.on_move is OnMove.SCHEDULED_WINDOW
-    monkeypatch.setattr(actions, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
+    monkeypatch.setattr(partitioned_tree, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
     update = tree.adopt(grown, pace, grid.cell(100, 102), [], 0, np.empty(0, np.int64))
     assert (tree.target_cell, update.wants_full) == (grid.cell(100, 101), True)
 
