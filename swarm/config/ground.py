@@ -182,17 +182,14 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance      energy: share of its weight which a vehicle needs to roll on level open ground
     power_reserve           energy: power of the motor over the power needed on level ground at the flat speed
     braking_share           energy: lasting power of the brakes over that of the motor
-    critical_slope_percent  herzog_wheeled: slope which doubles the pace
     slope_table             table: points [degrees, factor on the flat pace], negative is downhill; linear between
                             them, constant beyond
     slope_csv               table: a .csv file with such points instead. Its first line names two columns: slope_deg
                             or slope_percent; factor, pace_s_per_m or speed_m_per_s
     top_speed_m_per_s       limit on open ground, whatever the slope
-    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down
     max_slope_deg           steeper ground is lethal
     max_climb_deg           directional: steepest climb of a step; default: `max_slope_deg`
     max_descent_deg         directional: steepest descent of a step; default: `max_slope_deg`
-    rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
     classes                 true: the land cover (water, forest, rock ...) counts
     class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
     vehicle_radius_m        inflation: a cell is lethal if a vehicle of this radius in its centre touches a lethal

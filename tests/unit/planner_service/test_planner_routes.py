@@ -7,8 +7,7 @@ import math
 import numpy as np
 from support.scripted_planner import COLS, GRID, World
 
-from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
-from planner_service.planner_actions import Refusal
+from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer, Refusal
 from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
