@@ -27,7 +27,6 @@ FAMILIES = {
     "order target": ("order_commands:target_app", "Add, move and remove simulated targets.", ORDER),
     "order vehicle": ("vehicle_commands:app", "Add, remove, stop and start vehicles.", ORDER),
     "terrain": ("terrain_commands:app", "Inspect and convert terrain; reach maps.", PREPARE),
-    "plugin": ("plugin_commands:app", "List and test plug-ins.", PREPARE),
     "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
     "marks": ("map_commands:app", "Inspect, export and import marks of a store.", LEFT),
     "study": ("simulation_commands:study_app", "Run scenarios with many settings and seeds.", LEFT),

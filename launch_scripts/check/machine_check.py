@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from launch_scripts.check.findings import Finding, Level, failure, warning
+from launch_scripts.check import Finding, Level, failure, warning
 from launch_scripts.process_table import processes_of
 from swarm.config.agents import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
 from swarm.config.input_files import size

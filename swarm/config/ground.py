@@ -180,7 +180,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     preset                  a class of vehicles, whose settings stand for those that are not given here
     flat_speed_m_per_s      speed on level open ground
     road_speed_m_per_s      speed on roads
-    slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
+    slope_rule              what slope does to pace; docs/gis/costs.md has all
     directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
                             by how steep it is; every strategy of the planner goes with it
     steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
