@@ -39,9 +39,6 @@ CERTIFICATES = "Certificates (a folder, or all three files)"
 PART = "A part of a swarm"
 """The panels in which help shows options."""
 
-ENVIRONMENT: dict[str, str] = {}
-"""Variable of the environment -> the option that it stands for, where the command line does not have that."""
-
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Settings of every command, which inherits them from the root."""
 _ROW = re.compile(r"\w+(, \w+)*  +\S")
@@ -132,7 +129,6 @@ def _parameter(
 
 def from_environment(variable: str, **more: Any) -> Any:
     """An option whose value may be in a variable of the environment: `SWARM_NAMESPACE` for `--namespace`."""
-    ENVIRONMENT[variable] = "--" + variable.removeprefix("SWARM_").lower().replace("_", "-")
     return typer.Option(envvar=variable, show_envvar=False, **more)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import typer
 from typer.exceptions import TyperException
 
-from launch_scripts.command_line.declaring import ENVIRONMENT
 from launch_scripts.plain_text import plain
 from swarm.config.explain import choice, nearest
 from swarm.config.input_files import quoted
@@ -52,13 +51,13 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             sys.stdout.flush()
     except TyperException as error:
         if said := _sentence(error):
-            print(f"swarm: {said}{_given_by(said)}", file=sys.stderr)
+            print(f"swarm: {said}", file=sys.stderr)
         return ConfigError.exit_code
     except typer.Abort:
         print("swarm: stopped; nothing is written", file=sys.stderr)
         return 1
     except SwarmError as error:
-        said = "\n".join(map(plain, f"{error}{_given_by(str(error))}".split("\n")))
+        said = "\n".join(map(plain, str(error).split("\n")))
         print(f"swarm: {said}", file=sys.stderr)
         return error.exit_code
     except ModuleNotFoundError as error:
@@ -119,18 +118,6 @@ def _meant(word: str, known: Collection[str]) -> str:
     found = (each for each in _SYNONYMS.get(word, file) if each.split()[0] in known or each[0] in "-.")
     synonym = next(found, None)
     return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"
-
-
-def _given_by(said: str) -> str:
-    """Returns the variables of the environment whose option or value a sentence names, in words."""
-    given = {each: os.environ[each] for each in ENVIRONMENT if os.environ.get(each)}
-    named = [
-        f"{option} is {variable}"
-        for variable, value in given.items()
-        if (option := ENVIRONMENT[variable]) in said or f"'{value}'" in said
-        if not any(word == value or word.startswith(option) for word in sys.argv)
-    ]
-    return f" ({', '.join(named)} of the environment)" if named else ""
 
 
 def _fill_streams() -> None:

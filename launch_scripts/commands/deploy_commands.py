@@ -20,10 +20,9 @@ from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates, revocations
-from launch_scripts.deploy.host_scenario import CERTIFICATES
 from launch_scripts.deploy.hosts import load_hosts
-from launch_scripts.deploy.kits import keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan, plan_fields
+from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
+from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
 from launch_scripts.deploy.machines_needed import (
     CELLS_PER_VEHICLE,
     Estimate,
@@ -130,7 +129,7 @@ def _show(made: Plan, kit: KitName) -> None:
         table.add_column(Text(host.name), overflow="fold")
     rows = {
         "address": [host.address for host in made.hosts],
-        **{role: [", ".join(ids_of(host, role)) for host in made.hosts] for role in ROLES},
+        **{role: [", ".join(each.id for each in host.of(role)) for host in made.hosts] for role in ROLES},
         "load": [f"{host.load:.2f} of {host.cores:g}" for host in made.hosts],
         "terrain": ["files" if host.has_files else "from a keeper" for host in made.hosts],
     }

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import typer
 
 from launch_scripts.command_line.declaring import command, family_app
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
+from launch_scripts.commands.shared_options import VehicleClass, Where
 from launch_scripts.observe.run_folder import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
@@ -143,7 +142,7 @@ class Drives:
     """
 
     panel: ClassVar[str | None] = "How it is driven"
-    target: TargetId = None
+    target: str | None = None
     to: str | None = None
     drive: Literal["mission", "guided"] = "mission"
     arm: bool = False
@@ -166,7 +165,7 @@ class Vehicle:
 
     panel: ClassVar[str | None] = "Identity of the vehicle"
     id: str | None = None
-    group: GroupName = "all"
+    group: str = "all"
     radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0
     sysid: Annotated[int | None, typer.Option(min=1, max=244)] = None
     lost_after: Annotated[float, typer.Option(min=1.5, max=60.0)] = 5.0

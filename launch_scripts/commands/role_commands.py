@@ -108,9 +108,7 @@ def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str
 
 
 @command(app)
-def planner(
-    target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, rank: Rank = 0
-) -> None:
+def planner(target: Annotated[str, typer.Option()], part: Part, rank: Rank = 0) -> None:
     """Run the planner of one target, or a standby of it.
 
     swarm role planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert . --tls-key .
@@ -122,9 +120,7 @@ def planner(
 
 
 @command(app)
-def places(
-    group: Annotated[str, typer.Option(autocompletion=complete.group_names)], part: Part, rank: Rank = 0
-) -> None:
+def places(group: Annotated[str, typer.Option()], part: Part, rank: Rank = 0) -> None:
     """Plan between any two places for the vehicles of a group, or stand by (`planner.places`).
 
     swarm role places my.toml --group all
@@ -136,7 +132,7 @@ def places(
 
 
 @command(app)
-def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part) -> None:
+def agent(id: Annotated[str, typer.Option("--id")], part: Part) -> None:
     """Drive the vehicles of one agent process.
 
     swarm role agent jacksboro --id a0 --connect tcp/127.0.0.1:7447

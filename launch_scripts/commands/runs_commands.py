@@ -22,8 +22,7 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
-from launch_scripts.commands.running_swarm import RunOption, say_newest
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.shared_options import AsJson, RunOption, say_newest
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
 from swarm.errors import ConfigError, StoreError, SwarmError

@@ -9,7 +9,6 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import PREPARE, command
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -47,7 +46,7 @@ class Choices:
     """
 
     panel: ClassVar[str | None] = None
-    terrain: Annotated[str, typer.Option(autocompletion=complete.terrains)] = "synthetic"
+    terrain: str = "synthetic"
     photo: str | None = None
     preset: PresetOption = None
     vehicles: Annotated[int, typer.Option(min=1, max=100_000)] = 20

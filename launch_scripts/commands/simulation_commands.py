@@ -40,9 +40,7 @@ has every trial."""
 
 @command(app, RUN)
 def simulate(
-    scenario: Annotated[
-        str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete.scenarios_and_worlds)
-    ] = None,
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete.scenarios)] = None,
     seed: Seed = None,
     seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1)] = None,
@@ -196,7 +194,7 @@ def _total(verdicts: Sequence[Verdict], wall_s: float) -> dict[str, Any]:
 
 @command(study_app)
 def run(
-    study: Annotated[str, typer.Argument(metavar="STUDY", autocompletion=complete.studies)],
+    study: Annotated[str, typer.Argument(metavar="STUDY")],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
     out: Path | None = None,

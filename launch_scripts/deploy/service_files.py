@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from launch_scripts.deploy.host_scenario import GROUND, PLUGINS, host_scenario, plugin_files
+from launch_scripts.deploy.kits import GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.machine_plan import ROUTER, Plan, PlannedHost, PlannedProcess, router_name
 from launch_scripts.process_table import TABLE
 from swarm.bus.access_control import access_control, low_pass_filter
