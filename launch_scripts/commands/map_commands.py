@@ -1,4 +1,4 @@
-"""`swarm marks`: inspects a keeper's store, exports its marks, imports them into another, shows learned factors."""
+"""`swarm marks`: inspects a keeper's store, exports its marks, shows learned factors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from shared_map.learning.learned_factors import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame
-from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import BusError, StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec
@@ -112,7 +111,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
 def export(store: Store, out: Path) -> None:
     """Export the marks of a store.
 
-    JSON holds all marks and learned factors, and can be imported. Other formats hold the winning marks as pixels or
+    JSON holds all marks and learned factors. Other formats hold the winning marks as pixels or
     polygons.
 
     swarm marks export runs/LAST/map.sqlite marks.json
@@ -146,22 +145,6 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
     marks, words = _parted(grid, sets)
     text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
     return f"{text}, and what {len(words)} authors have learned" if words else text
-
-
-@command(app, name="import")
-def import_(file: Path, store: Path) -> None:
-    """Import exported marks into a store, which no keeper uses.
-
-    swarm marks import marks.json my.sqlite
-
-    file   A .json file of `swarm marks export`.
-    store  The store; made if missing.
-    """
-    terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
-    with KeeperStore(store) as into:
-        into.bind(terrain, grid, classes)
-        into.save(sets)
-    print(f"{store}: merged {_counted(grid, sets)}")
 
 
 @command(app)

@@ -61,10 +61,9 @@ def info(
     """Describe a terrain file or the terrain of a scenario.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
-    these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
-    Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
-    ROS map_server .yaml or .yml, and .png with --resolution-m and
-    --height-scale. Lines after the table
+    these in a .zip, .asc, .npz, .csv and .xyz grids, land cover (ESA
+    WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml,
+    and .png with --resolution-m and --height-scale. Lines after the table
     state processing steps and notes; those with a ! look wrong.
 
     swarm terrain info srtm.hgt
@@ -76,7 +75,7 @@ def info(
     fill                Fill voids from their surroundings instead of forbidding them.
     cover               A raster of land-cover codes on the same ground.
     cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
-    elevation_encoding  Encoding of heights, where the file does not state it.
+    elevation_encoding  metres, if whole numbers that look like codes of land cover are heights.
     """
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,

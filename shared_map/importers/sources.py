@@ -82,11 +82,6 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     else:
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
-    if config.photo is not None and config.cover is None and config.labels is None:
-        from shared_map.importers.cover.land_cover import is_drawn
-
-        if is_drawn(Path(config.photo), config):
-            config = msgspec.structs.replace(config, photo=None, cover=config.photo)
     if config.photo is not None:
         from shared_map.importers.cover.photos import read_photo
 

@@ -1,4 +1,4 @@
-"""Heights as text: points x, y, z of a regular grid (.xyz, .csv), or rows of heights (.csv).
+"""Heights as text: points x, y, z of a regular grid (.xyz, .csv).
 
 GDAL's driver for such files is not used: it fills missing points with 0 where 0 is a height, too, and refuses
 points that do not come row by row.
@@ -7,7 +7,7 @@ points that do not come row by row.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class _Layout(NamedTuple):
     what       names the file in sentences
     delimiter  between numbers; None is any blank
     header     number of the line that names columns; 0 if there is none
-    columns    of x, y and z; None for rows of heights
+    columns    of x, y and z
     degrees    whether x and y are longitude and latitude
     """
 
@@ -61,7 +61,7 @@ class _Layout(NamedTuple):
     what: str
     delimiter: str | None
     header: int = 0
-    columns: tuple[int, int, int] | None = None
+    columns: tuple[int, int, int] = (0, 1, 2)
     degrees: bool = False
 
 
@@ -73,7 +73,7 @@ def read_text_grid(path: Path, what: str) -> Numbers:
     path : Path
         Numbers between commas, semicolons, tabs or blanks; a header may name x, y and z (or lon, lat ...). Points
         may come in any order, and coordinates are those of the middles of cells. Without a header, three columns
-        (in .xyz: the first three) are x, y, z; any other number of columns are rows of heights, from the north.
+        (in .xyz: the first three) are x, y, z.
     what : str
         Names the file in sentences.
 
@@ -89,8 +89,7 @@ def read_text_grid(path: Path, what: str) -> Numbers:
         UnicodeDecodeError where it is no text.
     """
     check_bytes(path, _KIND)
-    layout = _layout(path, what)
-    return _rows_of_heights(layout) if layout.columns is None else _points(layout)
+    return _points(_layout(path, what))
 
 
 # --- text to numbers ----------------------------------------------------------------------------------------
@@ -110,10 +109,9 @@ def _layout(path: Path, what: str) -> _Layout:
             raise TerrainError(f"{what}, line {number}: {first[:60]!r} names no x, y, z or lon, lat, z") from None
         degrees = words[x] in _DEGREES and words[y] in _DEGREES
         return _Layout(path, what, delimiter, number, (x, y, z), degrees)
-    is_xyz = path.suffix.lower() == ".xyz" or words[3:] in ([], [""])
-    if is_xyz and len(words) < 3:
+    if len(words) < 3 or (path.suffix.lower() != ".xyz" and words[3:] not in ([], [""])):
         raise TerrainError(f"{what}: its first line has {len(words)} numbers; expected x, y and z")
-    return _Layout(path, what, delimiter, columns=(0, 1, 2) if is_xyz else None)
+    return _Layout(path, what, delimiter)
 
 
 def _lines(path: Path) -> Iterator[dict[int, str]]:
@@ -148,44 +146,19 @@ def _numbers(layout: _Layout) -> Iterator[Points]:
         try:
             yield numbers_of(lines.values())
         except _NO_NUMBERS as error:
-            raise _bad_line(layout, lines, numbers_of) from error
-
-
-def _bad_line(layout: _Layout, lines: dict[int, str], numbers_of: Callable[[list[str]], Points]) -> TerrainError:
-    """The error that names the first line that is not as the others, in numpy's words."""
-    expected, width = "heights" if layout.columns is None else "x, y and z", 0
-    for number, line in lines.items():
-        try:
-            found = numbers_of([line]).shape[1]
-        except _NO_NUMBERS as error:
-            why = re.split(r" at row|: row", str(error))[0][:120]
-            return TerrainError(f"{layout.what}, line {number}: {why}; expected {expected}")
-        width = width or found
-        if found != width:
-            break
-    return TerrainError(f"{layout.what} is ragged: line {number} has {found} heights, others {width}")
+            for number, line in lines.items():
+                try:
+                    numbers_of([line])
+                except _NO_NUMBERS as fault:
+                    why = re.split(r" at row|: row", str(fault))[0][:120]
+                    raise TerrainError(f"{layout.what}, line {number}: {why}; expected x, y and z") from error
+            raise
 
 
 def _heights(numbers: Points) -> Floats:
     """A value that is too large for float32 becomes infinite, which is no-data."""
     with np.errstate(over="ignore"):
         return numbers.astype(np.float32)
-
-
-# --- rows of heights ----------------------------------------------------------------------------------------
-
-
-def _rows_of_heights(layout: _Layout) -> Numbers:
-    parts: list[Floats] = []
-    for part in _numbers(layout):
-        parts.append(_heights(part))
-        if part.shape[1] != parts[0].shape[1]:
-            both = f"{parts[0].shape[1]} and of {part.shape[1]}"
-            raise TerrainError(f"{layout.what} is ragged: it has lines of {both} heights")
-        check_cells(sum(map(len, parts)), part.shape[1], layout.what)
-    heights = np.concatenate(parts)
-    note = f"{heights.shape[0]} lines of {heights.shape[1]} heights, the first taken for the north"
-    return Numbers(heights, notes=(note,))
 
 
 # --- points -------------------------------------------------------------------------------------------------

@@ -54,11 +54,11 @@ class KeeperStore(SealedDatabase):
     def __init__(self, path: Path | str, *, rebuild: bool = False, read_only: bool = False) -> None:
         super().__init__(path, (_SETS, _FOLDED, _ORDERS, _SIGHTINGS), rebuild=rebuild, read_only=read_only)
 
-    def bind(self, terrain: str, grid: GridSpec, classes: Sequence[str] | None = ()) -> None:
+    def bind(self, terrain: str, grid: GridSpec, classes: Sequence[str] = ()) -> None:
         """Tie the store to this terrain, and to these classes. Raises StoreError if it holds the marks of another
         terrain, or marks for one class alone by whose number another is meant.
 
-        classes  those of the scenario beside "ground", in the order of their numbers; None: not known
+        classes  those of the scenario beside "ground", in the order of their numbers
         """
         bound = self.terrain
         if bound is None:
@@ -70,7 +70,7 @@ class KeeperStore(SealedDatabase):
                 f"the store {self.path} holds marks on terrain {bound}, but this run has terrain {terrain}: "
                 "give another --store, or the terrain and cost rules that it was made with"
             )
-        if classes is not None and self.classes != (order := self._class_order(list(classes), grid)):
+        if self.classes != (order := self._class_order(list(classes), grid)):
             with self._writing():
                 self._put(META, ("classes", json.dumps(order)))
 

@@ -220,25 +220,16 @@ class SealedDatabase:
             raise
 
     def _begun(self, db: sqlite3.Connection) -> sqlite3.Connection:
-        """Makes the tables, or adds digests to those of the version before."""
+        """Makes the tables."""
         self._db = db
         self._sum = 0
-        db.create_function("digest_of_row", -1, self._digest_of_row, deterministic=True)
         with self._writing():
             db.execute("BEGIN IMMEDIATE")
             for table in self._tables:
                 db.execute(table.schema)
-                if not _has_digests(db, table):
-                    db.execute(f"ALTER TABLE {table.name} ADD COLUMN digest BLOB NOT NULL DEFAULT x''")
             self._watch(db)
-            for number, table in enumerate(self._tables):
-                columns = ", ".join(table.columns)
-                db.execute(f"UPDATE {table.name} SET digest = digest_of_row({number}, {columns})")
             self._put(META, ("version", STORE_VERSION))
         return db
-
-    def _digest_of_row(self, number: int, *row: object) -> bytes:
-        return self._tables[number].digest(row)
 
     def _watch(self, db: sqlite3.Connection) -> None:
         db.execute("PRAGMA recursive_triggers = ON")  # otherwise REPLACE deletes without one
@@ -252,16 +243,6 @@ class SealedDatabase:
         [(found,)] = db.execute("PRAGMA integrity_check(1)")
         if found != "ok":
             raise DamagedError(_damaged(self.path, found))
-        if not _has_digests(db, META):
-            if witness is not None:
-                raise DamagedError(_damaged(self.path, "it is of version 2, but was one of version 3"))
-            self._check_version(dict(db.execute("SELECT key, value FROM meta")), "2")
-            if not self._read_only:
-                return self._begun(db)
-            copy = sqlite3.connect(_MEMORY)
-            db.backup(copy)
-            db.close()
-            return self._begun(copy)
         self._db = db
         db.execute("BEGIN")  # one state of a file which another process may write
         try:
@@ -275,7 +256,8 @@ class SealedDatabase:
                         self._moved(b"", table.digest(row))
         finally:
             db.rollback()
-        self._check_version(meta, STORE_VERSION)
+        if (version := meta.get("version")) != STORE_VERSION:
+            raise StoreError(f"the store {self.path} has version {version}, this program reads {STORE_VERSION}")
         with self._reading("seal: "):
             seal = read_seal(bytes.fromhex(meta.get(_SEAL, "")), _KIND)
         if seal is None or seal.digest != self._sum.to_bytes(DIGEST_BYTES, "little"):
@@ -286,14 +268,6 @@ class SealedDatabase:
             self._watch(db)
             self._lock.witness(seal)  # there may be none
         return db
-
-    def _check_version(self, meta: dict[str, str], known: str) -> None:
-        if (version := meta.get("version")) != known:
-            raise StoreError(f"the store {self.path} has version {version}, this program reads {STORE_VERSION}")
-
-
-def _has_digests(db: sqlite3.Connection, table: Table) -> bool:
-    return any(row[1] == "digest" for row in db.execute(f"PRAGMA table_info({table.name})"))
 
 
 def _connect(path: Path | str) -> sqlite3.Connection:

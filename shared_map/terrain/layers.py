@@ -2,7 +2,7 @@
 
 The merge rule, per cell, in this order:
 
-1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
+1. pace = flat pace x slope factor x class factor; on a road the road pace instead.
    With `cost.directional` the slope factor is left out, and each step costs by its rise instead (`step_climb`). No
    finite pace is above `PACE_MOST` or below `PACE_LEAST`.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
@@ -11,8 +11,7 @@ The merge rule, per cell, in this order:
    doubles, slow water multiplies. A road sets the road pace, over cliffs and the terrain's own water too (a
    cutting, a causeway), but not over no-data; a road of a file only where that is quicker. Then water that is
    lethal closes what it touches, roads too; then bridges open the water beneath them; then every forbidden zone is
-   lethal, whatever else was painted there. With `cost.directional` each cell then pays `cost.cross_slope_factor`
-   for driving along its slope; steps that lead up or down get it back.
+   lethal, whatever else was painted there.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of
    `vehicle_radius_m` in its middle would touch a lethal cell.
 5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
@@ -31,7 +30,7 @@ import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands, padded_rows
-from shared_map.terrain.slope_rules import along_slope_factor, slope_factor
+from shared_map.terrain.slope_rules import slope_factor
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
@@ -155,33 +154,6 @@ def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
     return np.degrees(np.arctan(grade(elevation_m, resolution_m))).astype(np.float32)
 
 
-def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
-    """Returns the largest deviation of the eight neighbours from the plane through a cell, in metres: 0 on any even
-    slope.
-
-    `padded_m` has a border of one cell, which the result lacks. A neighbour without a height (NaN) is ignored.
-    """
-    east, north = gradient_of_padded(padded_m, resolution_m)
-    centre = padded_m[1:-1, 1:-1]
-    most = np.zeros(east.shape, np.float32)
-    for dr, dc, beside_m in _neighbours(padded_m):
-        plane = centre + (east * np.float32(dc) - north * np.float32(dr)) * np.float32(resolution_m)
-        np.fmax(most, np.abs(beside_m - plane), out=most)
-    return most
-
-
-def along_slope_of_padded(padded_m: Floats, resolution_m: float, cost: CostConfig) -> Floats:
-    """Returns the factor of each cell's slope on the pace along it (`slope_rules.along_slope_factor`).
-
-    A cell is as steep as its steepest step, if its slope is less: so no step gets more back than its cell has paid.
-    """
-    steepness = grade_of_padded(padded_m, resolution_m)
-    for dr, dc, beside_m in _neighbours(padded_m):
-        run = np.float32(resolution_m * math.hypot(dr, dc))
-        np.fmax(steepness, np.abs(beside_m - padded_m[1:-1, 1:-1]) / run, out=steepness)
-    return along_slope_factor(steepness, cost)
-
-
 def class_factors(cost: CostConfig) -> Floats:
     """Factor of each class, indexed by its number: the built-in ones, replaced by the scenario's."""
     factors = np.ones(256, np.float32)
@@ -212,7 +184,6 @@ def terrain_pace(
     grade_: Floats,
     classes: Bytes,
     cost: CostConfig,
-    rough_m: Floats | None = None,
     readings: Bytes | None = None,
 ) -> Floats:
     """Steps 1 and 2 of the merge rule. A NaN grade is a void; of unknown cells the readings count."""
@@ -226,8 +197,6 @@ def terrain_pace(
             doubtful = (classes == TerrainClass.UNKNOWN) & (readings > 0)
             factors[doubtful] = doubt_factors(cost)[readings[doubtful]]
         pace *= factors
-    if rough_m is not None:
-        pace *= np.float32(1) + np.float32(cost.rough_per_m) * rough_m
     road = classes == TerrainClass.ROAD
     if road.any():
         np.copyto(pace, np.float32(1 / cost.road_speed_m_per_s), where=road & np.isfinite(pace))

@@ -42,41 +42,22 @@ def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg` or NaN.
 
     For a rule that distinguishes uphill from downhill it is the mean of both: there and back again cost together
-    the same as with direction-dependent steps. Half of the ways over a cell lead along its slope, so half of what
-    `cross_slope_factor` adds is added.
+    the same as with direction-dependent steps.
     """
     sine = _sine(grade)
     factor = _bounded(SLOPE_RULES[cost.slope_rule].mean(grade, sine, cost), cost)
-    if cost.cross_slope_factor > 1:
-        factor *= np.float32(1) + np.float32(0.5 * _cross_slope(cost)) * (sine * sine)
     return _without_steeper(factor, sine, cost.max_slope_deg)
 
 
 def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
 
-    Steeper than `max_climb_deg` up or `max_descent_deg` down is inf. On ground with a `cross_slope_factor` it is
-    relative to `along_slope_factor`.
+    Steeper than `max_climb_deg` up or `max_descent_deg` down is inf.
     """
     sine = _sine(rise)
     factor = _bounded(SLOPE_RULES[cost.slope_rule].directed(rise, sine, cost), cost)
-    if cost.cross_slope_factor > 1:
-        factor /= np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
     climb_deg, descent_deg = step_limits_deg(cost)
     return _without_steeper(_without_steeper(factor, sine, climb_deg), -sine, descent_deg)
-
-
-def along_slope_factor(steepness: Floats, cost: CostConfig) -> Floats:
-    """Pace along a slope, neither up nor down, relative to level ground; 1 where the slope is NaN.
-
-    A cell of steepness g that is crossed with a rise r costs (1 + k sin(g)^2) / (1 + k sin(r)^2) times as much for
-    its slope across the path: 1 straight up or down, `cross_slope_factor` along a slope of `max_slope_deg`. This is
-    the part that depends on the cell; the part that depends on the rise is in `directional_factor`.
-    """
-    sine = _sine(steepness)
-    factor: Floats = np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
-    np.copyto(factor, np.float32(1), where=np.isnan(sine))
-    return factor
 
 
 def said_of_cost(cost: CostConfig) -> str:
@@ -113,11 +94,6 @@ def _without_steeper(factor: Floats, sine: Floats, most_deg: float) -> Floats:
 def _limit(cost: CostConfig) -> float:
     """Sine of `max_slope_deg`."""
     return math.sin(math.radians(cost.max_slope_deg))
-
-
-def _cross_slope(cost: CostConfig) -> float:
-    """Returns the coefficient of the square of a slope's sine in the pace along it."""
-    return (cost.cross_slope_factor - 1) / _limit(cost) ** 2
 
 
 def _sine(rise: Floats) -> Floats:
@@ -182,45 +158,6 @@ def _naismith_langmuir(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return factor
 
 
-MINETTI = (280.5, -58.7, -76.8, 51.9, 19.6, 2.5)
-"""J per kg and metre of way, by the gradient; of walking."""
-MINETTI_STEEPEST = 0.45
-"""Gradient up to which was measured."""
-
-
-def _minetti(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """Walking at constant metabolic power: pace in proportion to the energy per metre, which the source tells along
-    the slope, here per metre of the map. Beyond the measured range a metre of height costs as much as at its
-    end."""
-    steepest = np.float32(MINETTI_STEEPEST)
-    inside = np.clip(rise, -steepest, steepest)
-    joules = np.polyval(np.array(MINETTI, np.float32), inside)
-    along = np.sqrt(np.float32(1) + inside * inside)
-    # Per metre of height the same as at the end: per metre of the map it grows with the rise.
-    beyond = np.maximum(np.abs(rise) / steepest, np.float32(1))
-    factor: Floats = joules * along * beyond / np.float32(MINETTI[-1])
-    return factor
-
-
-HERZOG = (1337.8, 278.19, -517.39, -78.199, 93.419, 19.825, 1.64)
-"""J per kg and metre, by the gradient."""
-
-
-def _herzog(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """Walking at constant metabolic power, by Herzog's polynomial through Minetti's data: it stays positive on all
-    slopes, and is for those of up to 50 %."""
-    # Beyond a grade of 2 the bound is reached anyway, and float32 would overflow.
-    joules = np.polyval(np.array(HERZOG, np.float32), np.clip(rise, -2, 2))
-    return np.asarray(joules / np.float32(HERZOG[-1]), np.float32)
-
-
-def _herzog_wheeled(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """1 + (slope / critical slope)^2: where slope is critical, hairpins are as good as the straight way."""
-    share = np.minimum(rise * np.float32(100 / cost.critical_slope_percent), np.float32(1e6))
-    factor: Floats = np.float32(1) + share * share
-    return factor
-
-
 def _table(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     """Straight lines over degrees. Arcus tangent is no correctly rounded operation: the points are taken as rises,
     and lines in degrees are cut into pieces of a quarter degree at most."""
@@ -263,13 +200,6 @@ SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
     "tobler": _by_direction(_tobler),
     # W. Naismith, Scottish Mountaineering Club Journal 2, 1892; E. Langmuir, Mountaincraft and Leadership, 1984.
     "naismith_langmuir": _by_direction(_naismith_langmuir),
-    # A. E. Minetti et al., Energy cost of walking and running at extreme uphill and downhill slopes, Journal of
-    # Applied Physiology 93, 2002: 2.5 J/kg/m on the level, least at some 15 % down.
-    "minetti": _by_direction(_minetti),
-    # I. Herzog, Theory and practice of cost functions, CAA 2010.
-    "herzog": _by_direction(_herzog),
-    # The same, after Llobera and Sluckin, 2007: carts.
-    "herzog_wheeled": _by_steepness(_herzog_wheeled),
     # Points of a scenario: `slope_table` or `slope_csv`.
     "table": _by_direction(_table),
 }

@@ -8,15 +8,13 @@ allows, so that they lie on the disk once. Every file is checked against its dig
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import hashlib
 import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
@@ -331,16 +329,6 @@ def keep(key: str, files: Iterable[Path]) -> None:
         log.info("the terrain is not kept in %s: %s", root, error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    itself = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(itself, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(itself)
 
 
 def _evict(root: Path) -> None:

@@ -19,12 +19,10 @@ from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.layers import (
     TerrainClass,
-    along_slope_of_padded,
     class_factors,
     grade_of_padded,
     inflate,
     inflation_halves,
-    roughness_of_padded,
     slope_deg,
     terrain_pace,
 )
@@ -37,12 +35,12 @@ from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, of_class
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST
 
 if TYPE_CHECKING:
     from shared_map.importers.sources import Source
 
-FORMAT = 6
+FORMAT = 7
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
 
@@ -121,8 +119,6 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
             classes = classes.copy()
         zones = paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m), classes)
         notes.extend(each.told(grid.cells) for each in zones if each.file is not None)
-    if cost.directional and cost.cross_slope_factor > 1:
-        _add_cross_slopes(ground, source.elevation_m, cost, grid, progress)
     notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
@@ -142,26 +138,14 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
         padded_m, resolution_m = padded_rows(source.elevation_m, row0, row1), source.grid.resolution_m
         steepness = grade_of_padded(padded_m, resolution_m)
         np.copyto(steepness, np.float32(np.nan), where=np.isnan(source.elevation_m[row0:row1]))
-        rough_m = roughness_of_padded(padded_m, resolution_m) if cost.rough_per_m else None
         readings = None if source.readings is None else source.readings[row0:row1]
-        pace = terrain_pace(steepness, classes[row0:row1], cost, rough_m, readings)
+        pace = terrain_pace(steepness, classes[row0:row1], cost, readings)
         if source.factor is not None:
             pace *= source.factor[row0:row1]
         ground[row0:row1] = pace
 
     in_bands(source.grid.rows, work, "slope and cost", progress)
     return ground
-
-
-def _add_cross_slopes(
-    ground: Floats, elevation_m: Floats, cost: CostConfig, grid: GridSpec, progress: Progress
-) -> None:
-    def work(row0: int, row1: int) -> None:
-        padded_m, part = padded_rows(elevation_m, row0, row1), ground[row0:row1]
-        dearer = part * along_slope_of_padded(padded_m, grid.resolution_m, cost)
-        np.minimum(dearer, np.float32(PACE_MOST), out=part, where=np.isfinite(part))
-
-    in_bands(grid.rows, work, "slope and cost", progress)
 
 
 def finished(

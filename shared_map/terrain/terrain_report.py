@@ -9,15 +9,12 @@ import numpy as np
 from shared_map.array_files import Bools
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from shared_map.terrain.map_frame import MapFrame
-from shared_map.terrain.step_climb import Climb
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec
 from swarm.places import bounds_of, extent_of
 
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
-_JOINED_SIDE = 1024
-"""On larger terrains one-way steps are followed in a square of this side in cells: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
 _DOUBT = "! "
@@ -63,50 +60,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     for name, quantile in (("pace_least_s_per_m", 0.0), ("pace_median_s_per_m", 0.5), ("pace_most_s_per_m", 1.0)):
         facts[name] = float(f"{np.quantile(finite, quantile):.4g}")
     facts["largest_part_share"] = round(_largest_part(~lethal[::stride, ::stride]), 4)
-    if terrain.climb is not None:
-        facts |= _facts_of_steps(terrain.climb, ~lethal)
     return facts
-
-
-def _facts_of_steps(climb: Climb, passable: Bools) -> dict[str, float]:
-    """Returns the share of steps between passable neighbours that is too steep, and the largest part of the
-    passable cells in which each cell is reachable from each other. On a large terrain both are those of its
-    middle."""
-    if np.isfinite(climb.factors).all():
-        return {}
-    row0, col0 = (max(side - _JOINED_SIDE, 0) // 2 for side in passable.shape)
-    middle = np.s_[row0 : row0 + _JOINED_SIDE, col0 : col0 + _JOINED_SIDE]
-    cells = np.arange(passable.size).reshape(passable.shape)[middle]
-    passable = passable[middle]
-    allowed: list[tuple[Any, Any]] = []
-    counted = steep = 0
-    # East, south, and both diagonals to the south: each pair of neighbours once, driven both ways.
-    for here, there in (
-        (np.s_[:, :-1], np.s_[:, 1:]),
-        (np.s_[:-1], np.s_[1:]),
-        (np.s_[:-1, :-1], np.s_[1:, 1:]),
-        (np.s_[:-1, 1:], np.s_[1:, :-1]),
-    ):
-        both = passable[here] & passable[there]
-        one, other = cells[here][both], cells[there][both]
-        for tails, heads in ((one, other), (other, one)):
-            free = np.isfinite(climb.along(tails, heads))
-            counted, steep = counted + free.size, steep + int(free.size - np.count_nonzero(free))
-            allowed.append((tails[free], heads[free]))
-    tails, heads = (np.searchsorted(cells.reshape(-1), np.concatenate(each)) for each in zip(*allowed, strict=True))
-    return {
-        "too_steep_steps_share": round(steep / max(counted, 1), 4),
-        "both_ways_share": round(_largest_strong_part(tails, heads, passable), 4),
-    }
-
-
-def _largest_strong_part(tails: Any, heads: Any, passable: Bools) -> float:
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(tails.size, np.bool_), (tails, heads)), shape=(passable.size,) * 2)
-    _, labels = connected_components(graph.tocsr(), connection="strong")
-    return float(np.bincount(labels[passable.reshape(-1)]).max() / passable.sum())
 
 
 def bounds_deg(grid: GridSpec) -> dict[str, float]:
@@ -136,11 +90,6 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
         doubts.append(
             f"the passable ground is in parts: the largest has {facts['largest_part_share']:.0%} of it, and"
             " vehicles of one part reach no other"
-        )
-    elif facts.get("both_ways_share", 1.0) < _SCATTERED:
-        doubts.append(
-            f"steps that are too steep part the ground: {facts['both_ways_share']:.0%} of it can be entered and"
-            " left again, and vehicles elsewhere find no way; look at cost.max_climb_deg and cost.max_descent_deg"
         )
     if facts.get("slope_median_deg", 0.0) > _STEEP_DEG:
         doubts.append(

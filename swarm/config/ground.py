@@ -25,9 +25,7 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 
-SlopeRule = Literal[
-    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
-]
+SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "table"]
 
 
 class WayConfig(Section, frozen=True, kw_only=True):
@@ -115,7 +113,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
     cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
-                   own; also an image of such a map in the colours of its published legend
+                   own
     cover_codes    the legend of `cover`, if it cannot be recognised from the file: "worldcover", "corine",
                    "corine-level-3", "nlcd", or a CSV file with lines of code and class (or pace relative to open
                    ground, or "lethal")
@@ -123,8 +121,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     resolution_m   cell size to bring everything to; the source's own if not given
     crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
     height_scale   metres per unit of height, where the file does not say it (.png)
-    elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
-                        Terrain-RGB or Terrarium tiles
+    elevation_encoding  "metres" if whole numbers which look like codes of land cover are heights
     nodata         cells without a height: "lethal", or "fill" to interpolate them from their surroundings
     nodata_values  stored values that mean "no height", in addition to the value which the file declares
     level_is       meaning of exactly flat areas of an elevation file, if no photo shows it: surveys level lakes and
@@ -187,17 +184,14 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
     power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
     braking_share           energy: power that the brakes can hold for long over that of the motor
-    critical_slope_percent  herzog_wheeled: the slope that doubles the pace
     slope_table             table: points [degrees, factor on the flat pace], negative is downhill; straight lines
                             between them, and beyond the last the same factor
     slope_csv               table: a .csv file with such points instead. Its first line names two columns:
                             slope_deg or slope_percent; factor, pace_s_per_m or speed_m_per_s
     top_speed_m_per_s       no slope makes a vehicle quicker than this on open ground
-    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down it
     max_slope_deg           steeper ground is lethal
     max_climb_deg           directional: no step climbs steeper along its way; `max_slope_deg` if not given
     max_descent_deg         directional: no step descends steeper along its way; `max_slope_deg` if not given
-    rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
     classes                 whether what covers the ground (water, forest, rock ...) counts
     class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
     vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
@@ -215,15 +209,12 @@ class CostConfig(Section, frozen=True, kw_only=True):
     rolling_resistance: Annotated[float, Meta(ge=0.01, le=1)] = 0.08
     power_reserve: Annotated[float, Meta(ge=1, le=100)] = 1.0
     braking_share: Annotated[float, Meta(ge=0.1, le=100)] = 1.0
-    critical_slope_percent: Annotated[float, Meta(ge=1, le=100)] = 12.0
     slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
     slope_csv: str | None = None
     top_speed_m_per_s: SpeedOnGround | None = None
-    cross_slope_factor: Annotated[float, Meta(ge=1, le=100)] = 1.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     max_climb_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
     max_descent_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
-    rough_per_m: NotNegative = 0.0
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0

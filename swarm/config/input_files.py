@@ -45,7 +45,6 @@ class FileKind(Enum):
     VECTORS = ("zone", 1 << 30, TerrainError)
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)
-    EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
     TRACKS = ("tracks", 256 << 20, StoreError)
     RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)

@@ -74,7 +74,7 @@ CoverGround = Literal[ClassName, "lethal"] | Positive
 
 CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}\Z")]
 
-ElevationEncoding = Literal["metres", "terrain-rgb", "terrarium"]
+ElevationEncoding = Literal["metres"]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

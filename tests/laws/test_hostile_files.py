@@ -23,11 +23,10 @@ from support.effort import few
 
 from shared_map.importers.cover.classify import read_labels
 from shared_map.importers.sources import load_source
-from shared_map.keeper.export import from_json
 from swarm.config.ground import TerrainConfig
-from swarm.config.input_files import FileKind, parse_toml, read_bytes
+from swarm.config.input_files import parse_toml
 from swarm.config.load import load_scenario
-from swarm.errors import ConfigError, StoreError, SwarmError
+from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec
 
 COMMANDS = """
@@ -229,13 +228,6 @@ def test_a_raster_that_names_others_reaches_nothing_on_the_network(tmp_path: Pat
     assert asked == []
 
 
-def test_an_export_that_explodes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError):
-        from_json('{"format":' + "[" * 200_000)
-    with pytest.raises(StoreError, match=r"it has 21\.5 GB; at most 0\.5 GB are read"):
-        read_bytes(sparse(tmp_path / "a.json"), FileKind.EXPORTED_MAP)
-
-
 # --- flipped, cut, mixed -----------------------------------------------------------------------------------
 
 
@@ -264,11 +256,6 @@ def _seeds() -> dict[str, bytes]:
         "a.toml": b'seed = 3\n[terrain]\nsource = "synthetic"\nrows = 60\n[[targets]]\nstart = [3, 4]\n',
         "labels.toml": b'[[labels]]\nclass = "water"\npolygon_m = [[0, 0], [40, 0], [40, 40]]\n'
         b'[[labels]]\nclass = "grass"\npoints_m = [[55, 55]]\n',
-        "a.json": json.dumps(
-            {"format": "swarm-map/1", "terrain": "t", "grid": {"rows": 9, "cols": 9, "resolution_m": 1.0},
-             "sets": [{"author": "a.1", "group": "all", "tile": 0, "epoch": 1, "seq": 16,
-                       "marks": [[0, 1, "lethal", None, 5]]}]}
-        ).encode(),
     }  # fmt: skip
 
 
@@ -281,8 +268,6 @@ def _read(path: Path) -> None:
             load_scenario(path)
         case "labels.toml":
             read_labels(path, GridSpec(8, 8, 10.0))
-        case "a.json":
-            from_json(path.read_bytes())
         case "a.pgm":
             path.with_name("a.yaml").write_bytes(SEEDS["a.yaml"])
             load_source(TerrainConfig(source=str(path.with_name("a.yaml"))), 1)

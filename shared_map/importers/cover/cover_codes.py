@@ -1,4 +1,4 @@
-"""Codes and colours of land-cover maps: the built-in tables, and tables of the user's own.
+"""Codes of land-cover maps: the built-in tables, and tables of the user's own.
 
 A code becomes a class where one of ours fits. Else it becomes a pace relative to open ground, or lethal.
 """
@@ -10,33 +10,16 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.setting_types import CoverGround
 from swarm.errors import TerrainError
 
-Rgb = tuple[int, int, int]
-
 HIGHEST_CODE = 65_533
-NO_COLOUR, NOTHING = HIGHEST_CODE + 1, HIGHEST_CODE + 2
-"""Results of `legend_codes` for a colour that the legend lacks; and for white and black, which are margins, unless
-the legend has them."""
 _SHOWN = 8
-SAME_COLOUR = 5
-"""Publishers' legends differ by so much per channel between editions."""
-MOST_COLOURS = 1024
-"""A drawn map has fewer; a photo has more."""
-LEAST_DISTINCT = 3
-"""Fewer codes or colours tell nothing."""
-_LEAST_DRAWN = 0.9
-"""Share of a drawing that must have one legend's colours, margins left out (docs/design/terrain-import.md): labels,
-borders and scale bars have others."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +29,11 @@ class Ground:
     kind    the class; UNKNOWN where none of ours fits
     factor  pace relative to open ground; inf is lethal
     name    as the publisher calls it
-    colour  of the published legend
     """
 
     kind: TerrainClass
     factor: float = 1.0
     name: str = ""
-    colour: Rgb | None = None
 
     @property
     def shown(self) -> str:
@@ -91,23 +72,20 @@ class CoverTable:
         return replace(self, grounds={**self.grounds, **named}, nothing=self.nothing - own.keys())
 
 
-def ground_of(value: CoverGround, name: str = "", colour: Rgb | None = None) -> Ground:
+def ground_of(value: CoverGround, name: str = "") -> Ground:
     """A class by its name, "lethal", or a pace relative to open ground."""
     if value == "lethal":
-        return Ground(TerrainClass.UNKNOWN, math.inf, name, colour)
+        return Ground(TerrainClass.UNKNOWN, math.inf, name)
     if isinstance(value, str):
-        return Ground(TerrainClass[value.upper()], 1.0, name, colour)
-    return Ground(TerrainClass.UNKNOWN, float(value), name, colour)
+        return Ground(TerrainClass[value.upper()], 1.0, name)
+    return Ground(TerrainClass.UNKNOWN, float(value), name)
 
 
 def _built_in() -> tuple[dict[str, CoverTable], dict[str, frozenset[int]]]:
     tables = tomllib.loads((Path(__file__).parent / "land_cover.toml").read_text(encoding="utf-8"))
     others = {title: frozenset(codes) for title, codes in tables.pop("others").items()}
     grounds: dict[str, dict[int, Ground]] = {
-        key: {
-            int(code): ground_of(value, name, tuple(bytes.fromhex(colour)))  # type: ignore[arg-type]
-            for code, (value, colour, name) in table.pop("grounds", {}).items()
-        }
+        key: {int(code): ground_of(value, name) for code, (value, name) in table.pop("grounds", {}).items()}
         for key, table in tables.items()
     }
     found = {}
@@ -184,58 +162,6 @@ def table_named(name: str) -> CoverTable:
     if not path.is_file():
         raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
     return read_cover_table(path)
-
-
-# --- colours instead of codes -------------------------------------------------------------------------------
-
-
-def legend_codes(table: CoverTable) -> NDArray[np.uint16]:
-    """uint16 (2**24,): code of each colour red << 16 | green << 8 | blue in the table's published legend."""
-    codes = np.full((256, 256, 256), NO_COLOUR, np.uint16)
-    codes[0, 0, 0] = codes[255, 255, 255] = NOTHING
-    for code, ground in table.grounds.items():
-        if ground.colour is not None:
-            codes[tuple(slice(max(each - SAME_COLOUR, 0), each + SAME_COLOUR + 1) for each in ground.colour)] = code
-    return codes.reshape(-1)
-
-
-def legend_of(colours: NDArray[np.int32], what: str) -> CoverTable | None:
-    """The table in whose published colours an image is drawn; None if it is no drawing, or that of no table.
-
-    Parameters
-    ----------
-    colours : int32, red << 16 | green << 8 | blue
-        Of some of its cells; what shows nothing left out.
-
-    Raises
-    ------
-    TerrainError
-        That asks, if it may be drawn in those of several tables.
-    """
-    drawn, cells = np.unique(colours, return_counts=True)
-    if not 0 < len(drawn) <= MOST_COLOURS:
-        return None
-    shares: dict[str, float] = {}
-    for key, table in TABLES.items():
-        if key == "corine":
-            continue  # the colours are those of its level 3
-        codes = legend_codes(table)[drawn]
-        known, margin = codes < NO_COLOUR, codes == NOTHING
-        if len(np.unique(codes[known])) >= LEAST_DISTINCT:
-            shares[key] = float(cells[known].sum() / cells[~margin].sum())
-    best = [key for key, share in shares.items() if share >= max(_LEAST_DRAWN, *shares.values())]
-    if len(best) > 1:
-        raise TerrainError(
-            f"{what} is drawn in colours of {' and '.join(TABLES[key].title for key in best)}; set"
-            f" terrain.cover_codes = {' or '.join(map(repr, best))}"
-        )
-    return TABLES[best[0]] if best else None
-
-
-def joined(rgb: NDArray[Any]) -> NDArray[np.int32]:
-    """One number of each colour, red << 16 | green << 8 | blue, of (3, rows, cols)."""
-    red, green, blue = (band.astype(np.int32) for band in rgb)
-    return np.asarray(red << 16 | green << 8 | blue, np.int32)
 
 
 def some(codes: Iterable[int]) -> str:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, sampled
 from shared_map.terrain.row_bands import Progress, bands, no_progress
@@ -157,10 +156,10 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
         with as much green as blue; the reds of true ground have more green than blue.
     """
     same = (rgb[1:, 1:] == rgb[:-1, 1:]).all(axis=2) & (rgb[1:, 1:] == rgb[1:, :-1]).all(axis=2)
-    count = np.unique(joined(np.moveaxis(rgb, -1, 0))[seen]).size
+    red, green, blue = np.moveaxis(rgb.astype(np.int32), -1, 0)
+    count = np.unique((red << 16 | green << 8 | blue)[seen]).size
     if 1 < count <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
         return f"a drawn map: it has {count} colours, in areas"
-    red, green, blue = np.moveaxis(rgb.astype(np.int32), -1, 0)
     lit = seen & (red + green + blue > _DARK)
     false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit
     share = false.sum() / max(int(lit.sum()), 1)

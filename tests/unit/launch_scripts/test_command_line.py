@@ -130,7 +130,6 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("order", "set", "pl") == ["planner.cpu_budget", "planner.push_s"]
     assert offered("runs", "export", "LAST", "--what", "ma") == ["marks"]
     assert offered("runs", "export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
-    assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 
 def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

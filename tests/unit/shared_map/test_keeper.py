@@ -208,29 +208,6 @@ def test_damage_that_comes_up_while_a_keeper_runs_is_noticed_at_the_row(tmp_path
             list(store.load())
 
 
-def test_a_store_of_the_version_before_gets_digests_once(tmp_path: Path) -> None:
-    path, copy = tmp_path / "map.sqlite", tmp_path / "copy.sqlite"
-    with KeeperStore(path) as store:
-        store.bind("t", GRID)
-        store.save(some_sets())
-    with sqlite3.connect(path) as db:
-        for table in ("meta", "sets", "folded", "orders"):
-            db.execute(f"ALTER TABLE {table} DROP COLUMN digest")
-        db.execute("DROP TABLE sightings")  # a store from before there were any
-        db.execute("DELETE FROM meta WHERE key = 'seal'")
-        db.execute("UPDATE meta SET value = '2' WHERE key = 'version'")
-    db.close()
-    copy.write_bytes(path.read_bytes())
-    with pytest.raises(DamagedError, match="it is of version 2, but was one of version 3"):
-        KeeperStore(path)
-    with KeeperStore(copy, read_only=True) as store:
-        assert list(store.load()) == some_sets()
-    for _ in range(2):
-        with KeeperStore(copy) as store:
-            assert list(store.load()) == some_sets()
-            assert (store.terrain, store.sightings()) == ("t", [])
-
-
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"cannot open .*map\.sqlite: File exists"):

@@ -33,14 +33,6 @@ def patches(codes: Any, seed: int = 1) -> Any:
     return np.array(codes)[np.digitize(ground, borders)]
 
 
-def drawn(path: Path, codes: Any, key: str) -> Path:
-    """A map of codes in the colours of a published legend."""
-    image = np.full((*codes.shape, 3), 255, np.uint8)
-    for code, ground in TABLES[key].grounds.items():
-        image[codes == code] = ground.colour
-    return written(path, np.moveaxis(image, -1, 0), None)
-
-
 def expected(codes: Any, key: str) -> tuple[Any, Any]:
     grounds = TABLES[key].grounds
     kinds = np.vectorize(lambda code: int(grounds[code].kind))(codes)
@@ -95,26 +87,16 @@ def test_an_ambiguous_map_is_asked_for(tmp_path: Path) -> None:
         read_cover(both, grid, TerrainConfig())
 
 
-@pytest.mark.parametrize("evidence", ["palette", "names", "metadata", "file name"])
+@pytest.mark.parametrize("evidence", ["metadata", "file name"])
 def test_a_table_is_known_by_what_the_file_says_of_itself(tmp_path: Path, dem: Path, evidence: str) -> None:
     codes = patches([11, 21, 31, 41, 42, 43])
-    grounds = TABLES["nlcd"].grounds
     path = written(tmp_path / ("nlcd_2021.tif" if evidence == "file name" else "a.tif"), codes, "uint8")
     with rasterio.open(path, "r+") as file:
-        if evidence == "palette":
-            file.write_colormap(1, {code: (*ground.colour, 255) for code, ground in grounds.items()})
         if evidence == "metadata":
             file.update_tags(title="National Land Cover Database 2021")
-    names = "".join(f"<Category>{grounds[n].name if n in grounds else ''}</Category>" for n in range(96))
-    if evidence == "names":
-        described = f"<CategoryNames>{names}</CategoryNames>"
-        text = f'<PAMDataset><PAMRasterBand band="1">{described}</PAMRasterBand></PAMDataset>'
-        Path(f"{path}.aux.xml").write_text(text, encoding="utf-8")
     source = load(dem, cover=str(path))
     np.testing.assert_array_equal(source.classes, expected(codes, "nlcd")[0])
-    how = evidence if evidence in ("palette", "names") else "its name or metadata"
-    assert said(source.notes, "land cover: NLCD, known by")
-    assert said(source.notes, how)
+    assert said(source.notes, "land cover: NLCD, known by its name or metadata")
 
 
 def test_what_the_table_lacks_is_named_with_its_share_and_so_is_no_data(tmp_path: Path, dem: Path) -> None:
@@ -245,42 +227,9 @@ def test_land_cover_wins_over_level_ground_and_says_so(tmp_path: Path) -> None:
     assert said(source.notes, f"{sea[:, 100:].sum() / sea.size:.1%} of the terrain is water by photo or heights")
 
 
-# --- drawings -----------------------------------------------------------------------------------------------
-
-
-def drawn_by_palette(path: Path, codes: Any, key: str) -> Path:
-    """The same as programs for pictures write it: entries are counted from 0, and have the legend's colours."""
-    grounds = TABLES[key].grounds
-    colours = [(255, 255, 255), *(ground.colour for ground in grounds.values())]
-    path = written(path, np.searchsorted([0, *grounds], codes), "uint8")
-    with rasterio.open(path, "r+") as file:
-        file.write_colormap(1, {n: (*colour, 255) for n, colour in enumerate(colours)})
-    return path
-
-
-@pytest.mark.parametrize("key", ["worldcover", "corine-level-3", "nlcd"])
-@pytest.mark.parametrize("setting", ["cover", "photo", "source"])
-@pytest.mark.parametrize("draw", [drawn, drawn_by_palette])
-def test_a_drawing_in_a_legends_colours_is_read_as_its_codes(
-    tmp_path: Path, dem: Path, key: str, setting: str, draw: Any
-) -> None:
-    codes = patches(list(TABLES[key].grounds))
-    codes[:5] = 0  # drawn white
-    path = draw(tmp_path / "drawn.tif", codes, key)
-    source = load(path) if setting == "source" else load(dem, **{setting: str(path)})
-    np.testing.assert_array_equal(source.classes[5:], expected(codes[5:], key)[0])
-    np.testing.assert_allclose(source.factor[5:], expected(codes[5:], key)[1])
-    assert said(source.notes, TABLES[key].title.partition(" (")[0])
-    assert said(source.notes, "no data on 2.5% of the terrain")
-
-
-def test_a_drawing_in_other_colours_is_refused_as_land_cover_and_not_read_as_a_photo(
-    tmp_path: Path, dem: Path
-) -> None:
-    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
-    with rasterio.open(path, "r+") as file:
-        file.write(file.read()[::-1] // 2)
-    with pytest.raises(TerrainError, match="is an image, and not in the colours of ESA WorldCover"):
+def test_an_image_is_refused_as_land_cover_and_not_read_as_a_photo(tmp_path: Path, dem: Path) -> None:
+    path = written(tmp_path / "drawn.tif", np.stack([patches([11, 131, 242])] * 3), "uint8")
+    with pytest.raises(TerrainError, match="has 3 bands, expected one of codes; a photo goes into"):
         load(dem, cover=str(path))
     notes = load(dem, photo=str(path)).notes
     assert said(notes, "no classes are read from it")

@@ -15,7 +15,6 @@ from shared_map.terrain.layers import (
     TerrainClass,
     gradient_of_padded,
     polygon_mask,
-    roughness_of_padded,
     slope_deg,
     terrain_pace,
 )
@@ -81,20 +80,6 @@ def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
     known = ~np.isnan(heights)
     assert np.isfinite(east[known]).all()
     np.testing.assert_allclose(north[0:3], -0.2, atol=1e-6)
-
-
-def test_roughness_is_what_stands_off_the_even_slope() -> None:
-    row, col = np.mgrid[:9, :9]
-    heights = (3.0 * row + 2.0 * col).astype(np.float32)
-    np.testing.assert_allclose(roughness_of_padded(heights, 10.0), 0, atol=1e-4)
-    heights[4, 4] += 7
-    assert roughness_of_padded(heights, 10.0)[3, 3] == pytest.approx(7, abs=1e-4)
-    assert roughness_of_padded(heights, 10.0)[0, 0] == pytest.approx(0, abs=1e-4)
-    pace = [
-        terrain_pace(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint8), CostConfig(rough_per_m=0.5), rough)
-        for rough in (None, np.full((1, 1), 4.0, np.float32))
-    ]
-    assert pace[1][0, 0] == pytest.approx(3 * pace[0][0, 0])
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -48,11 +48,11 @@ def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
 
 def test_classes_keep_the_preset_of_the_common_cost() -> None:
     scenario = parse_scenario(
-        'cost = { preset = "wheeled" }\nclasses = [{ name = "slow", cost = { rough_per_m = 1 } }]'
+        'cost = { preset = "wheeled" }\nclasses = [{ name = "slow", cost = { vehicle_radius_m = 1 } }]'
     )
     cost = of_class(scenario, "slow").cost
     assert cost.max_slope_deg == cost_of_preset("wheeled").max_slope_deg
-    assert cost.rough_per_m == 1
+    assert cost.vehicle_radius_m == 1
 
 
 def test_an_unknown_class_is_said_with_those_there_are() -> None:
