@@ -10,14 +10,17 @@ returns the exit code.
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import cached_property
-from typing import Annotated, Any, TypeVar, get_type_hints
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -157,3 +160,45 @@ class Family(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         self.group.format_help(ctx, formatter)
+
+
+# --- completion: nothing here may fail or take long, as the user has pressed the Tab key ------------------------
+
+
+def complete_scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Built-in scenarios, and .toml files below the folder that the word begins with."""
+    from launch_scripts.launcher.options import SCENARIOS
+
+    built_in = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
+    return [name for name in [*built_in, *_files_of(incomplete)] if name.startswith(incomplete)]
+
+
+def complete_runs(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Names of the runs in --runs and of those that are registered, the newest first, and LAST."""
+    from launch_scripts.observe.run_registry import registered
+
+    names = {run.name for run in registered()}
+    with contextlib.suppress(OSError):
+        names |= {each.name for each in Path(ctx.params.get("runs") or "runs").iterdir() if each.is_dir()}
+    return [name for name in sorted(names, reverse=True) if name.startswith(incomplete)]
+
+
+def complete_words(module: str, name: str) -> Callable[[typer.Context, str], list[str]]:
+    """The words of a constant: a sequence, a mapping or a `Literal`. Its module is imported on the Tab key."""
+
+    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
+        known: Any = getattr(importlib.import_module(module), name)
+        return [str(word) for word in get_args(known) or tuple(known) if str(word).startswith(incomplete)]
+
+    return offered
+
+
+def _files_of(incomplete: str) -> Iterator[str]:
+    folder = Path(incomplete) if incomplete.endswith("/") else Path(incomplete).parent
+    before = "" if "/" not in incomplete else incomplete[: incomplete.rfind("/") + 1]
+    with contextlib.suppress(OSError):
+        for each in sorted(folder.iterdir()):
+            if each.suffix == ".toml":
+                yield f"{before}{each.name}"
+            elif each.is_dir() and not each.name.startswith("."):
+                yield f"{before}{each.name}/"

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import ORDER, command, family_app
+from launch_scripts.command_line.declaring import ORDER, command, complete_words, family_app
 from launch_scripts.commands.shared_options import AsJson, Walk, Where
 from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain
@@ -30,7 +29,7 @@ short = typer.Typer()
 """The commands which are also called without their family."""
 target_app = family_app("Add, move and remove simulated targets while the swarm runs.")
 Key = Annotated[
-    str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
+    str, typer.Argument(metavar="KEY", autocompletion=complete_words("swarm.runtime.order_book", "SETTINGS"))
 ]
 Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
 At = Annotated[

@@ -177,8 +177,8 @@ def check(
 def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
     """Check if this machine and installation can run a swarm.
 
-    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
-    disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
+    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, clock
+    and disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
 
     swarm doctor
 

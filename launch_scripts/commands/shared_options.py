@@ -14,8 +14,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import CERTIFICATES, NETWORK, PART, from_environment
+from launch_scripts.command_line.declaring import (
+    CERTIFICATES,
+    NETWORK,
+    PART,
+    complete_runs,
+    complete_scenarios,
+    complete_words,
+    from_environment,
+)
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import BusError, ConfigError, SwarmError
 from swarm.liveness import HIGHEST_RANK
@@ -35,13 +42,13 @@ HIGHEST_PORT = 65535
 Seconds = Annotated[float | None, typer.Option(min=0.1, max=MOST_SECONDS)]
 Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
 VehicleClass = Annotated[str, typer.Option("--class")]
-Walk = Annotated[str | None, typer.Option(autocompletion=complete.words("swarm.config.setting_types", "Walk"))]
+Walk = Annotated[str | None, typer.Option(autocompletion=complete_words("swarm.config.setting_types", "Walk"))]
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
         help="A .toml file, or a built-in scenario such as jacksboro.",
-        autocompletion=complete.scenarios,
+        autocompletion=complete_scenarios,
     ),
 ]
 Namespace = Annotated[
@@ -62,7 +69,7 @@ PresetOption = Annotated[
     str | None,
     typer.Option(
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
-        autocompletion=complete.words("swarm.config.setting_types", "Preset"),
+        autocompletion=complete_words("swarm.config.setting_types", "Preset"),
     ),
 ]
 SignalsAddress = Annotated[
@@ -162,7 +169,7 @@ class SomeProcesses:
     panel: ClassVar[str | None] = PART
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROLE[.ID]", autocompletion=complete.words("launch_scripts.process_table", "ROLES")),
+        typer.Option(metavar="ROLE[.ID]", autocompletion=complete_words("launch_scripts.process_table", "ROLES")),
     ] = None
     rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
     run_id: str | None = None
@@ -171,7 +178,7 @@ class SomeProcesses:
 
 # --- the running swarm that a command asks ----------------------------------------------------------------------
 
-RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete.runs)]
+RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete_runs)]
 RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
 _CONNECT_S = 3.0
 _NEWEST = 50

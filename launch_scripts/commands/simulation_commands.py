@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import RUN, command, family_app
+from launch_scripts.command_line.declaring import RUN, command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
 from launch_scripts.stop_requests import stop_requests
 from swarm.config.input_files import quoted
@@ -40,7 +39,7 @@ has every trial."""
 
 @command(app, RUN)
 def simulate(
-    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete.scenarios)] = None,
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete_scenarios)] = None,
     seed: Seed = None,
     seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1)] = None,

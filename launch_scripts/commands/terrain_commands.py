@@ -28,7 +28,6 @@ from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
 from swarm.errors import ConfigError
-from swarm.files import replacing
 from swarm.grid import GridSpec
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
@@ -186,7 +185,7 @@ def generate(
     swarm terrain generate --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
 
-    out           Write the heights: .tif (in UTM 32) or .npz.
+    out           Write the heights: .tif, in UTM 32.
     rows          Cells from north to south.
     cols          Cells from west to east.
     resolution_m  Metres a cell.
@@ -196,7 +195,7 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    check_target(out, "--out", *_TIFF, ".npz")
+    check_target(out, "--out", *_TIFF)
     check_target(photo, "--photo", *_TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
@@ -211,11 +210,7 @@ def generate(
     with progress() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
-    if out.suffix.lower() == ".npz":
-        with replacing(out) as half:
-            np.savez_compressed(half, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
-    else:
-        write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
+    write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
         write_raster(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     _draw(terrain, picture, f"synthetic, seed {seed}")

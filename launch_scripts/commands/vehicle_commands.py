@@ -89,10 +89,10 @@ def recall(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
 
 @command(app)
 def add(
+    id: Annotated[str, typer.Option()],
     group: Annotated[str, typer.Option()],
     part: Part,
     count: Annotated[int, typer.Option(min=1)] = 1,
-    id: str = "",
     at: Annotated[str | None, typer.Option(metavar="PLACE")] = None,
 ) -> None:
     """Start an agent with extra vehicles. Runs until they have left, or until Ctrl-C.
@@ -100,11 +100,11 @@ def add(
     They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
     process is killed they stay where they are; the same command finds them again.
 
-    swarm order vehicle add my.toml --group all --count 5 --at 36.41,-84.29
+    swarm order vehicle add my.toml --id extra --group all --count 5 --at 36.41,-84.29
 
+    id     Name of the agent that hosts them.
     group  The group of the scenario to which they belong.
     count  How many vehicles.
-    id     Name of the agent that hosts them; if not given, added0 or the next free one.
     at     LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere.
     """
     if at is not None:
