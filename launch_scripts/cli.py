@@ -12,9 +12,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from launch_scripts.command_line import declaring
-from launch_scripts.command_line.declaring import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family
-from launch_scripts.command_line.run_command import run_command
+from launch_scripts import command_line
+from launch_scripts.command_line import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
 
 LEAVES = (
     "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
@@ -102,7 +101,7 @@ def _root(
 help_app = typer.Typer()
 
 
-@declaring.command(help_app, ADMIN, "help")
+@command_line.command(help_app, ADMIN, "help")
 def help_(
     words: Annotated[list[str] | None, typer.Argument(metavar="[COMMAND...]")] = None,
     every: Annotated[bool, typer.Option("--all")] = False,

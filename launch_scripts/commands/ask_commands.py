@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line.declaring import ASK, command
+from launch_scripts.command_line import ASK, command
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     AsJson,

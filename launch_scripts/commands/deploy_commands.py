@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.check.scenario_check import check_start
-from launch_scripts.command_line.declaring import command, complete_scenarios, family_app
+from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates, revocations
 from launch_scripts.deploy.hosts import load_hosts

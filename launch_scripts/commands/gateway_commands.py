@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import VehicleClass, Where
 from launch_scripts.observe.run_folder import RUNS
 from launch_scripts.process_table import check_name

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import ORDER, command, complete_words, family_app
+from launch_scripts.command_line import ORDER, command, complete_words, family_app
 from launch_scripts.commands.shared_options import AsJson, Walk, Where
 from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.command_line.declaring import command, complete_runs, complete_words, family_app
+from launch_scripts.command_line import command, complete_runs, complete_words, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
 from launch_scripts.launcher.console import REPORTED, progress
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report

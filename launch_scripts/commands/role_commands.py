@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import command, complete_scenarios, family_app
+from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     LogFormatOption,

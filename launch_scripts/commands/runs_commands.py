@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line.declaring import RUN, command, complete_runs
+from launch_scripts.command_line import RUN, command, complete_runs
 from launch_scripts.commands.shared_options import AsJson, RunOption, say_newest
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.command_line.declaring import PREPARE, command
+from launch_scripts.command_line import PREPARE, command
 from launch_scripts.commands.shared_options import (
     AsJson,
     PortOption,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import (
+from launch_scripts.command_line import (
     CERTIFICATES,
     NETWORK,
     PART,

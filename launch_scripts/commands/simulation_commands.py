@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import RUN, command, complete_scenarios, family_app
+from launch_scripts.command_line import RUN, command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
 from launch_scripts.stop_requests import stop_requests
 from swarm.config.input_files import quoted

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import find_scenario

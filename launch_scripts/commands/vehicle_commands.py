@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Joins, Part, run_role
 from launch_scripts.commands.shared_options import AsJson, Where
