@@ -12,9 +12,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from launch_scripts.command_line import declaring
-from launch_scripts.command_line.declaring import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family
-from launch_scripts.command_line.run_command import run_command
+from launch_scripts import command_line
+from launch_scripts.command_line import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
 
 LEAVES = (
     "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
@@ -27,7 +26,6 @@ FAMILIES = {
     "order target": ("order_commands:target_app", "Add, move and remove simulated targets.", ORDER),
     "order vehicle": ("vehicle_commands:app", "Add, remove, stop and start vehicles.", ORDER),
     "terrain": ("terrain_commands:app", "Inspect and convert terrain; reach maps.", PREPARE),
-    "plugin": ("plugin_commands:app", "List and test plug-ins.", PREPARE),
     "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
     "marks": ("map_commands:app", "Inspect, export and import marks of a store.", LEFT),
     "study": ("simulation_commands:study_app", "Run scenarios with many settings and seeds.", LEFT),
@@ -103,7 +101,7 @@ def _root(
 help_app = typer.Typer()
 
 
-@declaring.command(help_app, ADMIN, "help")
+@command_line.command(help_app, ADMIN, "help")
 def help_(
     words: Annotated[list[str] | None, typer.Argument(metavar="[COMMAND...]")] = None,
     every: Annotated[bool, typer.Option("--all")] = False,

@@ -21,7 +21,7 @@ import typer
 from docs.generate import scenario_page, wire_page
 from docs.generate.templates import filled
 from launch_scripts import cli
-from launch_scripts.command_line.declaring import Family
+from launch_scripts.command_line import Family
 from launch_scripts.gateways.ros2.gateway_settings import EXAMPLE, Settings, incoming_rows
 from launch_scripts.gateways.ros2.topic_table import TABLE
 from shared_map.importers.cover.cover_codes import TABLES

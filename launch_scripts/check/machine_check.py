@@ -10,12 +10,11 @@ import platform
 import resource
 import shutil
 import time
-import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from launch_scripts.check.findings import Finding, Level, failure, warning
+from launch_scripts.check import Finding, Level, failure, warning
 from launch_scripts.process_table import processes_of
 from swarm.config.agents import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
 from swarm.config.input_files import size
@@ -273,17 +272,6 @@ def _zenoh(runs: Path) -> Said:
     return "ok", f"two sessions met on 127.0.0.1:{port} within {took_ms:.0f} ms"
 
 
-def _ports(runs: Path) -> Said:
-    from launch_scripts.ports import check_ports
-    from swarm.errors import BusError
-
-    try:
-        check_ports(Scenario(), ("router", "monitor"))
-    except BusError as error:
-        return "warning", str(error)
-    return "ok", "those of scenarios that name none are free"
-
-
 def _clock(runs: Path) -> Said:
     state = _clock_state()
     if state == _UNSYNCHRONISED:
@@ -295,15 +283,6 @@ def _clock_state() -> int:
     """Returns the kernel's state of its clock; below 0 if it gives none."""
     # All zero asks and changes nothing.
     return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
-
-
-def _browser(runs: Path) -> Said:
-    try:
-        webbrowser.get()
-    except webbrowser.Error:
-        page = "open the page that `swarm up` names from another computer, by the ssh line beside it"
-        return "warning", f"no browser here: {page}"
-    return "ok", "there is one for the live view"
 
 
 def _disk(runs: Path) -> Said:
@@ -319,7 +298,7 @@ def _disk(runs: Path) -> Said:
 CHECKS: dict[str, Callable[[Path], Said]] = {
     look.__name__.strip("_").replace("_", " "): look
     for look in (
-        _python, _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _ports, _clock, _browser, _disk,
+        _python, _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _clock, _disk,
     )
 }  # fmt: skip
 """The checks by their names, in order."""

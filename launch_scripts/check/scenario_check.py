@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from launch_scripts.check.findings import Finding, failure, warning
+from launch_scripts.check import Finding, failure, warning
 from launch_scripts.process_table import ROLES, certificate_names
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats

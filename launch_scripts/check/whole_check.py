@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.check import machine_check, scenario_check
-from launch_scripts.check.findings import Finding, counted, failure, warning
+from launch_scripts.check import Finding, counted, failure, machine_check, scenario_check, warning
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import with_port
 from launch_scripts.ports import check_ports
 from launch_scripts.process_table import ROLES
+from shared_map.array_files import Floats
 from shared_map.terrain.terrain import build_terrain, build_truth
 from swarm.config.input_files import FileKind, read_text, size
 from swarm.config.load import read_scenario
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, SwarmError
+from swarm.grid import GridSpec
+from swarm.plugins.find import find_plugin
 
 
 def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Finding], dict[str, Any], str]:
@@ -68,8 +71,6 @@ def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator
     yield from scenario_check.places(scenario, terrain, truth)
     yield from scenario_check.shards(scenario, terrain.grid)
     if any(each.name not in each.kind.built_in for each in plugins_of(scenario)):
-        from launch_scripts.check.plugin_check import not_made  # which loads the planner
-
         yield from not_made(scenario, terrain.grid, truth)
     yield from scenario_check.one_way_ground(scenario, terrain, truth)
     wanted, here = machine_check.needs_of(scenario, terrain.grid.cells), machine_check.this_machine(runs)
@@ -85,3 +86,35 @@ def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator
         "needs": wanted._asdict(),
         "machine": here._asdict(),
     }
+
+
+def not_made(scenario: Scenario, grid: GridSpec, truth: Floats) -> Iterator[Finding]:
+    """Yields plug-ins of a scenario that a run could not make, where they can be imported. Those of cost layers are
+    made with the terrain."""
+    # They load the planner, which only a scenario with plug-ins of its own needs here.
+    from launch_scripts.simulation.world.walks import Budget, TrueTerrain, WalkWorld
+    from planner_service.strategy import StrategyWorld
+    from vehicle_agent.assignment import AssignmentWorld
+    from vehicle_agent.driving.dynamics import DynamicsWorld
+    from vehicle_agent.sensing.sensor import SensorWorld
+
+    seed = scenario.seed
+    worlds = {
+        "sensor": SensorWorld(grid, truth, 35.0, "a0", seed),
+        "walk": WalkWorld("t0", TrueTerrain(grid, truth), random.Random(seed), Budget()),
+        "assignment": AssignmentWorld("a0", "all", ("t0",), seed),
+        "strategy": StrategyWorld("t0", grid, scenario.planner),
+        "dynamics": DynamicsWorld("a0", grid, seed),
+    }
+    for named in plugins_of(scenario):
+        if named.kind.name not in worlds:
+            continue
+        try:
+            plugin = find_plugin(named, scenario.plugin_folder)
+        except SwarmError:
+            continue  # reported with the plug-ins that cannot be imported
+        if plugin.factory is not None:
+            try:
+                plugin.make(worlds[named.kind.name])
+            except SwarmError as error:
+                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))

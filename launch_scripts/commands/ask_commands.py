@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line.declaring import ASK, command
-from launch_scripts.commands.running_swarm import Where
+from launch_scripts.command_line import ASK, command
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     AsJson,
     PresetOption,
     SignalsAddress,
-    TargetId,
     VehicleClass,
+    Where,
 )
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from launch_scripts.commands.status_view import Status
-    from launch_scripts.web.health_probe import Answer
     from swarm.config.scenario import NetworkConfig
 
 app = typer.Typer()
@@ -37,7 +33,7 @@ CPU without any query."""
 @command(app, ASK)
 def route(
     where: Where,
-    target: TargetId = None,
+    target: str | None = None,
     terrain: str | None = None,
     start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
     end: Annotated[str | None, typer.Option("--to", metavar="PLACE")] = None,
@@ -126,7 +122,7 @@ def top(
     once: bool = False,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
-    """Watch a running swarm, once a second; `q` or Ctrl-C ends it.
+    """Watch a running swarm, once a second; Ctrl-C ends it.
 
     Processes on other machines are shown, too, from their own reports. CPU of 100 % is one core; late/s counts
     ticks that came late or not at all, for a role its worst process.
@@ -145,53 +141,21 @@ def top(
 
 
 @command(app, ASK)
-def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
-    """Check if a swarm is ready: exit code 0 if it is, 1 if not, 4 without a reply.
+def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: AsJson = False) -> int:
+    """Check if the processes of a machine are ready: exit code 0 if they are, 1 if not, 4 without a reply.
 
-    With --url, put first, it asks the processes of one machine, without a router. Otherwise it asks the whole swarm
-    over its router, for two seconds.
+    It needs no router. `swarm status` shows the whole swarm.
 
     swarm health --url http://127.0.0.1:9464
 
     swarm health --url http://127.0.0.1:9464 --live
 
-    swarm health --connect tcp/127.0.0.1:7447 --json
-
-    url   Ask the machine whose figures or health are served there, such as http://127.0.0.1:9464.
-    live  With --url: whether its processes live, not whether they are ready.
+    url   Where figures or health are served, such as http://127.0.0.1:9464.
+    live  Whether the processes live, not whether they are ready.
     """
-    from launch_scripts.commands.status_view import ask_status
     from launch_scripts.web.health_probe import ask
 
-    if url is None and live:
-        raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
-    if url is not None and replace(where, runs=Where.runs) != Where():
-        raise ConfigError(
-            "--url asks one machine without TLS; options that state how a whole swarm is reached exclude it"
-        )
-    answer = swarm_answer(ask_status(where)) if url is None else ask(url, live=live)
-    return answer.show(as_json=as_json)
-
-
-def swarm_answer(status: Status) -> Answer:
-    """Returns whether all processes that the run needs are there and ready."""
-    from launch_scripts.web.health_probe import Answer
-    from swarm.runtime.stats import READY
-
-    observed = status.latest
-    missing = [f"{name.replace(' ', '-', 1)}: does not run" for name in observed.missing()]
-    for role, id in sorted(observed.up()):
-        stats = observed.newest_stats(role, id)
-        if stats is not None and stats.gauges.get(READY) == 0.0:
-            missing.append(f"{role}-{id}: not ready, as it says")
-    if not any(info.run_id for info in status.members):
-        missing.append("no run: only routers answer")
-    told = {
-        "status": "not ready" if missing else "ready",
-        "missing": missing,
-        "processes": [{"name": f"{role}-{id}"} for role, id in sorted(observed.up())],
-    }
-    return Answer(not missing, told)
+    return ask(url, live=live).show(as_json=as_json)
 
 
 @command(app, ASK)

@@ -16,14 +16,12 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.check.scenario_check import check_start
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates, revocations
-from launch_scripts.deploy.host_scenario import CERTIFICATES
 from launch_scripts.deploy.hosts import load_hosts
-from launch_scripts.deploy.kits import keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan, plan_fields
+from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
+from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
 from launch_scripts.deploy.machines_needed import (
     CELLS_PER_VEHICLE,
     Estimate,
@@ -130,7 +128,7 @@ def _show(made: Plan, kit: KitName) -> None:
         table.add_column(Text(host.name), overflow="fold")
     rows = {
         "address": [host.address for host in made.hosts],
-        **{role: [", ".join(ids_of(host, role)) for host in made.hosts] for role in ROLES},
+        **{role: [", ".join(each.id for each in host.of(role)) for host in made.hosts] for role in ROLES},
         "load": [f"{host.load:.2f} of {host.cores:g}" for host in made.hosts],
         "terrain": ["files" if host.has_files else "from a keeper" for host in made.hosts],
     }
@@ -213,10 +211,8 @@ def _show_size(found: Needs) -> None:
         ("cores, the first", found.first_cores),
         ("memory, a machine, GB", found.memory_gb),
         ("memory, the first, GB", found.first_memory_gb),
-        ("between machines, messages/s", found.crossings_per_s),
         ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
         ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
-        ("out, by a router of the region, Mbit/s", found.link_out_mbit_per_s),
         ("sessions of a router", found.sessions),
     ):
         table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
@@ -227,7 +223,7 @@ def _show_size(found: Needs) -> None:
 def certs(
     folder: Path,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME[=HOST,...]...]")] = None,
-    scenario: Annotated[str | None, typer.Option(autocompletion=complete.scenarios)] = None,
+    scenario: Annotated[str | None, typer.Option(autocompletion=complete_scenarios)] = None,
     days: Days = 365,
     renew: bool = False,
 ) -> None:
@@ -290,9 +286,8 @@ def zenohd(
     listen: list[str] | None = None,
     peer: list[str] | None = None,
     namespace: Namespace = None,
-    scenario: Annotated[str | None, typer.Option(autocompletion=complete.scenarios)] = None,
+    scenario: Annotated[str | None, typer.Option(autocompletion=complete_scenarios)] = None,
     plugins: Path | None = None,
-    volume: str = "memory",
 ) -> None:
     """Write a configuration for zenohd as the router of a swarm.
 
@@ -303,7 +298,6 @@ def zenohd(
     peer      Another router to connect to.
     scenario  Scenario whose processes may take part: needed with certificates.
     plugins   Folder with libzenoh_plugin_storage_manager.so, to store marks, too.
-    volume    Volume of the storage: memory, or one whose backend is installed.
     """
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
@@ -320,10 +314,7 @@ def zenohd(
     )
     # zenohd may run elsewhere than here.
     network = anchored(msgspec.structs.replace(chosen, network=network), Path.cwd()).network
-    config = zenohd_config(
-        revocations.with_revocations(network),
-        plugins=None if plugins is None else str(plugins.resolve()),
-        volume=volume,
-    )
+    folder = None if plugins is None else str(plugins.resolve())
+    config = zenohd_config(revocations.with_revocations(network), folder)
     write_file(out, (json.dumps(config, indent=2) + "\n").encode())
     print(f"{out}: run `zenohd -c {out}`")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
-from launch_scripts.command_line.declaring import command, family_app
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
+from launch_scripts.command_line import command, family_app
+from launch_scripts.commands.shared_options import VehicleClass, Where
 from launch_scripts.observe.run_folder import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
@@ -52,8 +50,6 @@ def ros2(
     side: RosSide,
     settings: Annotated[Path | None, typer.Argument(metavar="[SETTINGS]")] = None,
     vehicles: list[str] | None = None,
-    topics: Annotated[bool, typer.Option("--list")] = False,
-    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
     """Publish a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C.
 
@@ -63,44 +59,18 @@ def ros2(
 
     swarm gateway ros2 gateway.toml --run LAST
 
-    swarm gateway ros2 --list
-
     settings  A .toml file: topics, rates, names, both sides.
     vehicles  Ids of published vehicles, with * and ?; may be given several times.
-    topics    Print the forwarded topics, and exit.
-    as_json   With --list: as JSON.
     """
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
 
     told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
     chosen = load_settings(settings, {**told, "vehicles": vehicles})
-    if topics:
-        _list_topics(chosen, as_json=as_json)
-        return
     ours = chosen.swarm
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
     if where.tls_ca is None and where.tls_dir is None:
         where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
     _serve_ros2(chosen, where.network(), where.runs or RUNS)
-
-
-def _list_topics(settings: Settings, *, as_json: bool) -> None:
-    from launch_scripts.gateways.ros2.gateway_settings import incoming_rows
-
-    rows = list(settings.rows())
-    rows += incoming_rows(settings.incoming, has_map=any(row.name == "map" for row in rows))
-    if as_json:
-        told = [
-            {"name": row.name, "topic": row.topic, "type": row.type_name, "qos": row.qos.name.lower(),
-             "direction": row.direction, "hz": row.hz, "says": row.says}
-            for row in rows
-        ]  # fmt: skip
-        typer.echo(json.dumps(told, indent=2))
-        return
-    topic, kind = (max(len(getattr(row, name)) for row in rows) for name in ("topic", "type_name"))
-    for row in rows:
-        rate = "on change" if row.hz is None else f"{row.hz:g} Hz"
-        typer.echo(f"{row.topic:{topic}}  {row.type_name:{kind}}  {row.direction:3}  {rate}")
 
 
 def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
@@ -143,7 +113,7 @@ class Drives:
     """
 
     panel: ClassVar[str | None] = "How it is driven"
-    target: TargetId = None
+    target: str | None = None
     to: str | None = None
     drive: Literal["mission", "guided"] = "mission"
     arm: bool = False
@@ -166,7 +136,7 @@ class Vehicle:
 
     panel: ClassVar[str | None] = "Identity of the vehicle"
     id: str | None = None
-    group: GroupName = "all"
+    group: str = "all"
     radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0
     sysid: Annotated[int | None, typer.Option(min=1, max=244)] = None
     lost_after: Annotated[float, typer.Option(min=1.5, max=60.0)] = 5.0

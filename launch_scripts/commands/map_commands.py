@@ -13,9 +13,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from launch_scripts.command_line.declaring import command, family_app
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.command_line import command, family_app
+from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.report.exporter import FORMATS, check_target, write_layers, write_raster

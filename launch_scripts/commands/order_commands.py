@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import ORDER, command, family_app
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, Walk
+from launch_scripts.command_line import ORDER, command, complete_words, family_app
+from launch_scripts.commands.shared_options import AsJson, Walk, Where
 from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain
 from swarm.errors import ConfigError
@@ -31,11 +29,9 @@ short = typer.Typer()
 """The commands which are also called without their family."""
 target_app = family_app("Add, move and remove simulated targets while the swarm runs.")
 Key = Annotated[
-    str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
+    str, typer.Argument(metavar="KEY", autocompletion=complete_words("swarm.runtime.order_book", "SETTINGS"))
 ]
-Id = Annotated[
-    str, typer.Argument(metavar="ID", help="The target, such as t3.", autocompletion=complete.target_ids)
-]
+Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
@@ -69,9 +65,9 @@ def resume(where: Where, as_json: AsJson = False) -> int:
 
 @command(app)
 def group(
-    name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
+    name: Annotated[str, typer.Argument(metavar="GROUP")],
     where: Where,
-    targets: Annotated[list[str], typer.Argument(metavar="TARGET...", autocompletion=complete.target_ids)],
+    targets: Annotated[list[str], typer.Argument(metavar="TARGET...")],
     as_json: AsJson = False,
 ) -> int:
     """Set the targets that the vehicles of a group may chase.

@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, complete_runs, complete_words, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
 from launch_scripts.launcher.console import REPORTED, progress
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
@@ -32,7 +31,7 @@ app = family_app("Compare, export and replay finished runs, and write their repo
 RunArgument = Annotated[
     str,
     typer.Argument(
-        metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
+        metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete_runs
     ),
 ]
 _ROW = "{:<20} {:>10} {:>8} {:>8} {:>8}  {}"
@@ -42,7 +41,7 @@ _SHOWN = 300
 
 @command(app)
 def compare(
-    run: Annotated[list[str], typer.Argument(metavar="RUN...", autocompletion=complete.runs)],
+    run: Annotated[list[str], typer.Argument(metavar="RUN...", autocompletion=complete_runs)],
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
@@ -110,10 +109,10 @@ def export(
     run: RunArgument = "LAST",
     what: Annotated[
         list[str] | None,
-        typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "WHAT")),
+        typer.Option(autocompletion=complete_words("launch_scripts.report.run_layers", "WHAT")),
     ] = None,
     format: Annotated[
-        str | None, typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "ENDINGS"))
+        str | None, typer.Option(autocompletion=complete_words("launch_scripts.report.run_layers", "ENDINGS"))
     ] = None,
     out: Path | None = None,
     force: bool = False,

@@ -12,8 +12,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     LogFormatOption,
@@ -48,7 +47,7 @@ class Place(Tls):
         typer.Argument(
             metavar="SCENARIO",
             help="For roles, the same for all of a run: a .toml file or a built-in name.",
-            autocompletion=complete.scenarios,
+            autocompletion=complete_scenarios,
         ),
     ] = "jacksboro"
     connect: str | None = None
@@ -108,9 +107,7 @@ def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str
 
 
 @command(app)
-def planner(
-    target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, rank: Rank = 0
-) -> None:
+def planner(target: Annotated[str, typer.Option()], part: Part, rank: Rank = 0) -> None:
     """Run the planner of one target, or a standby of it.
 
     swarm role planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert . --tls-key .
@@ -122,9 +119,7 @@ def planner(
 
 
 @command(app)
-def places(
-    group: Annotated[str, typer.Option(autocompletion=complete.group_names)], part: Part, rank: Rank = 0
-) -> None:
+def places(group: Annotated[str, typer.Option()], part: Part, rank: Rank = 0) -> None:
     """Plan between any two places for the vehicles of a group, or stand by (`planner.places`).
 
     swarm role places my.toml --group all
@@ -136,7 +131,7 @@ def places(
 
 
 @command(app)
-def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part) -> None:
+def agent(id: Annotated[str, typer.Option("--id")], part: Part) -> None:
     """Drive the vehicles of one agent process.
 
     swarm role agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
@@ -197,13 +192,10 @@ def run_role(
     if is_router and part.connect is not None:
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
-    if joins is not None:
-        added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
-    if role in ("router", "keeper") or (joins is not None and id):
+    added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
+    if role in ("router", "keeper") or joins is not None:
         check_name("--id", id)
-    elif joins is not None and scenario.network.tls is not None:
-        raise ConfigError("give a name with --id: the one in the certificate agent.GROUP.NAME")
-    elif joins is None and id not in (ids := [spec.id for spec in processes_of(scenario, (role,))]):
+    elif id not in (ids := [spec.id for spec in processes_of(scenario, (role,))]):
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     scenario = options.as_process(scenario, role, id if joins is None else f"{joins.group}.{id}")
     log_to(None, part.log_format, Speaker(role, id, wanted_run or ""))
@@ -218,10 +210,8 @@ def run_role(
                 "no reply, not even from a router: does it admit the name in %s?", scenario.network.tls.certificate
             )
         found = [info for info in found if info.run_id]
-        id = id or _free_id(found)
         check_vacant(found, role, id)
     run_id = wanted_run or next((info.run_id for info in found), None) or options.common_run_id(scenario)
-    added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
     run_dir = options.make_run_dir(part.runs, run_id)
     log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
@@ -255,9 +245,3 @@ def _health_of(name: str, place: Place) -> Health:
         served = Server("health port", place.health_port, pages, place.signals_address)
         logging.getLogger(__name__).info("health at %s/healthz and /readyz", served.url)
     return health
-
-
-def _free_id(found: list[RunInfo]) -> str:
-    """The first of added0, added1, ... that no process has."""
-    taken = {info.id for info in found}
-    return next(id for n in range(len(taken) + 1) if (id := f"added{n}") not in taken)

@@ -7,7 +7,7 @@ import time
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.command_line import RUN, command
 from launch_scripts.commands.shared_options import Meeting, RunOptions, ScenarioArgument, SomeProcesses
 
 app = typer.Typer()

@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import RUN, command
-from launch_scripts.commands.running_swarm import RunOption, say_newest
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.command_line import RUN, command, complete_runs
+from launch_scripts.commands.shared_options import AsJson, RunOption, say_newest
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
 from swarm.errors import ConfigError, StoreError, SwarmError
@@ -36,7 +34,7 @@ app = typer.Typer()
 
 RunArgument = Annotated[
     str | None,
-    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete.runs),
+    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete_runs),
 ]
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""

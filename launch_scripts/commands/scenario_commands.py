@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import PREPARE, command
+from launch_scripts.command_line import PREPARE, command
 from launch_scripts.commands.shared_options import (
     AsJson,
     PortOption,
@@ -38,7 +35,7 @@ _AGENTS, _LEAST_PER_AGENT = 8, 25
 
 @dataclass(frozen=True)
 class Choices:
-    """Choices for a new scenario; None is not chosen yet, and an empty text is none.
+    """Choices for a new scenario.
 
     terrain   jacksboro, synthetic, or a file of elevation.
     photo     A GeoTIFF in colour on the same ground.
@@ -49,39 +46,31 @@ class Choices:
     """
 
     panel: ClassVar[str | None] = None
-    terrain: Annotated[str | None, typer.Option(autocompletion=complete.terrains)] = None
+    terrain: str = "synthetic"
     photo: str | None = None
     preset: PresetOption = None
-    vehicles: Annotated[int | None, typer.Option(min=1, max=100_000)] = None
-    targets: Annotated[int | None, typer.Option(min=1, max=1000)] = None
-    walk: Walk = None
-    seconds: Seconds = None
+    vehicles: Annotated[int, typer.Option(min=1, max=100_000)] = 20
+    targets: Annotated[int, typer.Option(min=1, max=1000)] = 3
+    walk: Walk = "waypoints"
+    seconds: Seconds = 60.0
 
 
-_DEFAULTS = Choices("synthetic", "", "", 20, 3, "waypoints", 60.0)
-_ASKED = {
-    "terrain": (
-        "terrain.source",
-        "Terrain: jacksboro (real mountains), synthetic (made up), or a file of elevation",
-    ),
-    "photo": ("terrain.photo", "Photo of the same ground, a GeoTIFF (Enter for none)"),
-    "preset": (
-        "cost.preset",
-        "Class of vehicles: hiker, wheeled, tracked, quadruped (Enter for plain settings)",
-    ),
-    "vehicles": ("groups[0].vehicles", "How many vehicles"),
-    "targets": ("targets[0].count", "How many targets"),
-    "walk": ("targets[0].walk", "How targets move: still, random, waypoints, evade"),
-    "seconds": ("seconds", "How many seconds the run lasts"),
+_OPTIONS = {
+    "terrain.source": "--terrain",
+    "terrain.photo": "--photo",
+    "cost.preset": "--preset",
+    "groups[0].vehicles": "--vehicles",
+    "targets[0].count": "--targets",
+    "targets[0].walk": "--walk",
 }
-"""Choice -> (key of the scenario, question)."""
+"""Key of the scenario -> the option that sets it."""
 
 
 @command(app, PREPARE)
 def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices) -> None:
     """Write a scenario, with a comment for every key.
 
-    On a terminal it asks for missing choices. An existing file is never overwritten.
+    An existing file is never overwritten.
 
     swarm new my.toml
 
@@ -95,58 +84,26 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
         raise ConfigError(f"{file} is there already and stays as it is; choose another name, or remove it first")
     if not file.absolute().parent.is_dir():
         raise ConfigError(f"{file}: there is no folder {file.parent}; make it first")
-    _check_choices(file, choices)
-    if is_terminal():
-        choices = _asked(file, choices)
-    text = _text(file, choices)
+    from swarm.config.write import commented
+
+    text = commented(_settings(file, choices), _HEAD.format(name=file))
+    _check(file, text)
     write_file(file, text.encode())
     typer.echo(f"{file} is written; `swarm check {file}` looks at it, `swarm up {file}` runs it")
 
 
-def is_terminal() -> bool:
-    """Returns True if there is a user to ask."""
-    return sys.stdin.isatty() and sys.stderr.isatty()
-
-
-def _asked(path: Path, choices: Choices, ask: Callable[..., Any] = typer.prompt) -> Choices:
-    """Returns the choices with answers for the missing ones; an impossible answer is explained and asked again."""
-    from swarm.config.load import BUILT_IN_TERRAINS
-
-    for name, (_, question) in _ASKED.items():
-        default = getattr(_DEFAULTS, name)
-        while getattr(choices, name) is None and not (name == "photo" and choices.terrain in BUILT_IN_TERRAINS):
-            answer = ask(question, default=default, type=type(default), err=True, show_default=default != "")
-            answered = replace(choices, **{name: answer})
-            try:
-                _check_choices(path, answered)
-            except ConfigError as error:
-                typer.echo(f"  {error}", err=True)
-                continue
-            choices = answered
-    return choices
-
-
-def _check_choices(path: Path, choices: Choices) -> None:
+def _check(path: Path, text: str) -> None:
     """Raises ConfigError where something chosen is not possible, by the option's name."""
     from launch_scripts.check import scenario_check
     from swarm.config.load import read_scenario
 
-    option_of = {key: f"--{name}" for name, (key, _) in _ASKED.items()}
-    scenario, faults = read_scenario(_text(path, choices), str(path), path.parent)
+    scenario, faults = read_scenario(text, str(path), path.parent)
     found = (
         faults if scenario is None else [*faults, *(each.sentence for each in scenario_check.files_named(scenario))]
     )
     for sentence in found:
         key, _, rest = sentence.removeprefix(f"{path}: ").partition(": ")
-        raise ConfigError(f"{option_of.get(key, key)}: {rest}")
-
-
-def _text(path: Path, choices: Choices) -> str:
-    from swarm.config.write import commented
-
-    given = {field.name: getattr(choices, field.name) for field in fields(choices)}
-    chosen = replace(_DEFAULTS, **{name: value for name, value in given.items() if value is not None})
-    return commented(_settings(path, chosen), _HEAD.format(name=path))
+        raise ConfigError(f"{_OPTIONS.get(key, key)}: {rest}")
 
 
 def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
@@ -170,7 +127,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         "planner": {"places": True},
         "targets": [
             {
-                "name": "t" if (chosen.targets or 0) > 1 else "t0",
+                "name": "t" if chosen.targets > 1 else "t0",
                 "count": chosen.targets,
                 "walk": chosen.walk,
                 "speed_m_per_s": 4.0,
@@ -178,7 +135,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         ],
         "groups": [{"name": "all", "vehicles": chosen.vehicles, "start": "spread"}],
         "vehicles": {
-            "per_agent": min(max(_LEAST_PER_AGENT, -(-(chosen.vehicles or 0) // _AGENTS)), MOST_PER_AGENT),
+            "per_agent": min(max(_LEAST_PER_AGENT, -(-chosen.vehicles // _AGENTS)), MOST_PER_AGENT),
             "tick_hz": 10.0,
             "sense_range_m": 300.0,
             "capture_range_m": 150.0,
@@ -186,12 +143,12 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
     }
 
 
-def _from(path: Path, name: str | None) -> str:
+def _from(path: Path, name: str) -> str:
     """A file as it is named from the folder of the scenario."""
     from swarm.config.load import BUILT_IN_TERRAINS
 
-    if name is None or name in BUILT_IN_TERRAINS or Path(name).is_absolute():
-        return str(name)
+    if name in BUILT_IN_TERRAINS or Path(name).is_absolute():
+        return name
     return os.path.relpath(name, path.parent)
 
 
@@ -207,7 +164,7 @@ def check(
 
     swarm check my.toml --json | jq .findings
     """
-    from launch_scripts.check.findings import answer
+    from launch_scripts.check import answer
     from launch_scripts.check.whole_check import check_scenario
     from launch_scripts.launcher.options import scenario_path
 
@@ -220,14 +177,14 @@ def check(
 def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
     """Check if this machine and installation can run a swarm.
 
-    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
-    disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
+    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, clock
+    and disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
 
     swarm doctor
 
     swarm doctor --json | jq .findings
     """
-    from launch_scripts.check.findings import answer
+    from launch_scripts.check import answer
     from launch_scripts.check.machine_check import examine
 
     return answer(list(examine(runs)), as_json, {})

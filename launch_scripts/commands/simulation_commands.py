@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import RUN, command, family_app
+from launch_scripts.command_line import RUN, command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
 from launch_scripts.stop_requests import stop_requests
 from swarm.config.input_files import quoted
@@ -39,9 +38,7 @@ has every trial."""
 
 @command(app, RUN)
 def simulate(
-    scenario: Annotated[
-        str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete.scenarios_and_worlds)
-    ] = None,
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete_scenarios)] = None,
     seed: Seed = None,
     seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1)] = None,
@@ -189,7 +186,7 @@ def _line(trial: Trial, result: Result) -> str:
 
 @command(study_app)
 def run(
-    study: Annotated[str, typer.Argument(metavar="STUDY", autocompletion=complete.studies)],
+    study: Annotated[str, typer.Argument(metavar="STUDY")],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
     out: Path | None = None,

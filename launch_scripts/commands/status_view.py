@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import select
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +34,7 @@ from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
 
 if TYPE_CHECKING:
-    from launch_scripts.commands.running_swarm import Where
+    from launch_scripts.commands.shared_options import Where
     from swarm.bus.bus import Bus
 
 _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
@@ -239,12 +235,11 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
 
 
 def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
-    """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if no process replies at the beginning."""
+    """Shows the swarm until Ctrl-C or its end. Raises BusError if no process replies at the beginning."""
     make_output_outlive_readers()
     console = Console(highlight=False)
     moving = console.is_terminal and not as_json and not once
-    keys = _keys() if moving else nullcontext()
-    with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus, keys:
+    with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus:
         observer, clock = observed(bus, where, _TOP_LISTEN_S), MonotonicClock()
         run, latest = observer.run, observer.latest
         if run is None or latest is None:
@@ -260,7 +255,7 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
                     console.print(table_of(run, state, processes, console, each=each))
                 else:
                     live.update(table_of(run, state, processes, console, each=each), refresh=True)
-                if once or (moving and _asked_to_end()):
+                if once:
                     return
                 if observer.over or all(role == "router" for role, _ in latest.up()):
                     break
@@ -280,28 +275,3 @@ def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> d
     """The same for programs."""
     told = list(map(asdict, processes))
     return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": told}
-
-
-@contextmanager
-def _keys() -> Iterator[None]:
-    """Reads single keys, if there is a keyboard."""
-    if not sys.stdin.isatty():
-        yield
-        return
-    import termios
-    import tty
-
-    before = termios.tcgetattr(sys.stdin)
-    try:
-        tty.setcbreak(sys.stdin)
-        yield
-    finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-
-
-def _asked_to_end() -> bool:
-    """Returns True if `q` was pressed."""
-    if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
-        return False
-    keys = os.read(sys.stdin.fileno(), 64)
-    return not keys or b"q" in keys.lower()

@@ -6,9 +6,8 @@ import json
 import math
 import time
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
@@ -22,7 +21,7 @@ from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.operator import replies_to
 from swarm.wire.access import OPERATOR
-from swarm.wire.codec import COMPASS, encode_json
+from swarm.wire.codec import encode_json
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
 from swarm.wire.topics import PLACE_ROUTE, ROUTE, asker_of
@@ -212,7 +211,7 @@ def show(answer: Answer) -> None:
         way = f"{turns - 1} straight segments through {many + 1} cells, {found.length_m:.0f} m"
         typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight")
     else:
-        typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}")
+        typer.echo(f"{many} steps, {found.length_m:.0f} m")
     age_s = reply.tree_age_ms / 1e3
     grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
     typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
@@ -233,9 +232,3 @@ def _show_pose(reply: RouteReply) -> None:
         typer.secho(where, fg="yellow")
     else:
         typer.echo(f"pose {reply.pose_age_s:.1f} s old")
-
-
-def _strides(directions: bytes) -> str:
-    """Runs of equal steps: 12 N, 3 NE, ..."""
-    runs: Any = groupby(directions)
-    return ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in runs) or "already there"

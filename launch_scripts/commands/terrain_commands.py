@@ -4,10 +4,9 @@ says how long driving takes."""
 from __future__ import annotations
 
 import json
-import math
 import time
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -16,27 +15,19 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.report.exporter import FORMATS, check_target, write_raster
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.slope_rules import (
-    SLOPE_RULES,
-    directional_factor,
-    slope_factor,
-    step_limits_deg,
-)
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-from swarm.config.cost_rules import PRESETS, cost_of_preset
-from swarm.config.ground import CostConfig, TerrainConfig
+from swarm.config.cost_rules import cost_of_preset
+from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
-from swarm.config.write import toml_value
 from swarm.errors import ConfigError
-from swarm.files import replacing
 from swarm.grid import GridSpec
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
@@ -177,37 +168,6 @@ def cost(
 
 
 @command(app)
-def rules(
-    scenario: Annotated[str | None, typer.Argument()] = None,
-    picture: Picture = None,
-    as_json: AsJson = False,
-) -> None:
-    """List the rules by which slope becomes pace, and the presets of vehicle classes.
-
-    cost.slope_rule selects a rule, cost.preset a class of vehicles, whose settings
-    replace those that the scenario does not give.
-
-    swarm terrain rules --picture rules.png
-    swarm terrain rules mine.toml
-
-    scenario  A scenario file or the name of a built-in one: show its rule alone, in m/s.
-    """
-    check_target(picture, "--picture", ".png")
-    if scenario is None:
-        shown = rules_of_all()
-    else:
-        shown = rules_of_scenario(find_scenario(scenario), Path(scenario).stem)
-    if picture is not None:
-        from launch_scripts.report.terrain_figure import draw_rules
-
-        draw_rules(shown, picture)
-    if as_json:
-        console.print_json(json.dumps(_rules_fields(shown)))
-    else:
-        _show_rules(shown)
-
-
-@command(app)
 def generate(
     out: Annotated[Path, typer.Option()],
     rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
@@ -225,7 +185,7 @@ def generate(
     swarm terrain generate --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
 
-    out           Write the heights: .tif (in UTM 32) or .npz.
+    out           Write the heights: .tif, in UTM 32.
     rows          Cells from north to south.
     cols          Cells from west to east.
     resolution_m  Metres a cell.
@@ -235,7 +195,7 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    check_target(out, "--out", *_TIFF, ".npz")
+    check_target(out, "--out", *_TIFF)
     check_target(photo, "--photo", *_TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
@@ -250,11 +210,7 @@ def generate(
     with progress() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
-    if out.suffix.lower() == ".npz":
-        with replacing(out) as half:
-            np.savez_compressed(half, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
-    else:
-        write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
+    write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
         write_raster(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     _draw(terrain, picture, f"synthetic, seed {seed}")
@@ -399,105 +355,3 @@ def _shares(terrain: Terrain) -> str:
     total = terrain.classes.size
     shares = (f"{kind.name.lower()} {counts[kind] / total:.1%}" for kind in TerrainClass if counts[kind])
     return f"classes: {', '.join(shares)}"
-
-
-# --- what slopes cost, as numbers over slope ---------------------------------------------------------------------
-
-SLOPES_PERCENT = (-30, -20, -10, -5, 0, 5, 10, 20, 30)
-"""Slopes of the tables; downhill is negative."""
-_SLOPES = [f"{slope:+d}" if slope else "0" for slope in SLOPES_PERCENT]
-
-
-class Curve(NamedTuple):
-    """Effect of one rule or preset on pace.
-
-    unit     factor: pace over that of level ground; m/s: speed
-    notes    sentences: what it is, where it comes from, its settings
-    is_mean  whether a cell's pace is shown, whichever way it is crossed, not that of a step
-    """
-
-    name: str
-    unit: str
-    cost: CostConfig
-    notes: dict[str, str]
-    is_mean: bool = False
-
-    def at(self, slopes_percent: Any) -> NDArray[np.float64]:
-        """The values at some slopes; a speed of 0 and an infinite factor are too steep."""
-        rise = np.asarray(slopes_percent, np.float32) / np.float32(100)
-        if self.is_mean:
-            factor = slope_factor(np.abs(rise), self.cost)
-        else:
-            factor = directional_factor(rise, self.cost)
-        found = factor.astype(np.float64)
-        return self.cost.flat_speed_m_per_s / found if self.unit == "m/s" else found
-
-    def by_slope(self) -> dict[str, float | None]:
-        """Slope in percent -> value; None where it is too steep."""
-        values = zip(_SLOPES, self.at(SLOPES_PERCENT).round(4).tolist(), strict=True)
-        return {slope: value if 0 < value < math.inf else None for slope, value in values}
-
-
-Shown = dict[str, list[Curve]]
-"""Groups of curves under their titles."""
-
-
-def rules_of_all() -> Shown:
-    """Every rule with the settings that an empty scenario has, and every preset."""
-    rules = [
-        Curve(name, "factor", CostConfig(slope_rule=name), {"about": row.about, "source": row.source})
-        for name, row in SLOPE_RULES.items()
-        if name != "table"
-    ]
-    presets = []
-    for name, told in PRESETS.items():
-        settings = ", ".join(f"{key} = {toml_value(value)}" for key, value in told.settings.items())
-        notes = {"about": told.about, "source": told.source, "settings": settings}
-        presets.append(Curve(name, "m/s", cost_of_preset(name), notes))
-    return {"rules": rules, "presets": presets}
-
-
-def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
-    """Returns the costs of steps with `directional`; without it, the costs of cells, and those that steps would
-    have."""
-    cost, row = scenario.cost, SLOPE_RULES[scenario.cost.slope_rule]
-    climb_deg, descent_deg = step_limits_deg(cost)
-    limits = f"{cost.max_slope_deg:g} degrees of ground"
-    if cost.directional:
-        limits += f", steps to {climb_deg:g} degrees up and {descent_deg:g} down"
-    notes = {"about": row.about, "source": row.source, "limits": limits}
-    title = f"{name}: slope rule {cost.slope_rule}{f', preset {cost.preset}' if cost.preset else ''}"
-    if cost.directional:
-        return {title: [Curve("each step", "m/s", cost, notes)]}
-    return {
-        title: [Curve("each cell", "m/s", cost, notes, is_mean=True), Curve("if directional", "m/s", cost, notes)]
-    }
-
-
-def _rules_fields(shown: Shown) -> dict[str, Any]:
-    """For programs."""
-    return {
-        title: [
-            {"name": curve.name, **curve.notes, "unit": curve.unit, "by_slope_percent": curve.by_slope()}
-            for curve in curves
-        ]
-        for title, curves in shown.items()
-    }
-
-
-def _show_rules(shown: Shown) -> None:
-    """Prints a table of each group, and what its lines are."""
-    for title, curves in shown.items():
-        unit = "pace over that of level ground" if curves[0].unit == "factor" else "m/s on open ground"
-        heading = f"{title}: {unit}, by slope in % (negative is downhill)"
-        table = Table("", title=heading, title_justify="left", box=None)
-        for slope in _SLOPES:
-            table.add_column(slope, justify="right")
-        for curve in curves:
-            values = curve.by_slope().values()
-            table.add_row(curve.name, *("-" if value is None else f"{value:.2f}" for value in values))
-        console.print(table)
-        for curve in curves:
-            for key, text in curve.notes.items():
-                _say(f"{curve.name}: {text}" if key == "about" else f"  {key}: {text}")
-        console.print()

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from launch_scripts.command_line import complete
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Joins, Part, run_role
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, GroupName
+from launch_scripts.commands.shared_options import AsJson, Where
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
@@ -34,9 +32,7 @@ _AGAIN_S, _ANSWERS_S = 0.2, 1.0
 """Waits between two questions, and for the answer to one. An agent takes several ticks of 0.1 s to give cells back,
 and one that is silent for a second is asked five times within `_WITHIN_S`."""
 app = family_app("Send vehicles to places, stop them, let them join a running swarm and leave it.")
-Vehicles = Annotated[
-    list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.", autocompletion=complete.vehicle_ids)
-]
+Vehicles = Annotated[list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.")]
 
 
 @command(app)
@@ -59,7 +55,7 @@ def start(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
 
 @command(app, context_settings={"ignore_unknown_options": True})  # a latitude below 0 is no option
 def send(
-    id: Annotated[str, typer.Argument(metavar="ID", autocompletion=complete.vehicle_ids)],
+    id: Annotated[str, typer.Argument(metavar="ID")],
     places: Annotated[list[str], typer.Argument(metavar="PLACE...")],
     where: Where,
     then: Then = "hold",
@@ -93,10 +89,10 @@ def recall(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
 
 @command(app)
 def add(
-    group: GroupName,
+    id: Annotated[str, typer.Option()],
+    group: Annotated[str, typer.Option()],
     part: Part,
     count: Annotated[int, typer.Option(min=1)] = 1,
-    id: str = "",
     at: Annotated[str | None, typer.Option(metavar="PLACE")] = None,
 ) -> None:
     """Start an agent with extra vehicles. Runs until they have left, or until Ctrl-C.
@@ -104,11 +100,11 @@ def add(
     They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
     process is killed they stay where they are; the same command finds them again.
 
-    swarm order vehicle add my.toml --group all --count 5 --at 36.41,-84.29
+    swarm order vehicle add my.toml --id extra --group all --count 5 --at 36.41,-84.29
 
+    id     Name of the agent that hosts them.
     group  The group of the scenario to which they belong.
     count  How many vehicles.
-    id     Name of the agent that hosts them; if not given, added0 or the next free one.
     at     LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere.
     """
     if at is not None:
@@ -118,7 +114,7 @@ def add(
 
 @command(app)
 def remove(
-    names: Annotated[list[str], typer.Argument(autocompletion=complete.vehicle_ids)],
+    names: list[str],
     where: Where,
     as_json: AsJson = False,
 ) -> int:

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.order_commands import checked, print_obeyed
-from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
 from swarm.config.ground import ZoneConfig

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import accumulate, pairwise
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
 from types import MappingProxyType
 from typing import Any
 
@@ -292,19 +292,3 @@ def plan_fields(plan: Plan) -> dict[str, Any]:
 def as_json(plan: Plan) -> str:
     """plan.json of every archive."""
     return json.dumps(plan_fields(plan), indent=1) + "\n"
-
-
-def ids_of(host: PlannedHost, role: str) -> Iterator[str]:
-    """Ids of a machine's processes, runs of three and more consecutive numbers as first and last: "a0 to a7"."""
-    ids = [each.id for each in host.of(role)]
-    starts = [0, *(n for n, (one, other) in enumerate(pairwise(ids), 1) if not _follows(one, other)), len(ids)]
-    for first, end in pairwise(starts):
-        run = ids[first:end]
-        yield from [f"{run[0]} to {run[-1]}"] if len(run) > 2 else run
-
-
-def _follows(one: str, other: str) -> bool:
-    """Returns True if two ids differ by a number at their end, which is one higher: a7, a8."""
-    stem = one.rstrip("0123456789")
-    number = one[len(stem) :]
-    return number.isdecimal() and other == f"{stem}{int(number) + 1}"

@@ -85,9 +85,7 @@ class Needs(msgspec.Struct, frozen=True, kw_only=True):
     machine_cores    cores that work on each machine
     first_cores      on the first
     memory_gb, first_memory_gb  of each machine, of the first
-    crossings_per_s  messages from one machine to another, at most
     link_mbit_per_s, first_link_mbit_per_s  into each machine, and as much out of it; into the first
-    link_out_mbit_per_s  out of each machine where a router of the region passes on: each message leaves once
     sessions         of a machine's router
     """
 
@@ -99,9 +97,7 @@ class Needs(msgspec.Struct, frozen=True, kw_only=True):
     first_cores: float
     memory_gb: float
     first_memory_gb: float
-    crossings_per_s: float
     link_mbit_per_s: float
-    link_out_mbit_per_s: float
     first_link_mbit_per_s: float
     sessions: int
 
@@ -154,7 +150,6 @@ class Estimate:
         one = self._one
         messages, first_messages = self._enters(one["messages_in"], one["messages_out"], machines)
         size, first_size = self._enters(one["bytes_in"], one["bytes_out"], machines)
-        leaves, said = (self._sum(one[sent], count) for sent in ("bytes_out", "messages_out"))
         return Needs(
             size=self._swarm,
             machines=machines,
@@ -164,10 +159,8 @@ class Estimate:
             first_cores=shared + single,
             memory_gb=memory,
             first_memory_gb=memory + sum(self._memory_gb[role] for role in _SINGLE),
-            crossings_per_s=messages * (machines - 1) + first_messages,
             link_mbit_per_s=_mbit(size, messages),
             first_link_mbit_per_s=_mbit(first_size, first_messages),
-            link_out_mbit_per_s=min(_mbit(leaves, said) * spread, _mbit(size, messages)),
             sessions=math.ceil((count["agent"] + count["planner"]) * spread) + len(_SINGLE) + machines,
         )
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from launch_scripts.deploy.host_scenario import GROUND, PLUGINS, host_scenario, plugin_files
+from launch_scripts.deploy.kits import GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.machine_plan import ROUTER, Plan, PlannedHost, PlannedProcess, router_name
 from launch_scripts.process_table import TABLE
 from swarm.bus.access_control import access_control, low_pass_filter
@@ -167,11 +167,10 @@ def dns_label(text: str) -> str:
     return f"{plain.strip('-')}-{number}".lstrip("-")
 
 
-def zenohd_config(network: NetworkConfig, *, plugins: str | None = None, volume: str = "memory") -> dict[str, Any]:
+def zenohd_config(network: NetworkConfig, plugins: str | None = None) -> dict[str, Any]:
     """The configuration that `zenohd -c FILE` reads, as JSON.
 
     plugins  folder of `libzenoh_plugin_storage_manager.so`; without one marks are passed on, not stored
-    volume   of the storage: "memory", or one whose backend is installed
     With certificates the names in `network.admit` may take part, under the rules of `swarm role router`. Raises
     ConfigError on one that no process can have.
     """
@@ -182,7 +181,7 @@ def zenohd_config(network: NetworkConfig, *, plugins: str | None = None, volume:
         lease_ms=int(network.lease_s * 1000),
         most_bytes=MAX_PAYLOAD_BYTES + (1 << 16),
         plugins=plugins,
-        storage={"key_expr": MARKS.expression(network.namespace), "volume": volume},
+        storage={"key_expr": MARKS.expression(network.namespace), "volume": "memory"},
         tls=tls_settings(network.tls) if network.tls is not None else None,
         access_control=access_control(network.namespace, network.admit, network.revoked) if secured else None,
         low_pass_filter=low_pass_filter(network.namespace),

@@ -5,7 +5,6 @@ A map is values of each cell of a level in colours, drawn by matplotlib, with th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -160,38 +159,3 @@ def draw_route(
             below.fill_between(at, np.nanmin(height_m), height_m, color=BLUE, alpha=0.15)
         unit = "km" if unit_m > 1 else "m"
         below.set(xlabel=f"along the route, {unit}", ylabel="height, m", xlim=(0, max(at[-1], 1e-9)))
-
-
-# --- slope rules --------------------------------------------------------------------------------------------------
-
-_STEEPEST_PERCENT = 60
-_MOST_FACTOR = 8.0
-_ALIKE = 4.0
-"""Vehicles of which one is quicker than another by more are shown on a logarithmic scale."""
-_COLOURS = ("#1b6ca8", "#c8553d", "#4f9d69", "#8e6bb0", "#b8860b", "#3a3a3a", "#d48fb0", "#1fa3a3")
-
-
-def draw_rules(groups: Mapping[str, Sequence[Any]], path: Path) -> None:
-    """Pace or speed over slope, a panel for each group: its title and its `slope_rules.Curve`s."""
-    slopes = np.linspace(-_STEEPEST_PERCENT, _STEEPEST_PERCENT, 1201)
-    with saved(path, (7.5 * len(groups), 5.6), layout="constrained") as figure:
-        panels = figure.subplots(1, len(groups), squeeze=False)[0]
-        for panel, (title, curves) in zip(panels, groups.items(), strict=True):
-            for n, curve in enumerate(curves):
-                values = curve.at(slopes)
-                values[~np.isfinite(values) | (values == 0)] = np.nan
-                panel.plot(slopes, values, "-" if n % 8 < 4 else "--", color=_COLOURS[n % 8], label=curve.name)
-            panel.set(title=title, xlabel="slope in %, negative is downhill", xlim=slopes[[0, -1]])
-            panel.axvline(0, color="#999", linewidth=0.8)
-            speeds = [curve.cost.flat_speed_m_per_s for curve in curves]
-            if curves[0].unit == "factor":
-                panel.set(ylabel="pace over that of level ground", ylim=(0, _MOST_FACTOR))
-                panel.axhline(1, color="#999", linewidth=0.8)
-            else:
-                panel.set(ylabel="speed on open ground, m/s")
-                if max(speeds) >= _ALIKE * min(speeds):
-                    panel.set_yscale("log")
-                    panel.yaxis.set_major_formatter("{x:g}")
-                else:
-                    panel.set_ylim(bottom=0)
-            panel.legend()

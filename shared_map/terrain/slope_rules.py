@@ -31,15 +31,11 @@ class RuleRow(NamedTuple):
     mean         the factor of a cell by its grade (never negative), whichever way the cell is crossed
     directed     the factor of a step by its rise
     is_directed  whether uphill and downhill differ
-    about        what it is, for people
-    source       where it comes from
     """
 
     mean: Factor
     directed: Factor
     is_directed: bool
-    about: str
-    source: str
 
 
 def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
@@ -173,16 +169,16 @@ def _table(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return found
 
 
-def _by_steepness(mean: Factor, about: str, source: str) -> RuleRow:
+def _by_steepness(mean: Factor) -> RuleRow:
     """A rule that does not tell uphill from downhill."""
 
     def directed(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
         return mean(np.abs(rise), np.abs(sine), cost)
 
-    return RuleRow(mean, directed, False, about, source)
+    return RuleRow(mean, directed, False)
 
 
-def _by_direction(directed: Factor, about: str, source: str) -> RuleRow:
+def _by_direction(directed: Factor) -> RuleRow:
     """A rule that tells uphill from downhill; its mean is that of up and down."""
 
     def mean(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
@@ -191,32 +187,20 @@ def _by_direction(directed: Factor, about: str, source: str) -> RuleRow:
         both *= np.float32(0.5)
         return both
 
-    return RuleRow(mean, directed, True, about, source)
+    return RuleRow(mean, directed, True)
 
 
 SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
-    "linear": _by_steepness(
-        _linear, "grows with the sine of the slope to steep_factor at max_slope_deg", "a plain curve"
-    ),
-    "quadratic": _by_steepness(
-        _quadratic, "grows with the square of the sine to steep_factor at max_slope_deg", "a plain curve"
-    ),
-    "energy": _by_direction(
-        _energy,
-        "a wheeled vehicle: rolling resistance and grade against the power of its motor, and of its brakes",
-        "balance of power, as in J. Y. Wong, Theory of Ground Vehicles",
-    ),
-    "tobler": _by_direction(
-        _tobler,
-        "a hiker: 6 exp(-3.5 |slope + 0.05|) km/h, fastest at 5 % down",
-        "W. Tobler, Three presentations on geographical analysis and modeling, NCGIA Technical Report 93-1, 1993",
-    ),
-    "naismith_langmuir": _by_direction(
-        _naismith_langmuir,
-        "a hiker: 5 km/h, 1 h per 600 m up; per 300 m down 10 min less on 5 to 12 degrees, 10 min more beyond",
-        "W. Naismith, Scottish Mountaineering Club Journal 2, 1892; E. Langmuir, Mountaincraft and Leadership,"
-        " 1984",
-    ),
-    "table": _by_direction(_table, "points of one's own: slope_table or slope_csv", "the scenario"),
+    # Plain curves: to `steep_factor` at `max_slope_deg`.
+    "linear": _by_steepness(_linear),
+    "quadratic": _by_steepness(_quadratic),
+    # Balance of power, as in J. Y. Wong, Theory of Ground Vehicles.
+    "energy": _by_direction(_energy),
+    # W. Tobler, Three presentations on geographical analysis and modeling, NCGIA Technical Report 93-1, 1993.
+    "tobler": _by_direction(_tobler),
+    # W. Naismith, Scottish Mountaineering Club Journal 2, 1892; E. Langmuir, Mountaincraft and Leadership, 1984.
+    "naismith_langmuir": _by_direction(_naismith_langmuir),
+    # Points of a scenario: `slope_table` or `slope_csv`.
+    "table": _by_direction(_table),
 }
 """Every rule; a new one is a row here and its name in `swarm.config.ground.SlopeRule`."""

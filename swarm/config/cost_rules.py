@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -18,25 +18,10 @@ from swarm.config.input_files import FileKind, quoted, read_text
 from swarm.config.setting_types import Slope, SlopeFactor
 from swarm.errors import ConfigError
 
-
-class PresetRow(NamedTuple):
-    """A class of vehicles.
-
-    about     what it is, for people
-    source    where its numbers come from
-    settings  of `[cost]`, as a scenario would give them
-    """
-
-    about: str
-    source: str
-    settings: Mapping[str, Any]
-
-
-PRESETS: Mapping[str, PresetRow] = {
-    name: PresetRow(**row)
-    for name, row in tomllib.loads(Path(__file__).with_name("presets.toml").read_text("utf-8")).items()
-}
-"""Every preset, by name, as `presets.toml` has it."""
+PRESETS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
+    Path(__file__).with_name("presets.toml").read_text("utf-8")
+)
+"""Every preset, by name: settings of `[cost]`, as a scenario would give them."""
 
 
 def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
@@ -49,8 +34,8 @@ def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
     row = PRESETS.get(name) if isinstance(name, str) else None
     if not isinstance(cost, dict) or row is None:
         return raw
-    settings = {**row.settings, **cost}
-    factors = row.settings.get("class_factor")
+    settings = {**row, **cost}
+    factors = row.get("class_factor")
     if factors is not None and isinstance(cost.get("class_factor"), dict):
         settings["class_factor"] = {**factors, **cost["class_factor"]}
     return {**raw, "cost": settings}

@@ -175,7 +175,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     preset                  a kind of vehicle, whose settings are the defaults of all others
     flat_speed_m_per_s      speed on level open ground
     road_speed_m_per_s      speed on roads
-    slope_rule              effect of slope on pace; `swarm terrain rules` lists all with their sources
+    slope_rule              effect of slope on pace (docs/gis/costs.md)
     directional             true: a step costs by its own climb, so uphill and downhill differ, instead of by the
                             slope of its cell
     steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace

@@ -102,7 +102,8 @@ def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _over(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    preset = next((row.settings for name, row in PRESETS.items() if name == own.get("preset")), {})
+    name = own.get("preset")
+    preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
     named = {**preset, **own}
     changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
     tables = {"slope_table", "slope_csv"}

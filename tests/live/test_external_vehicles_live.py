@@ -164,10 +164,10 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
     assert unknown.returncode == 2
     assert "no agent knows an external vehicle 'nobody'" in unknown.stderr
     for options, sentence in (
-        (("--group", "none"), "has no group 'none'"),
+        (("--id", "x", "--group", "none"), "has no group 'none'"),
         (("--id", "a0"), "has an agent 'a0' itself"),
-        (("--at", "five"), "expected LAT,LON"),
-        (("--count", 99), "an agent hosts 1 to 6 vehicles"),
+        (("--id", "x", "--at", "five"), "expected LAT,LON"),
+        (("--id", "x", "--count", 99), "an agent hosts 1 to 6 vehicles"),
     ):
         refused = add(live, *options)
         assert refused.wait(20) == 2

@@ -28,7 +28,7 @@ ROWS = re.findall(
 """(extra, MB, command) of the page."""
 OURS = ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts")
 PUBLIC = """import importlib, pkgutil, sys
-for package in ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts.check.plugin_check"):
+for package in ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts.check"):
     try:
         found = importlib.import_module(package)
         for each in pkgutil.walk_packages(getattr(found, "__path__", ()), package + ".", lambda name: None):

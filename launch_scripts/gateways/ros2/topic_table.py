@@ -1,6 +1,6 @@
 """The table of topics: what crosses between the swarm and ROS. Nothing else does.
 
-The gateway, `swarm gateway ros2 --list` and the page of the reference all draw from it.
+The gateway and the page of the reference draw from it.
 """
 
 from __future__ import annotations

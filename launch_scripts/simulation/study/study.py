@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from launch_scripts.deploy.host_scenario import parts_of, plugin_files
+from launch_scripts.deploy.kits import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
 from launch_scripts.simulation.trials import MIX, SECONDS, Trial, code_version, parse_seeds, world_of
 from launch_scripts.simulation.worlds import WORLDS

@@ -15,7 +15,7 @@ import msgspec
 import pytest
 from support.command import Swarm
 
-from launch_scripts.commands.running_swarm import Where, find_swarm
+from launch_scripts.commands.shared_options import Where, find_swarm
 from launch_scripts.observe.run_folder import begin_run, find_run
 from launch_scripts.observe.run_registry import _started_s, register, registered
 from launch_scripts.ports import free_ports
@@ -201,20 +201,3 @@ def test_a_registry_that_cannot_be_written_costs_a_sentence(tmp_path: Path, swar
     code, _, said = swarm("up", "synthetic", "-d")
     assert code == 6
     assert said.startswith("swarm: --detach: the run could not be registered")
-
-
-def test_a_sentence_about_an_option_names_the_variable_which_gave_its_value(
-    swarm: Swarm, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for line, variable, value in (
-        ("status", "SWARM_CONNECT", "nowhere"),
-        ("up synthetic", "SWARM_LOG_FORMAT", "xml"),
-        ("status --connect tcp/127.0.0.1:9", "SWARM_NAMESPACE", "a/b"),
-        ("down", "SWARM_RUN", "nix"),
-        ("status --connect tcp/127.0.0.1:9", "SWARM_TLS_DIR", str(tmp_path)),
-    ):
-        with monkeypatch.context() as environment:
-            environment.setenv(variable, value)
-            code, _, said = swarm(line)
-            assert (code, said.count("\n")) == (2, 1), said
-            assert f" is {variable} of the environment)" in said

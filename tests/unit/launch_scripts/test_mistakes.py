@@ -22,7 +22,7 @@ import pytest
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import main
-from launch_scripts.commands import running_swarm
+from launch_scripts.commands import shared_options
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher import forkserver
 from launch_scripts.launcher.forkserver import WarmUp
@@ -164,7 +164,7 @@ def test_a_mistake_is_answered_with_what_to_do(
     monkeypatch.setattr(LocalSwarm, "start", _no_process)
     monkeypatch.setattr(forkserver, "start_forkserver", lambda *args: None)
     monkeypatch.setattr(WarmUp, "begin", lambda self: None)
-    monkeypatch.setattr(running_swarm, "_CONNECT_S", 0.3)
+    monkeypatch.setattr(shared_options, "_CONNECT_S", 0.3)
     # Neither who else listens here nor how large this machine is has a part in it.
     if mistake.get("given") != "port_taken":
         monkeypatch.setattr(ports, "_taken", lambda host, port: False)

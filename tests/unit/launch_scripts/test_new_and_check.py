@@ -10,7 +10,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from support.command import Swarm
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
 from launch_scripts.check.scenario_check import places, shards, traps
-from launch_scripts.commands.scenario_commands import Choices, _asked
+from launch_scripts.check.whole_check import not_made
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -107,42 +106,6 @@ def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:
     assert (tmp_path / "my.toml").read_text() == "seed = 5\n"
     assert swarm("new other.toml --walk fly")[0] == 2
     assert not (tmp_path / "other.toml").exists()
-
-
-def test_new_asks_for_what_is_not_given_and_again_for_what_cannot_be(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = iter(["jaksboro", "jacksboro", "car", "wheeled", 0, 9, "evade", -1.0, 30.0])
-    asked: list[str] = []
-
-    def ask(question: str, **options: object) -> object:
-        asked.append(question.partition(":")[0].partition(",")[0])
-        return next(answers)
-
-    found = _asked(tmp_path / "my.toml", Choices(targets=4), ask)
-    assert found == Choices("jacksboro", None, "wheeled", 9, 4, "evade", 30.0)
-    assert asked == [
-        *("Terrain", "Terrain", "Class of vehicles", "Class of vehicles"),
-        *("How many vehicles", "How many vehicles"),
-        *("How targets move", "How many seconds the run lasts", "How many seconds the run lasts"),
-    ]
-    said = capsys.readouterr().err
-    assert "--terrain: no such file" in said
-    assert "did you mean 'jacksboro'?" in said
-    assert "--preset: found 'car'" in said
-    assert "--vehicles: found 0, expected a whole number, 1 to 100000" in said
-    assert "--seconds: found -1.0" in said
-
-
-def test_who_breaks_off_gets_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm) -> None:
-    def leave(*question: object, **options: object) -> object:
-        raise typer.Abort
-
-    monkeypatch.setattr("launch_scripts.commands.scenario_commands._asked", leave)
-    monkeypatch.setattr("launch_scripts.commands.scenario_commands.is_terminal", lambda: True)
-    code, _, err = swarm("new my.toml")
-    assert (code, err) == (1, "swarm: stopped; nothing is written\n")
-    assert not (tmp_path / "my.toml").exists()
 
 
 FEW = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -331,6 +294,19 @@ def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_han
     )
     least = PLACE_TREES_BYTES + 2 * 20 * 2048**2
     assert least < with_places.memory_bytes - lone.memory_bytes < least + (128 << 20)
+
+
+@pytest.mark.parametrize(
+    "key", ["vehicles.sensor", "vehicles.assignment", "vehicles.dynamics", "planner.strategy", "targets[0].walk"]
+)
+def test_a_check_refuses_a_function_of_another_library_as_the_run_does(key: str) -> None:
+    section, _, name = key.rpartition(".")
+    text = {"targets[0]": f'[[targets]]\n{name} = "os:system"'}.get(section, f'[{section}]\n{name} = "os:system"')
+    scenario = parse_scenario(text if "targets" in text else f"[[targets]]\n{text}")
+    (refused,) = not_made(scenario, GridSpec(4, 5, 10.0), np.full((4, 5), 0.1, np.float32))
+    assert (refused.level, refused.about) == ("failure", key)
+    assert "'os:system' could not be made: TypeError" in refused.text
+    assert list(not_made(parse_scenario("[[targets]]"), GridSpec(4, 5, 10.0), np.ones((4, 5), np.float32))) == []
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from PIL import Image
 from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain_commands import app
 from launch_scripts.commands.terrain_routes import find_route
 from launch_scripts.report import terrain_figure
-from shared_map.terrain.slope_rules import SLOPE_RULES
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
-from swarm.config.cost_rules import PRESETS
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError
 
@@ -121,40 +118,6 @@ def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) 
     assert "learnt, on polygons not seen" in said
     with rasterio.open(tmp_path / "classes.tif") as file:
         assert set(np.unique(file.read(1))) == {2, 4}
-
-
-def test_every_rule_and_preset_is_listed_with_its_source_and_drawn(tmp_path: Path) -> None:
-    picture = tmp_path / "rules.png"
-    said = run("rules", "--picture", picture)
-    for name in (*SLOPE_RULES, *PRESETS):
-        assert name in said or name == "table"
-    assert "NCGIA Technical Report 93-1" in said
-    assert 'settings: slope_rule = "tobler", flat_speed_m_per_s = 0.84' in said
-    with Image.open(picture) as image:
-        assert image.width > image.height > 300
-
-
-def test_programs_get_the_same_as_numbers() -> None:
-    found = json.loads(run("rules", "--json"))
-    by_name = {each["name"]: each for each in [*found["rules"], *found["presets"]]}
-    assert set(by_name) == {*SLOPE_RULES, *PRESETS} - {"table"}
-    assert by_name["tobler"]["by_slope_percent"]["-5"] == pytest.approx(0.8395, abs=1e-4)
-    assert by_name["hiker"]["by_slope_percent"]["0"] == pytest.approx(0.84)
-    assert by_name["wheeled"]["unit"] == "m/s"
-
-
-def test_of_a_scenario_what_steps_cost_or_cells(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text('[cost]\npreset = "wheeled"\ndirectional = true\nmax_climb_deg = 10\n')
-    (curves,) = json.loads(run("rules", file, "--json")).values()
-    assert [curve["name"] for curve in curves] == ["each step"]
-    assert curves[0]["by_slope_percent"]["+20"] is None
-    assert curves[0]["by_slope_percent"]["-20"] == 10.0
-    assert "steps to 10 degrees up and 30 down" in run("rules", file)
-    file.write_text('[cost]\nslope_rule = "tobler"\n')
-    (curves,) = json.loads(run("rules", file, "--json")).values()
-    assert [curve["name"] for curve in curves] == ["each cell", "if directional"]
-    assert curves[0]["by_slope_percent"]["-10"] == curves[0]["by_slope_percent"]["+10"]
 
 
 def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_them_itself(tmp_path: Path) -> None:

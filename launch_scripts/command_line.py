@@ -1,0 +1,329 @@
+"""Turns functions into commands of Typer, and runs them: options come from a signature, what they mean from its
+docstring.
+
+A command is a function and `@command(app, PANEL)`. Its docstring is its help: prose and examples, and rows
+`name  meaning` for its arguments and options, as the docstrings of scenario sections have them. A parameter without
+a default is an argument, one with a default an option; `Annotated[..., typer.Option(...)]` says what else there is,
+such as bounds or completion. A parameter whose type is a dataclass stands for one option per field, which the
+class's own docstring explains: options that several commands share are declared and explained once. The function
+returns the exit code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import inspect
+import os
+import pkgutil
+import re
+import signal
+import sys
+from collections.abc import Callable, Collection, Iterator
+from copy import copy
+from dataclasses import fields, is_dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+from typer.exceptions import TyperException
+
+from launch_scripts.plain_text import plain
+from swarm.config.explain import choice, meanings, nearest
+from swarm.config.input_files import quoted
+from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
+from swarm.files import discard_output
+
+F = TypeVar("F", bound=Callable[..., int | None])
+
+RUN = "Run a swarm"
+PREPARE = "Before a run"
+ASK = "Ask a running swarm"
+ORDER = "Give a running swarm orders"
+LEFT = "Finished runs"
+ADMIN = "Processes, machines and other systems"
+"""The panels in which help shows commands."""
+
+NETWORK = "Where the swarm is"
+CERTIFICATES = "Certificates (a folder, or all three files)"
+PART = "A part of a swarm"
+"""The panels in which help shows options."""
+
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+"""Settings of every command, which inherits them from the root."""
+_ROW = re.compile(r"\w+(, \w+)*  +\S")
+_AS_IT_STANDS = (" ", "\b", "[", "swarm ")
+"""Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
+
+
+def command(
+    app: typer.Typer, panel: str | None = None, name: str | None = None, **settings: Any
+) -> Callable[[F], F]:
+    """Adds a function to an app as a command, and returns the function as it is.
+
+    settings  what else Typer takes of a command
+    """
+
+    def added(function: F) -> F:
+        made = app.command(name, rich_help_panel=panel, help=_prose(function.__doc__), **settings)
+        made(_called_with_options(function))
+        return function
+
+    return added
+
+
+def family_app(help: str) -> typer.Typer:
+    """The app of a sub-command that has sub-commands of its own."""
+    return typer.Typer(help=_prose(help), no_args_is_help=True, add_completion=False)
+
+
+def _prose(docstring: str | None) -> str:
+    """The prose of a docstring, each paragraph on one line, without the rows that explain options."""
+    paragraphs = re.split(r"\n\s*\n", inspect.cleandoc(docstring or ""))
+    return "\n\n".join(
+        each if any(line.startswith(_AS_IT_STANDS) for line in each.splitlines()) else " ".join(each.split())
+        for each in paragraphs
+        if not _ROW.match(each)
+    )
+
+
+def _called_with_options(function: Callable[..., int | None]) -> Callable[..., None]:
+    """The function as Typer reads it: every dataclass parameter is replaced by the fields of its class."""
+    said = meanings(function)
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for each in inspect.signature(function, eval_str=True).parameters.values():
+        if not is_dataclass(each.annotation):
+            parameters.append(_parameter(each.name, each.annotation, each.default, said))
+            continue
+        group: Any = each.annotation
+        groups[each.name] = group
+        bases: list[Any] = [base for base in reversed(group.__mro__) if is_dataclass(base)]
+        explained = {name: text for base in bases for name, text in meanings(base).items()}
+        panels = {name: base.panel for base in bases for name in meanings(base)}
+        hints = get_type_hints(group, include_extras=True)
+        for field in fields(group):
+            parameters.append(
+                _parameter(
+                    field.name, hints[field.name], field.default, explained, panels.get(field.name, group.panel)
+                )
+            )
+
+    def run(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        if code := function(**values):
+            raise typer.Exit(code)
+
+    run.__name__ = function.__name__
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run
+
+
+def _parameter(
+    name: str, hint: Any, default: Any, said: dict[str, str], panel: str | None = None
+) -> inspect.Parameter:
+    """A parameter with its meaning; one that is true or false is given as `--name` alone."""
+    kind, *declared = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
+    is_argument = default is inspect.Parameter.empty
+    info = copy(declared[0]) if declared else typer.Argument() if is_argument else typer.Option()
+    info.help = said.get(name, info.help)
+    info.rich_help_panel = panel
+    if kind is bool and not isinstance(info.default, str):  # where Typer keeps a name that is declared
+        info.param_decls = (f"--{name.replace('_', '-')}",)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info]
+    )
+
+
+def from_environment(variable: str, **more: Any) -> Any:
+    """An option whose value may be in a variable of the environment: `SWARM_NAMESPACE` for `--namespace`."""
+    return typer.Option(envvar=variable, show_envvar=False, **more)
+
+
+class Family(TyperGroup):
+    """A group whose commands are those of a Typer app, `MODULE:APP`, which is imported when one is asked for.
+
+    help  the line beside its name among the other commands; the app has a longer one of its own
+    """
+
+    def __init__(self, name: str, module: str, help: str, panel: str) -> None:
+        self.module = module
+        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel, suggest_commands=False)
+
+    @cached_property
+    def group(self) -> Any:
+        """The group of the app itself."""
+        return typer.main.get_group(pkgutil.resolve_name(self.module))
+
+    @property
+    def commands(self) -> Any:
+        return self.group.commands
+
+    @commands.setter
+    def commands(self, none_yet: Any) -> None:
+        """Typer gives a new group the commands that it knows, and of a family it knows none."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        self.group.format_help(ctx, formatter)
+
+
+# --- completion: nothing here may fail or take long, as the user has pressed the Tab key ------------------------
+
+
+def complete_scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Built-in scenarios, and .toml files below the folder that the word begins with."""
+    from launch_scripts.launcher.options import SCENARIOS
+
+    built_in = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
+    return [name for name in [*built_in, *_files_of(incomplete)] if name.startswith(incomplete)]
+
+
+def complete_runs(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Names of the runs in --runs and of those that are registered, the newest first, and LAST."""
+    from launch_scripts.observe.run_registry import registered
+
+    names = {run.name for run in registered()}
+    with contextlib.suppress(OSError):
+        names |= {each.name for each in Path(ctx.params.get("runs") or "runs").iterdir() if each.is_dir()}
+    return [name for name in sorted(names, reverse=True) if name.startswith(incomplete)]
+
+
+def complete_words(module: str, name: str) -> Callable[[typer.Context, str], list[str]]:
+    """The words of a constant: a sequence, a mapping or a `Literal`. Its module is imported on the Tab key."""
+
+    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
+        known: Any = getattr(importlib.import_module(module), name)
+        return [str(word) for word in get_args(known) or tuple(known) if str(word).startswith(incomplete)]
+
+    return offered
+
+
+def _files_of(incomplete: str) -> Iterator[str]:
+    folder = Path(incomplete) if incomplete.endswith("/") else Path(incomplete).parent
+    before = "" if "/" not in incomplete else incomplete[: incomplete.rfind("/") + 1]
+    with contextlib.suppress(OSError):
+        for each in sorted(folder.iterdir()):
+            if each.suffix == ".toml":
+                yield f"{before}{each.name}"
+            elif each.is_dir() and not each.name.startswith("."):
+                yield f"{before}{each.name}/"
+
+
+# --- a command is run: whatever ends it becomes an exit code and one sentence, never a traceback ----------------
+
+_NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
+"""Errors about a path that cannot be one, or not for this user."""
+_SYNONYMS = {
+    "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
+    "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
+    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
+    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
+    "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
+}  # fmt: skip
+"""Word that other programs have, or we had -> our words, the first of which that a group knows is meant."""
+
+
+def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
+    """Runs the command that is made here. Returns its exit code; a fault of the user, a file or the network is
+    reported in a sentence."""
+    # A shell starts what it puts into the background deaf to SIGINT. An explicit signal is obeyed.
+    asked: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
+    _fill_streams()
+    try:
+        try:
+            code = command().main(prog_name=name, standalone_mode=False)
+        finally:
+            sys.stdout.flush()
+    except TyperException as error:
+        if said := _sentence(error):
+            print(f"swarm: {said}", file=sys.stderr)
+        return ConfigError.exit_code
+    except typer.Abort:
+        print("swarm: stopped; nothing is written", file=sys.stderr)
+        return 1
+    except SwarmError as error:
+        said = "\n".join(map(plain, str(error).split("\n")))
+        print(f"swarm: {said}", file=sys.stderr)
+        return error.exit_code
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise  # a fault of ours
+        print(f"swarm: this needs {missing(package)}", file=sys.stderr)
+        return ConfigError.exit_code
+    except BrokenPipeError:
+        discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
+        return 0
+    except OSError as error:
+        if error.errno in _NO_PATHS and error.filename is not None:
+            print(f"swarm: {quoted(str(error.filename))}: {error.strerror}", file=sys.stderr)
+            return ConfigError.exit_code
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+            raise
+        discard_output(1)
+        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
+        return StoreError.exit_code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
+        print("swarm: stopped", file=sys.stderr)
+    return code if isinstance(code, int) else 0
+
+
+def _sentence(error: TyperException) -> str:
+    """Returns Typer's sentence about a mistake, completed: the value found, the meaning of an argument, the list of
+    commands. Empty where Typer has printed help already."""
+    if type(error).__name__ == "NoArgsIsHelpError":  # private to Typer, as all of its classes of errors
+        return ""
+    ctx: Any = getattr(error, "ctx", None)
+    param: Any = getattr(error, "param", None)
+    wrong: list[Any] = getattr(error.__cause__, "errors", list)()
+    said: str = error.format_message()
+    if wrong:
+        said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
+    elif param is not None and said.startswith("Missing") and param.help:
+        said = f"{said.removesuffix('.')}: {param.help}"
+    elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
+        said = said.removesuffix(".") + _meant(unknown[1], ctx.command.commands)
+    elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
+        names = [name for each in ctx.command.params for name in each.opts]
+        said = f"No such option: {option}{nearest(option, names)}"
+    for before, word in pairwise(sys.argv):
+        if re.fullmatch(r"\S*\d,", before) and re.fullmatch(r"[-+.\d]+", word):
+            return f"{said.removesuffix('.')}; a place has no blank: did you mean '{before}{word}'?"
+    if ctx is None:
+        return said
+    said = re.sub(r"(?<!\.)\.$", "", said)
+    return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
+
+
+def _meant(word: str, known: Collection[str]) -> str:
+    """Returns the end of a sentence about an unknown command: the command which is meant, or all that are known."""
+    file = (f"up {word}", f"info {word}") if "." in word else ()
+    found = (each for each in _SYNONYMS.get(word, file) if each.split()[0] in known or each[0] in "-.")
+    synonym = next(found, None)
+    return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"
+
+
+def _fill_streams() -> None:
+    """Redirects closed standard streams to nowhere: otherwise the next file that is opened would take their place,
+    and receive printed text."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))

@@ -1,1 +1,0 @@
-"""Command line: families of commands, completion, and sentences for mistakes."""
