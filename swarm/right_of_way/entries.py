@@ -46,6 +46,7 @@ class HostEntries:
     away        vehicles that have left in this generation: they take no entry
     paths       vehicle -> its entries in driving order, its own cell first
     placed      vehicles that are on the first cell of their paths; the others are nowhere
+    listed      shard -> vehicle -> its entries in the table acted on
     over        shard -> numbers that this generation has left, given back or passed over, and its table still lists
     disclaimed  shard -> numbers later than `knows` that we never take, by our word to members
     heard       (number, host) of which that host has said that it is over; entries of paths know it
@@ -59,6 +60,7 @@ class HostEntries:
     away: set[str] = field(default_factory=set)
     paths: dict[str, list[Entry]] = field(default_factory=dict)
     placed: set[str] = field(default_factory=set)
+    listed: dict[int, dict[str, list[Number]]] = field(default_factory=dict)
     over: dict[int, set[Number]] = field(default_factory=dict)
     disclaimed: dict[int, set[Number]] = field(default_factory=dict)
     heard: dict[tuple[Number, str], None] = field(default_factory=dict)
@@ -88,14 +90,19 @@ class HostEntries:
     def hear_granted(
         self, shard: int, stamp: Stamp, generation: int, grants: Mapping[str, Sequence[Entry]]
     ) -> set[str]:
-        """A usable table of a shard names these entries of our vehicles. Returns the vehicles of which the path has
-        other entries now."""
+        """A usable table of a shard names these entries of the vehicles of which it names others than the table
+        before it. Returns the vehicles of which the path has other entries now."""
         known = self.knows.get(shard, BEFORE_ALL)
         if generation != self.generation or stamp <= known:
             return set()
         self.knows[shard] = stamp
         over = self.over.setdefault(shard, set())
-        over.intersection_update(entry.number for entries in grants.values() for entry in entries)
+        listed = self.listed.setdefault(shard, {})
+        for vehicle, entries in grants.items():
+            numbers = [entry.number for entry in entries]
+            over.difference_update(set(listed.pop(vehicle, ())).difference(numbers))
+            if numbers:
+                listed[vehicle] = numbers
         no_more = self.disclaimed.get(shard, set())
         longer = set()
         for vehicle, entries in grants.items():

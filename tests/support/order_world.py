@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from swarm.right_of_way.entries import HostEntries
-from swarm.wire.messages.traffic import Entry, Number, Stamp, Table
+from swarm.wire.messages.traffic import Entry, Held, Number, Stamp, Table, entries_of
 from vehicle_agent.traffic.cell_orders import Orders
 
 SIDE, MEMBERS, SHARDS = 6, 3, 2
@@ -93,7 +93,7 @@ class OrderWorld:
         for host in HOSTS[:-1]:
             for vehicle in vehicles_of(host):
                 spawns[vehicle] = cell = cells.pop()
-                first[shard_of(cell)].grants[vehicle] = [(cell, 0, 1)]
+                first[shard_of(cell)].grants[vehicle] = Held.of([(cell, 0, 1)])
                 self.bodies[vehicle, 0] = cell
         self.seats = [[Seat(first[shard]) for _ in range(MEMBERS)] for shard in range(SHARDS)]
         self.first = first
@@ -143,7 +143,8 @@ class OrderWorld:
             if not generation.up:
                 continue
             known = table.hosts.get(generation.host, (0, 0))[0]
-            grants = orders.granted(generation.host)
+            held, waits = orders.granted(generation.host)
+            grants = {vehicle: entries_of(of, waits.get(vehicle, ())) for vehicle, of in held.items()}
             self.send(self.hear_granted, generation, shard, table.stamp, known, grants)
 
     def hear_claim(self, shard: int, member: int, claimant: int, epoch: int) -> None:
@@ -230,7 +231,8 @@ class OrderWorld:
                 for vehicle in vehicles_of(generation.host):
                     self.bodies.pop((vehicle, generation.entries.generation), None)
         if not generation.replaced:
-            generation.entries.hear_granted(shard, stamp, known, grants)
+            unlisted = {vehicle: [] for vehicle in generation.entries.listed.get(shard, ())}
+            generation.entries.hear_granted(shard, stamp, known, {**unlisted, **grants})
 
     def tell(self, generation: Generation) -> None:
         generation.seq += 1

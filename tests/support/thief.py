@@ -11,7 +11,7 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 from swarm.config.agents import agent_of
 from swarm.right_of_way.holdings import part_of
-from swarm.wire.messages.traffic import Granted, Number, Stored, Table, Word
+from swarm.wire.messages.traffic import Granted, Held, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import AskPromises
 from vehicle_agent.traffic.right_of_way_core import Action
@@ -68,7 +68,7 @@ class Thief(Process):
         shards, free = self.world.shards, Orders(table)
         thefts: list[tuple[str, Number]] = []
         for vehicle, path in table.grants.items():
-            for cell in self.world.next_to(path[-1][0]):
+            for cell in self.world.next_to([*path.cells][-1]):
                 order = list(free.order(cell).items())
                 thefts += [
                     (vehicle, number)
@@ -89,12 +89,12 @@ class Thief(Process):
         first = (stolen[0], 0, 0) if how == 0 else (stolen[0], table.epoch, table.seq)  # before it, or after it
         grants[vehicle] = [*grants[vehicle], first]
         assert shards.of(stolen[0]) == table.shard
-        return replace(table, grants={id: path for id, path in grants.items() if path}, hosts=hosts)
+        return replace(table, grants={id: Held.of(path) for id, path in grants.items() if path}, hosts=hosts)
 
     def any_of(self, word: Word) -> list[Number]:
         """Entries of a host that it may not have heard of yet."""
         grants = self.rights._members[word.shard].stored.grants.items()
-        return [path[-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
+        return [[*path][-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
 
     def tell(self, table: Table) -> None:
         """Different members and hosts are told different tables of one number, each with the words that go with
@@ -113,9 +113,9 @@ class Thief(Process):
 
     def words(self, table: Table, host: str) -> Iterator[Granted | Word]:
         """A grant by a table, sometimes without those before; and the word for it."""
-        grants, generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
+        (grants, waits), generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
         if self.chance.random() < 0.2:
-            grants = {id: [replace(entry, after=[]) for entry in entries] for id, entries in grants.items()}
+            waits = {}
         stamp = {"epoch": table.epoch, "seq": table.seq}
         yield Granted(
             shard=table.shard,
@@ -124,9 +124,10 @@ class Thief(Process):
             generation=generation,
             heard=1 << 30,
             grants=grants,
+            waits=waits,
             **stamp,
         )
-        part = part_of(generation, grants)
+        part = part_of(generation, grants, waits)
         yield Word(shard=table.shard, host=host, agent=self.agent, part=part, **stamp)
 
 

@@ -19,7 +19,7 @@ from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import HostState, Known, KnownRequest, Left, Stored, Table
+from swarm.wire.messages.traffic import Held, HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
 _ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
@@ -252,7 +252,7 @@ class RightOfWay:
     def _at_start(self, shard: int) -> Table:
         """The table from before any leader: vehicles stand where the run begins."""
         grants = {
-            vehicle: [(cell, 0, 1)]
+            vehicle: Held.of([(cell, 0, 1)])
             for fleet in self._spawns.values()
             for vehicle, cell in fleet.items()
             if self.shards.of(cell) == shard

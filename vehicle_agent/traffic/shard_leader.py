@@ -18,7 +18,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stamp, Stand, Table
+from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
@@ -69,9 +69,11 @@ def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
     return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
 
 
-_Content = tuple[dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int]
-"""Content of a `Granted`: entries, those that are followed, vehicles to make way, and cells of others; then its
-generation, and what it was heard to say if it waits for that alone."""
+_Content = tuple[
+    dict[str, Held], dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int
+]
+"""Content of a `Granted`: entries, those that wait, those that are followed, vehicles to make way, and cells of
+others; then its generation, and what it was heard to say if it waits for that alone."""
 
 
 @dataclass(slots=True)
@@ -235,7 +237,7 @@ class Leader:
             if content == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
                 continue
             host.told, host.told_ns = content, now_ns
-            grants, behind, pushed, occupied, *_ = content
+            grants, waits, behind, pushed, occupied, *_ = content
             yield Granted(
                 shard=table.shard,
                 host=name,
@@ -245,6 +247,7 @@ class Leader:
                 generation=generation,
                 heard=heard,
                 grants=grants,
+                waits=waits,
                 followed=behind,
                 pushed=pushed,
                 occupied=occupied,
@@ -256,7 +259,7 @@ class Leader:
         held, followed = orders.orders.keys(), orders.followed()
         found: dict[str, _Content] = {}
         for name, host in self._hosts.items():
-            grants = orders.granted(name)
+            grants, waits = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
             others = held - {each[0] for vehicle in grants for each in orders.of[vehicle]}
@@ -264,7 +267,8 @@ class Leader:
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             generation, heard = table.hosts.get(name, (0, 0))
-            found[name] = grants, followed.get(name, {}), pushed, occupied, generation, 0 if stands else heard
+            behind, awaited = followed.get(name, {}), 0 if stands else heard
+            found[name] = grants, waits, behind, pushed, occupied, generation, awaited
         return found
 
     def _plan(self, now_ns: int) -> None:

@@ -165,7 +165,7 @@ class Witness:
             if now_ns - host.spoke_ns > SILENT_NS and lacks is None:
                 continue
             generation, _ = stored.hosts.get(name, BEFORE_ALL)
-            part = part_of(generation, self._orders.granted(name))
+            part = part_of(generation, *self._orders.granted(name))
             says = stored.epoch, part, lacks
             if says == host.told and 0 <= now_ns - host.told_ns < HEARTBEAT_NS:
                 continue
