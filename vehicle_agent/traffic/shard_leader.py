@@ -16,7 +16,7 @@ from zlib import crc32
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
+from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
@@ -125,7 +125,7 @@ class Leader:
         self._told_ns = 0
         self._content: dict[Stamp, dict[str, _Content]] = {}
         """Stamp of a table -> host -> what it is told of that."""
-        self._said_of: Table | None = None
+        self._said_of: Stamp | None = None
         self._said_ns = 0
 
     @property
@@ -224,15 +224,15 @@ class Leader:
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
         heartbeat old."""
-        if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
+        if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
             return
-        self._said_of, self._said_ns = table, now_ns
+        self._said_of, self._said_ns = table.stamp, now_ns
         for name, content in self._content.get(table.stamp, {}).items():
             host = self._hosts[name]
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             generation, heard = table.hosts.get(name, (0, 0))
-            if content == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
+            if is_said(content, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
                 continue
             host.told, host.told_ns = content, now_ns
             grants, behind, pushed, occupied, *_ = content

@@ -13,7 +13,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS
+from swarm.right_of_way.incarnations import is_said
 from swarm.wire.messages.traffic import HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import SILENT_NS, is_entering
@@ -167,7 +167,7 @@ class Witness:
             generation, _ = stored.hosts.get(name, BEFORE_ALL)
             part = part_of(generation, self._orders.granted(name))
             says = stored.epoch, part, lacks
-            if says == host.told and 0 <= now_ns - host.told_ns < HEARTBEAT_NS:
+            if is_said(says, host.told, now_ns - host.told_ns):
                 continue
             host.told, host.told_ns = says, now_ns
             yield Word(
