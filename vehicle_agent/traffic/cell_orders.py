@@ -62,7 +62,9 @@ class Orders:
             if shut:
                 self._fences.add(number)
 
-    def table(self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
+    def table(
+        self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int], without: str | None = None
+    ) -> Table:
         """Returns the same as a message."""
         fences = [Fence(host, generation, dict(of)) for (host, generation), of in self.fenced.items()]
         epoch, seq = stamp
@@ -75,6 +77,7 @@ class Orders:
             grants=dict(self.of),
             fences=fences,
             pushed=dict(pushed),
+            without=without,
         )
 
     # --- what is so -----------------------------------------------------------------------------------------

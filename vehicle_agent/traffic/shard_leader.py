@@ -7,6 +7,7 @@ waits for one that stays: it follows only those that have an entry behind the ce
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -43,7 +44,7 @@ _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
 TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
-_MOST_CELLS = 64
+MOST_CELLS = 64
 """Limit for one vehicle: the largest `Grant`."""
 
 
@@ -57,6 +58,19 @@ def _turn(stand: Stand) -> tuple[int, int, str]:
 def is_entering(stand: Stand) -> bool:
     """Returns True if the vehicle holds no cell and requests its first."""
     return not stand.holds and stand.ahead[:1] == [stand.cell]
+
+
+def exceeds_externals(table: Table, fleets: Mapping[str, Collection[str]]) -> bool:
+    """Returns True if external vehicles have more of a table than leaders grant them."""
+    counts = Counter[str]()
+    for vehicle, entries in table.grants.items():
+        if (host := agent_of(vehicle)) not in fleets:
+            counts[host] += len(entries)
+    return (
+        counts.total() > MOST_CELLS_OF_EXTERNALS
+        or any(count > MOST_CELLS_OF_EXTERNAL for count in counts.values())
+        or len(table.hosts.keys() - fleets.keys()) > MOST_EXTERNALS
+    )
 
 
 @lru_cache(maxsize=1 << 14)
@@ -102,10 +116,17 @@ class Leader:
     fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
     (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
+    without  a member with a revoked name, after which the table was agreed by the others
     """
 
     def __init__(
-        self, shards: Shards, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
+        self,
+        shards: Shards,
+        me: str,
+        epoch: int,
+        table: Table,
+        fleets: Mapping[str, Collection[str]],
+        without: str | None = None,
     ) -> None:
         self.epoch = epoch
         self.seq = 0
@@ -114,6 +135,7 @@ class Leader:
         self._shard = table.shard
         self._me = me
         self._fleets = fleets
+        self._without = without or table.without
         self._orders = Orders(table)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
@@ -213,7 +235,8 @@ class Leader:
             return None
         if self._told is None or self._granted or self._changed:
             self.seq += 1
-            self._told = self._orders.table(self._shard, self._me, (self.epoch, self.seq), self._pushed)
+            stamp = self.epoch, self.seq
+            self._told = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
             self._content[self._told.stamp] = self._content_of(self._told)
             if len(self._content) > TABLES_KEPT:
                 del self._content[next(iter(self._content))]
@@ -361,7 +384,7 @@ class Leader:
             if order and not self._may_follow(stand, order):
                 return
             held = len(orders.entries(vehicle))
-            if held >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
+            if held >= MOST_CELLS or not self._external_may_hold_more(vehicle):
                 return
             if held > stand.keeps and self._is_near(cell, vehicle):
                 return
