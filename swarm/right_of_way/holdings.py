@@ -11,7 +11,7 @@ from itertools import chain, takewhile
 import msgspec
 
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
-from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
+from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 
@@ -303,13 +303,14 @@ class Holdings:
 
     def hear_word(self, word: Word) -> list[str]:
         """A member has something on file for us. Returns the vehicles that have found their place."""
-        if word.agent not in self._shards.members(word.shard):
+        knows = self._entries.knows.get(word.shard, BEFORE_ALL)
+        if word.agent not in self._shards.members(word.shard) or word.epoch > knows[0] + FURTHEST_EPOCH:
             return []
         view = self._views.setdefault(word.shard, _View())
         view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.shard])
-            self._entries.disclaim(word.shard, word.lacks)
+            self._entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), word.lacks)
             view.same, view.told = False, None
         return self._take_agreed(view)
 
@@ -418,7 +419,7 @@ class Holdings:
                     continue
                 told, told_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
-                if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
+                if left and not is_said(left, told, now_ns - told_ns):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
@@ -471,7 +472,7 @@ class Holdings:
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
-            never=sorted(self._entries.disclaimed.get(shard, ())),
+            never=sorted(self._entries.never(shard)),
         )
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:

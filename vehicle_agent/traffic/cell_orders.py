@@ -64,7 +64,9 @@ class Orders:
             if shut:
                 self._fences.add(number)
 
-    def table(self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
+    def table(
+        self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int], without: str | None = None
+    ) -> Table:
         """Returns the same as a message."""
         fences = [
             Fence(host, generation, {vehicle: Held.of(entries) for vehicle, entries in of.items()})
@@ -80,6 +82,7 @@ class Orders:
             grants={vehicle: self._held_by(vehicle) for vehicle in self.of},
             fences=fences,
             pushed=dict(pushed),
+            without=without,
         )
 
     # --- what is so -----------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ waits for one that stays: it follows only those that have an entry behind the ce
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -16,7 +17,7 @@ from zlib import crc32
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
+from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
@@ -43,7 +44,7 @@ _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
 TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
-_MOST_CELLS = 64
+MOST_CELLS = 64
 """Limit for one vehicle: the largest `Grant`."""
 
 
@@ -57,6 +58,19 @@ def _turn(stand: Stand) -> tuple[int, int, str]:
 def is_entering(stand: Stand) -> bool:
     """Returns True if the vehicle holds no cell and requests its first."""
     return not stand.holds and stand.ahead[:1] == [stand.cell]
+
+
+def exceeds_externals(table: Table, fleets: Mapping[str, Collection[str]]) -> bool:
+    """Returns True if external vehicles have more of a table than leaders grant them."""
+    counts = Counter[str]()
+    for vehicle, entries in table.grants.items():
+        if (host := agent_of(vehicle)) not in fleets:
+            counts[host] += len(entries)
+    return (
+        counts.total() > MOST_CELLS_OF_EXTERNALS
+        or any(count > MOST_CELLS_OF_EXTERNAL for count in counts.values())
+        or len(table.hosts.keys() - fleets.keys()) > MOST_EXTERNALS
+    )
 
 
 @lru_cache(maxsize=1 << 14)
@@ -104,10 +118,17 @@ class Leader:
     fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
     (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
+    without  a member with a revoked name, after which the table was agreed by the others
     """
 
     def __init__(
-        self, shards: Shards, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
+        self,
+        shards: Shards,
+        me: str,
+        epoch: int,
+        table: Table,
+        fleets: Mapping[str, Collection[str]],
+        without: str | None = None,
     ) -> None:
         self.epoch = epoch
         self.seq = 0
@@ -116,6 +137,7 @@ class Leader:
         self._shard = table.shard
         self._me = me
         self._fleets = fleets
+        self._without = without or table.without
         self._orders = Orders(table)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
@@ -127,7 +149,7 @@ class Leader:
         self._told_ns = 0
         self._content: dict[Stamp, dict[str, _Content]] = {}
         """Stamp of a table -> host -> what it is told of that."""
-        self._said_of: Table | None = None
+        self._said_of: Stamp | None = None
         self._said_ns = 0
 
     @property
@@ -215,7 +237,8 @@ class Leader:
             return None
         if self._told is None or self._granted or self._changed:
             self.seq += 1
-            self._told = self._orders.table(self._shard, self._me, (self.epoch, self.seq), self._pushed)
+            stamp = self.epoch, self.seq
+            self._told = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
             self._content[self._told.stamp] = self._content_of(self._told)
             if len(self._content) > TABLES_KEPT:
                 del self._content[next(iter(self._content))]
@@ -226,15 +249,15 @@ class Leader:
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
         heartbeat old."""
-        if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
+        if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
             return
-        self._said_of, self._said_ns = table, now_ns
+        self._said_of, self._said_ns = table.stamp, now_ns
         for name, content in self._content.get(table.stamp, {}).items():
             host = self._hosts[name]
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             generation, heard = table.hosts.get(name, (0, 0))
-            if content == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
+            if is_said(content, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
                 continue
             host.told, host.told_ns = content, now_ns
             grants, waits, behind, pushed, occupied, *_ = content
@@ -365,7 +388,7 @@ class Leader:
             if order and not self._may_follow(stand, order):
                 return
             held = len(orders.entries(vehicle))
-            if held >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
+            if held >= MOST_CELLS or not self._external_may_hold_more(vehicle):
                 return
             if held > stand.keeps and self._is_near(cell, vehicle):
                 return

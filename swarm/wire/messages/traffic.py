@@ -161,6 +161,8 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     grants  vehicle -> its entries in driving order
     fences  entries of generations that may still drive
     pushed  vehicle -> the age with which it is to make way into another shard
+    without name that was revoked: a leader began with what two of three other members had on file, or with a table
+            that followed from such a one
     """
 
     shard: Shard
@@ -171,6 +173,7 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     grants: Annotated[dict[VehicleId, Held], LARGE]
     fences: Annotated[list[Fence], IDS] = []
     pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
+    without: Id | None = None
 
     @property
     def stamp(self) -> Stamp:
