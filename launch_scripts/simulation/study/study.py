@@ -120,8 +120,8 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
         fault = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
         raise ConfigError(f"{source}: {fault}") from error
     seeds = parse_seeds(study.seeds, f"{source}: seeds")
-    if fault := next(_faults(study, len(seeds)), None):
-        raise ConfigError(f"{source}: {fault}")
+    if wrong := next(_faults(study, len(seeds)), None):
+        raise ConfigError(f"{source}: {wrong}")
     return study
 
 

@@ -132,6 +132,18 @@ def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
     return f": {' and '.join(map(on_cell, evidence))}"
 
 
+def _started_ns(author: str) -> int:
+    """Start of the process which an author's name states, ns; 0 of a name without it.
+
+    The simulated vehicle of a process which has ended stays where it is until the next process of its name starts,
+    and is nowhere until that one has a place for it. Others may drive over the cell meanwhile.
+    """
+    try:
+        return int(author.rpartition(".")[2], 16)
+    except ValueError:
+        return 0
+
+
 Encounters = dict[tuple[str, str], int]
 """Pair -> the last time at which both are known to have been on one cell."""
 
@@ -195,15 +207,18 @@ class Referee:
             before_ns = stay.end_ns
             if stamp_ns <= before_ns:
                 continue
-            gapless = author == stay.author and seq <= stay.seq + 1
-            stay.author, stay.seq = author, seq
+            same = author == stay.author
+            until_ns = stamp_ns if same else min(max(_started_ns(author), before_ns), stamp_ns)
+            gapless = same and seq <= stay.seq + 1
+            if same:
+                stay.seq = seq
             stands = cell == stay.cell
             if stands or gapless:
-                stay.end_ns = stamp_ns
+                stay.end_ns = until_ns
                 if stay.cell in covered or len(stays[stay.cell]) > 1:
                     broken.extend(self._meetings(stay))
-            if not stands:
-                since_ns = stamp_ns if gapless else before_ns
+            if not (stands and same):
+                since_ns = before_ns if same and not gapless else until_ns
                 self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, region, author, seq, seq), fleet, broken)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)

@@ -105,6 +105,15 @@ def test_who_is_seen_standing_still_stood_there_meanwhile() -> None:
     assert len(judged(a(100, 5), b(150, 4), b(250, 5), a(900, 5), b(950, 5))) == 1
 
 
+def test_a_vehicle_is_on_its_cell_until_its_process_starts_again_and_nowhere_until_it_is_placed() -> None:
+    began, again = f"a0.{50 * MS:x}", f"a0.{600 * MS:x}"
+    before, after = a(100, 5, author=began, seq=7), a(900, 5, author=again, seq=1)
+    assert len(judged(before, b(300, 4), b(400, 5), b(550, 5), b(560, 6), after)) == 1
+    assert judged(before, b(650, 4), b(700, 5), b(800, 5), b(810, 6), after) == []
+    later = a(1000, 5, author=again, seq=2)
+    assert len(judged(before, b(700, 5), after, later, b(1050, 5))) == 1
+
+
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.integers(0, 3)), max_size=30), st.randoms())
 def test_repeated_and_late_reports_change_nothing(moves: list[tuple[str, int]], chance: random.Random) -> None:
