@@ -308,7 +308,8 @@ FIRST = {
     "stores_after_a_promise": 39,
     "an_older_generation_goes_on": 14,
     "forgets_where_an_older_generation_may_stand": 14,
-    "seats_a_file_that_is_not_the_first": 56,
+    "restart_without_file": 122,
+    "seats_a_file_that_is_not_the_first": 252,
     "acts_on_a_table_that_is_not_the_newest": 97,
 }
 """Histories tried before the others, because they collided last: rare faults are found soon."""
