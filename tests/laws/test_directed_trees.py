@@ -10,14 +10,7 @@ import pytest
 from support import slow_twins as naive
 from support.kernel_oracle import inner
 from support.planner_play import Play
-from support.planner_strategies import (
-    RULES,
-    STRATEGIES,
-    Marks,
-    Move,
-    random_climb,
-    random_pace,
-)
+from support.planner_strategies import RULES, STRATEGIES, Marks, Move, random_climb, random_pace
 from support.repaired_tree import FACTORS, Patchwork
 
 from planner_service.kernels.layout import NONE
