@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, step_price
 from planner_service.kernels.compile import helper, step_kernel
-from planner_service.kernels.layout import (
-    INF,
-    NONE,
-    RULE_OCTILE,
-    SQRT2_EXACT,
-    check_cells,
-    step_offsets,
-)
+from planner_service.kernels.layout import INF, NONE, RULE_OCTILE, SQRT2_EXACT, check_cells, step_offsets
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
 """Result of a requested route."""

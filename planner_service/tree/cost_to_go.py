@@ -90,12 +90,8 @@ class CostToGoTree:
 
     def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
         """Becomes a tree that was searched elsewhere, exactly, on the map as it was or is now. Raises as `grow`,
-        except that the root may have become lethal since, and ValueError unless the arrays are as `cost` and
-        `parent` here."""
+        except that the root may have become lethal since."""
         self.cost_grid.grid.row_col(root)
-        size = self.cost_grid.size
-        if cost.shape != (size,) or parent.shape != (size,) or cost.dtype != np.float32 or parent.dtype != np.uint8:
-            raise ValueError(f"a tree of this map is float32 and uint8, {size} cells each")
         self.cost = cost
         self.parent = parent
         self.reach = reach

@@ -113,10 +113,8 @@ class PieceTree:
 
     def take(self, root: int, parent: NDArray[np.uint8]) -> None:
         """Becomes a tree that was made elsewhere, on the current map, and makes it exact. The array is taken over.
-        Raises as `grow`, and ValueError unless the array is as `parent` here."""
+        Raises as `grow`."""
         self.cost_grid.check_root(root)
-        if parent.shape != (self.cost_grid.size,) or parent.dtype != np.uint8:
-            raise ValueError(f"parents of this map are uint8, {self.cost_grid.size} cells")
         self.parent = parent
         self.root = root
         self._wanted[:] = CHECK | RELINK

@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.planner_play import Play
-from support.planner_strategies import (
-    RULES,
-    STRATEGIES,
-    Marks,
-    Move,
-    random_climb,
-    random_pace,
-)
+from support.planner_strategies import RULES, STRATEGIES, Marks, Move, random_climb, random_pace
 from support.repaired_tree import Patchwork
 
 from planner_service.kernels.layout import NONE

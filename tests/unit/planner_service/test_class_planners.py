@@ -208,11 +208,11 @@ def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(
     tags = []
     for _ in range(2):
         world.ask(CostRequest(cells=[world.target], vehicle_class="low"))
-        tags.append(world.service._tag("grow-tree", "low"))
+        tags.append(world.service._tag("low"))
         assert [world.service._asked_by(tag) is not None for tag in tags] == [False] * (len(tags) - 1) + [True]
         world.run(2)
         assert world.trees() == ["ground"]
-    assert world.service._asked_by(world.service._tag("grow-tree", "ground")) is not None
+    assert world.service._asked_by(world.service._tag("ground")) is not None
 
 
 def test_a_zone_for_one_class_is_obeyed_once_the_tree_of_that_class_knows_of_it() -> None:

@@ -99,10 +99,3 @@ def test_a_tree_that_was_never_grown_says_so() -> None:
     for attempt in (tree.mend, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
         with pytest.raises(ValueError, match="no root"):
             attempt()
-
-
-def test_only_arrays_of_the_map_become_its_tree(tree: CostToGoTree) -> None:
-    with pytest.raises(ValueError, match="cells each"):
-        tree.take(0, tree.cost[:-1], tree.parent, 1.0)
-    with pytest.raises(ValueError, match="cells each"):
-        tree.take(0, tree.cost.astype(np.float64), tree.parent, 1.0)  # type: ignore[arg-type]
