@@ -16,7 +16,7 @@ GROUND, CERTIFICATES, PLUGINS = "ground", "certs", "plugins"
 """Folders beside a machine's scenario."""
 _BESIDE = (".dbf", ".shx", ".prj", ".cpg", ".hdr", ".tfw", ".pgw", ".wld", ".blw", ".aux.xml", ".msk")
 """Endings of files that a format keeps beside its main one."""
-_NAMES_OTHERS = (".vrt", ".yaml", ".yml")
+_NAMES_OTHERS = (".yaml", ".yml")
 
 
 def host_scenario(plan: Plan, host: PlannedHost) -> tuple[Scenario, dict[str, Path]]:

@@ -108,7 +108,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     """Sources of elevation and photo.
 
     source         "jacksboro" (built in), "synthetic", or a file. Rasters: .tif, .tiff, .img, .hgt, .bil, .flt,
-                   .dem, .dt2, .nc, .vrt; each of these may be in a .zip. Others: .asc, .npz, .png, .csv, .xyz, .map
+                   .dem, .dt2, .nc; each of these may be in a .zip. Others: .asc, .npz, .png, .csv, .xyz, .map
                    (MovingAI), .yaml or .yml (ROS map)
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
