@@ -240,7 +240,7 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: dem(f, np.full((9, 9), np.nan, np.float32)), "no heights at all"),
     (
         lambda f: dem(f, np.zeros((3, 40, 50), np.uint8)),
-        r"3 bands of uint8, expected one of heights.*terrain\.photo",
+        r"3 bands of uint8, expected one of elevation.*terrain\.photo",
     ),
     (lambda f: with_photo(f, np.zeros((3, 40, 50), np.uint8), nodata=0), "p.tif shows nothing of the terrain"),
     (lambda f: with_photo(f, NOT_A_NUMBER), "p.tif shows nothing of the terrain"),
