@@ -11,8 +11,7 @@ from shared_map.replication.mark_filter import MarkFilter
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain
-from shared_map.vehicle_class_grounds import class_terrains
-from shared_map.vehicle_class_maps import ClassMaps
+from shared_map.vehicle_class_grounds import ClassMaps, class_terrains
 from swarm.bus.bus import Asked, Bus, Event, Post, Worker
 from swarm.config.agents import agent_of
 from swarm.config.vehicle_classes import GROUND, class_numbers

@@ -16,7 +16,7 @@ in a planner, 19 and 20 in the agent of the other vehicle:
 7. `swarm/bus/zenoh_intake.py`: `together` checks and decodes all waiting sets (`swarm/wire/codec.py`).
 8. `replica_sync.py`: `MapSync.tick` admits the sets within their author's quota (`author_limits.py`).
 9. `replica.py`: `MapReplica.merge` determines the winning marks (`merge.py`).
-10. `shared_map/vehicle_class_maps.py`: `ClassMaps.apply` passes them to the map of each vehicle class.
+10. `shared_map/vehicle_class_grounds.py`: `ClassMaps.apply` passes them to the map of each vehicle class.
 11. `shared_map/cost_map.py`: `CostMap.apply` changes the paces and notes the changed windows.
 12. `planner_service/planner.py`: `Planner.tick` takes the windows (`followers.MapIntake` decides when).
 13. `planner_service/target_tree.py`: `TargetTree.update` learns the new costs.

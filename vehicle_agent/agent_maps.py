@@ -22,8 +22,7 @@ from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.step_climb import Climb
-from shared_map.vehicle_class_grounds import ClassGround
-from shared_map.vehicle_class_maps import ClassMaps, for_class, read_marks
+from shared_map.vehicle_class_grounds import ClassGround, ClassMaps, for_class, read_marks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkKind

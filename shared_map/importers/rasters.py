@@ -73,7 +73,7 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
     Raises TerrainError that names the setting which answers, if they may be heights, too.
     """
     if dataset.count >= 3:
-        found = f"{dataset.count} bands of {dataset.dtypes[0]}, expected one of heights"
+        found = f"{dataset.count} bands of {dataset.dtypes[0]}, expected one of elevation"
         raise TerrainError(f"{what} has {found}: gdal_translate -b 1 takes it out; a photo goes into terrain.photo")
     if config.elevation_encoding is not None:
         return False

@@ -12,7 +12,7 @@ from shared_map.learning.measurements import Measurement
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from shared_map.vehicle_class_maps import ClassMaps
+from shared_map.vehicle_class_grounds import ClassMaps
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS
 from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, MarkKind, MarkSet

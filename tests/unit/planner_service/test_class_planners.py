@@ -23,8 +23,7 @@ from shared_map.keeper.zone_orders import rows_of
 from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
-from shared_map.vehicle_class_grounds import class_terrains
-from shared_map.vehicle_class_maps import ClassMaps, read_by
+from shared_map.vehicle_class_grounds import ClassMaps, class_terrains, read_by
 from swarm.bus.bus import AskEnded, Event
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S

@@ -156,21 +156,6 @@ def ending(author: str, cell: int, stamp_ns: int, until_ns: int, kind: MarkKind 
     return mark_set(author, "all", 0, 1, 0, said)
 
 
-def test_a_mark_ends_by_itself_and_what_it_had_overruled_stands_again() -> None:
-    replica, composite = replica_of([set_of("b", 0, 0, {5: (PACE, 2.0, 10)}), ending("a", 5, 20, 50)])
-    replica.tick(49)
-    assert composite.kinds[5] == LETHAL
-    replica.tick(50)
-    assert (composite.kinds[5], composite.paces[5]) == (PACE, 2.0)
-
-
-def test_a_mark_that_had_ended_before_it_came_changes_nothing() -> None:
-    replica, composite = replica_of([])
-    replica.tick(60)
-    assert merge_one(replica, ending("a", 5, 20, 50)) == []
-    assert composite.kinds[5] == CLEAR
-
-
 @given(
     st.lists(
         st.builds(ending, st.sampled_from("abc"), st.integers(0, 2), st.integers(0, 9), st.integers(0, 19)),
