@@ -59,7 +59,7 @@ def info(
 ) -> None:
     """Describe a terrain file or the terrain of a scenario.
 
-    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, one of
+    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
     these in a .zip, .asc, .npz, .csv and .xyz grids, land cover (ESA
     WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml,
     and .png with --resolution-m and --height-scale. Lines after the table

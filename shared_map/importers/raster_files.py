@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,7 @@ LONGEST_REASON = 200
 READ_ROWS = 512
 """Rows that are read at once."""
 _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
+_MOST_TIMES, _DEEPEST = 32, 4
 _MAX_PIXELS = 16 * MAX_CELLS
 """Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
@@ -111,7 +113,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            # Nothing that a file names may be somewhere on the network.
+            # A .vrt names other files: none of them may be somewhere on the network.
             with (
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
                 contextlib.ExitStack() as files,
@@ -278,13 +280,17 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
     head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
     if member is not None:
         driver = _driver(head, Path(member).suffix.lower(), f"{what}: {member}")
+        if driver == "VRT":
+            raise TerrainError(f"{what}: {member} names other files; unpack it")
         return f"/vsizip/{{{path}}}/{member}", driver
     driver = _driver(head, path.suffix.lower(), what)
-    length = check_bytes(path, FileKind.IMAGE)
+    length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
         raise TerrainError(f"{what} is truncated or no .hgt: it has {length} bytes, expected one of {_HGT_BYTES}")
     if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
         raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
+    if driver == "VRT":
+        _check_virtual(path, what, {})
     if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
         return f"/vsisubfile/3,{path}", driver
     beside = path.with_suffix(".hdr")
@@ -331,11 +337,53 @@ def _driver(head: bytes, ending: str, what: str) -> str:
     found = _magic_driver(head) or _NAMELESS.get(ending)
     if found is None:
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
-        raise TerrainError(
-            f"{what} is no raster that is read: it begins with {head[:8]!r}, as none of {known} does;"
-            " `gdal_translate FILE out.tif` converts most others"
-        )
+        raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
     return found
+
+
+def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int = 1) -> float:
+    """Returns how many times over a .vrt is painted by its sources; `known` holds that of others.
+
+    It names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait at a
+    pipe for ever. It has no limit of time either, and a megabyte of XML can ask for the same pixels often.
+    """
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise TerrainError(f"{what} is truncated or no raster: {str(error)[:LONGEST_REASON]}") from error
+    nested = 1.0
+    for node in root.iter():
+        if not node.tag.endswith(("SourceFilename", "SourceDataset")):
+            continue
+        source = path.parent / (node.text or "").strip()
+        check_file(source, FileKind.VIRTUAL_RASTER)
+        with source.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        _driver(head, source.suffix.lower(), f"{what}: {source}")  # GDAL knows other kinds, also of the network
+        if b"<VRTDataset" in head:  # anywhere, for GDAL
+            if depth >= _DEEPEST:
+                raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
+            if source not in known:
+                check_bytes(source, FileKind.VIRTUAL_RASTER)
+                known[source] = _check_virtual(source, what, known, depth + 1)
+            nested = max(nested, known[source])
+    times = nested * max((_painted(root, band) for band in root.iter("VRTRasterBand")), default=1.0)
+    if times > _MOST_TIMES:
+        raise TerrainError(f"{what} paints its pixels {times:.0f} times over; at most {_MOST_TIMES} times are read")
+    return times
+
+
+def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
+    """Returns how many times over the pixels of a band are painted, at least once."""
+    try:
+        cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
+        places = [node.find("DstRect") for node in band if node.tag.endswith("Source")]
+        painted = cells * places.count(None)
+        for place in places:
+            painted += 0 if place is None else abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
+    except ValueError:
+        return 1.0  # GDAL states the fault
+    return max(painted / cells, 1.0)
 
 
 # --- read ---------------------------------------------------------------------------------------------------

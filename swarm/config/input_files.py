@@ -41,6 +41,7 @@ class FileKind(Enum):
     ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)
     IMAGE = ("image", 8 * MAX_CELLS, TerrainError)
     SYSTEM = ("coordinate system", 1 << 16, TerrainError)
+    VIRTUAL_RASTER = ("raster", 4 << 20, TerrainError)
     VECTORS = ("zone", 1 << 30, TerrainError)
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)

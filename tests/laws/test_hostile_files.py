@@ -174,6 +174,7 @@ BOMBS: dict[str, Callable[[Path], Path]] = {
     "line": lambda p: sparse(p / "a.asc", b"ncols 10\nnrows 10\ncellsize 10\n", 1 << 30),
     "map": lambda p: sparse(p / "a.map", b"type octile\nheight 3\nwidth 4\nmap\n"),
     "yaml": lambda p: sparse(p / "a.yaml"),
+    "vrt": lambda p: sparse(p / "a.vrt", b"<VRTDataset"),
     "pixels": lambda p: raster(p / "a.tif", 200_000, 200_000, tiled=True, compress="deflate"),
     "one block": lambda p: raster(p / "a.tif", 16_000, 16_000, compress="deflate", blockysize=16_000),
 }
@@ -197,6 +198,34 @@ def test_a_member_that_nobody_asked_for_is_not_unpacked(tmp_path: Path, run: Run
     code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)
     assert code == 0, said
     assert peak_mb < MOST_MB
+
+
+def test_a_raster_that_names_others_reaches_nothing_on_the_network(tmp_path: Path, run: Run) -> None:
+    import http.server
+    import threading
+
+    asked: list[str] = []
+
+    class Ear(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+
+        def do_HEAD(self) -> None:
+            asked.append(self.path)
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Ear) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        path = tmp_path / "a.vrt"
+        path.write_text(
+            '<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:32632</SRS><GeoTransform>0,9,0,0,0,-9'
+            '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><SimpleSource><SourceFilename>/vsicurl/'
+            f"http://127.0.0.1:{server.server_address[1]}/x.tif</SourceFilename></SimpleSource></VRTRasterBand>"
+            "</VRTDataset>"
+        )
+        code, said, _ = run("terrain", "info", path)
+        server.shutdown()
+    assert code == 3, said
+    assert asked == []
 
 
 # --- flipped, cut, mixed -----------------------------------------------------------------------------------
