@@ -62,7 +62,6 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
         namespace=meeting.namespace,
         tls=meeting.tls(),
     )
-    chosen = options.with_follow(chosen, run.follow)
     chosen = msgspec.structs.replace(
         chosen,
         seconds=chosen.seconds if run.seconds is None else run.seconds,

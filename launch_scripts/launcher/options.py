@@ -29,7 +29,6 @@ from launch_scripts.process_table import (
 )
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.sources import FILE_KINDS, is_terrain
-from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, explain, nearest
 from swarm.config.ground import TerrainConfig
@@ -151,20 +150,6 @@ def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
         check_bytes(own, FileKind.CERTIFICATE)
         files.append(str(own))
     return TlsConfig(ca=tls.ca, certificate=files[0], key=files[1])
-
-
-def with_follow(scenario: Scenario, followed: str | None) -> Scenario:
-    """The scenario whose camera follows this vehicle or target; None: the one that it says itself. Raises
-    ConfigError where there is none of that name."""
-    name = followed or scenario.monitor.follow
-    vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
-    targets = scenario.target_ids
-    if name is not None and name not in vehicles and name not in targets:
-        known = [f"{ids[0]} to {ids[-1]}" if len(ids) > 1 else ids[0] for ids in (targets, vehicles) if ids]
-        option = "--follow" if followed else "monitor.follow"
-        hint = nearest(name, [*targets, *vehicles])
-        raise ConfigError(f"{option}: no vehicle or target {name!r}{hint}; there are {' and '.join(known)}")
-    return msgspec.structs.replace(scenario, monitor=msgspec.structs.replace(scenario.monitor, follow=name))
 
 
 def with_port(scenario: Scenario, port: int) -> Scenario:
