@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import importlib
 import inspect
 import os
 import pkgutil
@@ -26,7 +25,7 @@ from dataclasses import fields, is_dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -192,16 +191,6 @@ def complete_runs(ctx: typer.Context, incomplete: str) -> list[str]:
     with contextlib.suppress(OSError):
         names |= {each.name for each in Path(ctx.params.get("runs") or "runs").iterdir() if each.is_dir()}
     return [name for name in sorted(names, reverse=True) if name.startswith(incomplete)]
-
-
-def complete_words(module: str, name: str) -> Callable[[typer.Context, str], list[str]]:
-    """The words of a constant: a sequence, a mapping or a `Literal`. Its module is imported on the Tab key."""
-
-    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
-        known: Any = getattr(importlib.import_module(module), name)
-        return [str(word) for word in get_args(known) or tuple(known) if str(word).startswith(incomplete)]
-
-    return offered
 
 
 def _files_of(incomplete: str) -> Iterator[str]:

@@ -21,7 +21,7 @@ from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.explain import nearest
-from swarm.config.input_files import FileKind, check_file
+from swarm.config.input_files import FileKind, check_file, quoted
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
@@ -90,8 +90,8 @@ def places_counted(scenario: Scenario) -> Iterator[Finding]:
 
 
 def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
-    """Yields faults of the monitor's ports, and of certificates that are missing or not signed by the same
-    authority.
+    """Yields faults of the monitor's ports and camera, and of certificates that are missing or not signed by the
+    same authority.
 
     whole  True if all processes run on this machine. Otherwise processes of other machines need no certificate
            here.
@@ -99,6 +99,11 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
     net, view = scenario.network, scenario.monitor
     if view.live and view.grpc_port == view.web_port != 0:
         yield failure("monitor.web_port", f"found {view.web_port}, which is monitor.grpc_port too; choose another")
+    if view.follow is not None:
+        known = [*scenario.target_ids, *(id for plan in plan_agents(scenario) for id in plan.vehicle_ids)]
+        if view.follow not in known:
+            near = nearest(view.follow, known)
+            yield failure("monitor.follow", f"found {quoted(view.follow)}, expected a vehicle or target{near}")
     if net.tls is not None:
         yield from _certificates(scenario, net.tls, whole)
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import ORDER, command, complete_words, family_app
-from launch_scripts.commands.shared_options import AsJson, Walk, Where
+from launch_scripts.command_line import ORDER, command, family_app
+from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.plain_text import unanswered
 from swarm.config.explain import choice, explain
 from swarm.errors import ConfigError
@@ -28,9 +28,7 @@ app = family_app("Pause a running swarm, change its settings, zones, targets and
 short = typer.Typer()
 """The commands which are also called without their family."""
 target_app = family_app("Add, move and remove simulated targets while the swarm runs.")
-Key = Annotated[
-    str, typer.Argument(metavar="KEY", autocompletion=complete_words("swarm.runtime.order_book", "SETTINGS"))
-]
+Key = Annotated[str, typer.Argument(metavar="KEY")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
@@ -150,7 +148,7 @@ def add(
     id: Id,
     at: At,
     where: Where,
-    walk: Walk = "waypoints",
+    walk: str = "waypoints",
     speed: float = 4.0,
     as_json: AsJson = False,
 ) -> int:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.command_line import command, complete_runs, complete_words, family_app
+from launch_scripts.command_line import command, complete_runs, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
 from launch_scripts.launcher.console import REPORTED, progress
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
@@ -107,13 +107,8 @@ def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
 @command(app)
 def export(
     run: RunArgument = "LAST",
-    what: Annotated[
-        list[str] | None,
-        typer.Option(autocompletion=complete_words("launch_scripts.report.run_layers", "WHAT")),
-    ] = None,
-    format: Annotated[
-        str | None, typer.Option(autocompletion=complete_words("launch_scripts.report.run_layers", "ENDINGS"))
-    ] = None,
+    what: list[str] | None = None,
+    format: str | None = None,
     out: Path | None = None,
     force: bool = False,
     runs: Runs = Path("runs"),

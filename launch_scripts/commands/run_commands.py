@@ -62,7 +62,6 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
         namespace=meeting.namespace,
         tls=meeting.tls(),
     )
-    chosen = options.with_follow(chosen, run.follow)
     chosen = msgspec.structs.replace(
         chosen,
         seconds=chosen.seconds if run.seconds is None else run.seconds,
@@ -81,7 +80,6 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
             plain=run.plain,
             metrics_port=run.metrics_port,
             signals_address=run.signals_address,
-            log_format=run.log_format,
             began_s=_began_s(),
             record_inputs=run.record_inputs,
             takes_over=part.take_over,

@@ -17,7 +17,6 @@ from launch_scripts.commands.shared_options import (
     Runs,
     ScenarioArgument,
     Seconds,
-    Walk,
 )
 from swarm.errors import ConfigError
 from swarm.files import write_file
@@ -51,7 +50,7 @@ class Choices:
     preset: PresetOption = None
     vehicles: Annotated[int, typer.Option(min=1, max=100_000)] = 20
     targets: Annotated[int, typer.Option(min=1, max=1000)] = 3
-    walk: Walk = "waypoints"
+    walk: str = "waypoints"
     seconds: Seconds = 60.0
 
 

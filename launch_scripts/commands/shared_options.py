@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import msgspec
 import typer
@@ -20,7 +20,6 @@ from launch_scripts.command_line import (
     PART,
     complete_runs,
     complete_scenarios,
-    complete_words,
     from_environment,
 )
 from swarm.config.input_files import FileKind, read_text
@@ -42,7 +41,6 @@ HIGHEST_PORT = 65535
 Seconds = Annotated[float | None, typer.Option(min=0.1, max=MOST_SECONDS)]
 Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
 VehicleClass = Annotated[str, typer.Option("--class")]
-Walk = Annotated[str | None, typer.Option(autocompletion=complete_words("swarm.config.setting_types", "Walk"))]
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
@@ -69,7 +67,6 @@ PresetOption = Annotated[
     str | None,
     typer.Option(
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
-        autocompletion=complete_words("swarm.config.setting_types", "Preset"),
     ),
 ]
 SignalsAddress = Annotated[
@@ -77,14 +74,6 @@ SignalsAddress = Annotated[
     typer.Option(
         metavar="ADDRESS",
         help="Address of the port of figures and health; 0.0.0.0 for other machines.",
-    ),
-]
-LogFormatOption = Annotated[
-    Literal["text", "json"],
-    from_environment(
-        "SWARM_LOG_FORMAT",
-        metavar="FORMAT",
-        help="Logs as text, or as json: one object a line, for programs.",
     ),
 ]
 Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
@@ -121,7 +110,6 @@ class RunOptions:
     no_live        Serve no live view. The run is recorded all the same.
     record_inputs  Record what every process hears, so that `swarm runs replay` can repeat it.
     metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
-    follow         The camera follows this vehicle or target, as a0-07.
     plain          Plain lines instead of the live table.
     detach         Run in the background: return once the swarm is whole. `swarm down` ends it.
     """
@@ -135,8 +123,6 @@ class RunOptions:
     record_inputs: bool = False
     metrics_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
     signals_address: SignalsAddress = "127.0.0.1"
-    log_format: LogFormatOption = "text"
-    follow: Annotated[str | None, typer.Option(metavar="ID")] = None
     plain: bool = False
     detach: Annotated[bool, typer.Option("--detach", "-d")] = False
     as_json: AsJson = False
@@ -169,7 +155,7 @@ class SomeProcesses:
     panel: ClassVar[str | None] = PART
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROLE[.ID]", autocompletion=complete_words("launch_scripts.process_table", "ROLES")),
+        typer.Option(metavar="ROLE[.ID]"),
     ] = None
     rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
     run_id: str | None = None

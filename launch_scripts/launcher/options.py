@@ -14,7 +14,6 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import (
@@ -29,7 +28,6 @@ from launch_scripts.process_table import (
 )
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.sources import FILE_KINDS, is_terrain
-from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, explain, nearest
 from swarm.config.ground import TerrainConfig
@@ -153,20 +151,6 @@ def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
     return TlsConfig(ca=tls.ca, certificate=files[0], key=files[1])
 
 
-def with_follow(scenario: Scenario, followed: str | None) -> Scenario:
-    """The scenario whose camera follows this vehicle or target; None: the one that it says itself. Raises
-    ConfigError where there is none of that name."""
-    name = followed or scenario.monitor.follow
-    vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
-    targets = scenario.target_ids
-    if name is not None and name not in vehicles and name not in targets:
-        known = [f"{ids[0]} to {ids[-1]}" if len(ids) > 1 else ids[0] for ids in (targets, vehicles) if ids]
-        option = "--follow" if followed else "monitor.follow"
-        hint = nearest(name, [*targets, *vehicles])
-        raise ConfigError(f"{option}: no vehicle or target {name!r}{hint}; there are {' and '.join(known)}")
-    return msgspec.structs.replace(scenario, monitor=msgspec.structs.replace(scenario.monitor, follow=name))
-
-
 def with_port(scenario: Scenario, port: int) -> Scenario:
     """Router on `port`, live view on the two after it; 0 picks three free ones."""
     ports = free_ports(3) if port == 0 else [port, port + 1, port + 2]
@@ -257,7 +241,6 @@ class UpOptions:
     began_s          time.monotonic() at which the command was given
     metrics_port     where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
-    log_format       of all logs of this machine
     record_inputs    of every process, for `swarm runs replay`
     takes_over       from the launcher that runs this part of the run here
     stays_watched    goes on beyond the scenario's seconds while a viewer is connected
@@ -276,7 +259,6 @@ class UpOptions:
     takes_over: bool = False
     stays_watched: bool = False
     signals_address: str = LOOPBACK
-    log_format: LogFormat = "text"
 
     @property
     def roles(self) -> tuple[str, ...]:

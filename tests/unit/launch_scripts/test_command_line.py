@@ -20,7 +20,6 @@ from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
-from swarm.config.setting_types import Walk
 
 
 def offered(*words: str) -> list[str]:
@@ -117,19 +116,12 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("check", "m") == ["mine.toml", "maps/"] or offered("check", "m") == ["maps/", "mine.toml"]
     assert offered("simulate", "maps/a") == ["maps/alps.toml"]
     assert offered("simulate", "ma") == ["maps/"]
-    assert offered("up", "jacksboro", "--only", "p") == ["planner", "places"]
     assert offered("runs", "compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
     assert "LAST" in offered("runs", "compare", "")
     monkeypatch.chdir(newest_run / "maps")
     assert offered("down", "20260101") == ["20260101-000000-aaaa"], "from any folder"
     monkeypatch.chdir(newest_run)
     assert offered("runs", "export", "L") == ["LAST"]
-    assert offered("new", "x.toml", "--walk", "w") == ["waypoints"]
-    assert offered("new", "x.toml", "--preset", "h") == ["hiker"]
-    assert set(offered("order", "target", "add", "x", "--walk", "")) >= set(Walk.__args__[:4])
-    assert offered("order", "set", "pl") == ["planner.cpu_budget", "planner.push_s"]
-    assert offered("runs", "export", "LAST", "--what", "ma") == ["marks"]
-    assert offered("runs", "export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
 
 
 def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

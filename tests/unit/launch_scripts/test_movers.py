@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch_scripts.launcher.options import with_follow
+from launch_scripts.check.scenario_check import network
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.movers_view import (
     OVER_S,
@@ -41,7 +42,6 @@ from launch_scripts.plain_text import Duration
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
-from swarm.errors import ConfigError
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import Believed
@@ -292,17 +292,12 @@ def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
     assert cells_at(grid, east_m, south_m).tolist() == [2 * 20 + 1, 9 * 20]
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"), [("a0-99", "; did you mean 'a0-"), ("t3x", "; did you mean 't"), ("\x1b[31m", "; there are")]
-)
-def test_whom_nobody_knows_the_camera_cannot_follow(name: str, hint: str) -> None:
-    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[[groups]]\nvehicles = 40\n')
-    with pytest.raises(ConfigError) as refused:
-        with_follow(scenario, name)
-    sentence = str(refused.value)
-    assert sentence.startswith(f"--follow: no vehicle or target {name!r}")
-    assert hint in sentence
-    assert sentence.endswith("; there are t0 to t4 and a0-00 to a1-14")
+@pytest.mark.parametrize("name", ["a0-99", "t3x", "\x1b[31m", "a0-07", "t3"])
+def test_whom_nobody_knows_the_camera_cannot_follow(name: str) -> None:
+    scenario = parse_scenario(f'[[targets]]\nname = "t"\ncount = 5\n[monitor]\nfollow = {json.dumps(name)}\n')
+    faults = [finding.sentence for finding in network(scenario)]
+    assert [fault.partition(": found")[0] for fault in faults] == ["monitor.follow"] * (name not in ("a0-07", "t3"))
+    assert all(fault.isprintable() for fault in faults)
 
 
 # --- how much and how often -----------------------------------------------------------------------------------
