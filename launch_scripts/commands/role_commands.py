@@ -15,6 +15,7 @@ import typer
 from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
+    LogFormatOption,
     Namespace,
     Rank,
     Runs,
@@ -54,6 +55,7 @@ class Place(Tls):
     runs: Runs = Path("runs")
     health_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
     signals_address: SignalsAddress = "127.0.0.1"
+    log_format: LogFormatOption = "text"
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def run_role(
     elif id not in (ids := [spec.id for spec in processes_of(scenario, (role,))]):
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     scenario = options.as_process(scenario, role, id if joins is None else f"{joins.group}.{id}")
-    log_to(None, Speaker(role, id, wanted_run or ""))
+    log_to(None, part.log_format, Speaker(role, id, wanted_run or ""))
     health = _health_of(f"{role}-{id}", part)
     health.starts("its router")
     found: list[RunInfo] = []
@@ -211,7 +213,7 @@ def run_role(
         check_vacant(found, role, id)
     run_id = wanted_run or next((info.run_id for info in found), None) or options.common_run_id(scenario)
     run_dir = options.make_run_dir(part.runs, run_id)
-    log_to(None, Speaker(role, id, run_id))
+    log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
     if not is_router:
         with progress() as tell:

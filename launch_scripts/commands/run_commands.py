@@ -80,6 +80,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
             plain=run.plain,
             metrics_port=run.metrics_port,
             signals_address=run.signals_address,
+            log_format=run.log_format,
             began_s=_began_s(),
             record_inputs=run.record_inputs,
             takes_over=part.take_over,

@@ -324,6 +324,6 @@ def _lines_of(file: Path, read: dict[int, int]) -> Iterator[_Line]:
                 return
             read[inode] += len(raw)
             text = raw.decode(errors="replace").rstrip()
-            with suppress(ValueError, OverflowError):
-                at_s = datetime.fromisoformat(text[:29]).timestamp()
+            with suppress(ValueError, OverflowError):  # text, or JSON
+                at_s = datetime.fromisoformat(text[:29] if text[:1] != "{" else text[10:34]).timestamp()
             yield at_s, file.name.partition(".log")[0], text

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import msgspec
 import typer
@@ -76,6 +76,14 @@ SignalsAddress = Annotated[
         help="Address of the port of figures and health; 0.0.0.0 for other machines.",
     ),
 ]
+LogFormatOption = Annotated[
+    Literal["text", "json"],
+    from_environment(
+        "SWARM_LOG_FORMAT",
+        metavar="FORMAT",
+        help="Logs as text, or as json: one object a line, for programs.",
+    ),
+]
 Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 
 
@@ -123,6 +131,7 @@ class RunOptions:
     record_inputs: bool = False
     metrics_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
     signals_address: SignalsAddress = "127.0.0.1"
+    log_format: LogFormatOption = "text"
     plain: bool = False
     detach: Annotated[bool, typer.Option("--detach", "-d")] = False
     as_json: AsJson = False

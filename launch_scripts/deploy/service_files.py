@@ -117,7 +117,7 @@ def _words(process: PlannedProcess, run_id: str) -> list[str]:
         "monitor": [],
     }.get(process.role, ["--id", process.id])
     run = [] if process.role == ROUTER else ["--run-id", run_id]
-    told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1"]
+    told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]
     return ["role", process.role, f"/etc/swarm/{_SCENARIO}", *which, *run, "--runs", "/var/lib/swarm/runs", *told]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from launch_scripts.launcher.log_file import Speaker, log_to
+from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.parent_death import end_with_parent
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
@@ -51,18 +51,20 @@ class Reports:
     """Channels from a process to its launcher.
 
     log_path     its log
+    log_format   of the log
     health       memory of a `Board`, which the launcher reads
     exit_reason  its last word, an `ExitReason`
     """
 
     log_path: Path
+    log_format: LogFormat
     health: Any
     exit_reason: Connection
 
 
 def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     """Runs a role until it receives a stop signal. Ends the process with the role's exit code."""
-    _redirect(reports.log_path, setup)
+    _redirect(reports.log_path, reports.log_format, setup)
     setup = replace(setup, health=Health(Board(reports.health)))
     pipe = reports.exit_reason
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
@@ -121,14 +123,14 @@ def _watch_launcher() -> None:
     threading.Thread(target=watch, name="launcher-watch", daemon=True).start()
 
 
-def _redirect(log_path: Path, setup: RoleSetup) -> None:
+def _redirect(log_path: Path, log_format: LogFormat, setup: RoleSetup) -> None:
     """Sends all output of this process, that of native libraries included, to its log file: once that can be
     opened, for a full disk must not keep a process from its start."""
     sys.stdout.flush()
     sys.stderr.flush()
     discard_output(1, 2)
     faulthandler.enable()
-    log_to(log_path, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
+    log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
 
 
 def _leave(code: int) -> None:

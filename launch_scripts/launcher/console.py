@@ -70,18 +70,25 @@ REPORTED = {
 
 
 class Terminal:
-    """Shows the progress of a run. With `as_json`, standard output stays free for the report."""
+    """Shows the progress of a run. With `as_json`, standard output stays free for the report.
 
-    def __init__(self, as_json: bool, plain: bool) -> None:
+    lines  format of the lines that programs read instead of people; None: people read them
+    """
+
+    def __init__(self, as_json: bool, plain: bool, lines: logging.Formatter | None = None) -> None:
         make_output_outlive_readers()
         self._console = Console(stderr=as_json, highlight=False)
-        self._table = self._console.is_terminal and not plain
+        self._lines = lines
+        self._table = self._console.is_terminal and not plain and lines is None
         self._live: Live | None = None
         self._due_s = 0.0
 
     def say(self, text: str, style: str | None = None) -> None:
         """Prints one line, above the table if there is one, and logs it."""
-        log.log(_LEVELS.get(style or "", logging.INFO), "%s", text)
+        level = _LEVELS.get(style or "", logging.INFO)
+        log.log(level, "%s", text)
+        if self._lines is not None:
+            text, style = self._lines.format(logging.LogRecord(__name__, level, "", 0, "%s", (text,), None)), None
         self.print(Text(plain(text), style=style or ""))
 
     def print(self, what: Any) -> None:
@@ -129,6 +136,8 @@ class Terminal:
         from launch_scripts.observe.summed_counts import gap_text  # not before there is a report
 
         self.say(numbers["verdict"], "green" if WELL in numbers["verdict"] else "yellow")
+        if self._lines is not None:
+            return
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
             if name in REPORTED and _counts(value):

@@ -19,6 +19,7 @@ from typing import Any
 from launch_scripts.launcher.child_process import ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
+from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
@@ -159,12 +160,14 @@ class LocalSwarm:
         specs: Iterable[ProcessSpec],
         setup_of: Callable[[ProcessSpec], RoleSetup],
         log_dir: Path,
+        log_format: LogFormat = "text",
     ) -> None:
         self.running = [Running(spec) for spec in specs]
         self.cut_short: list[str] = []
         """Names of processes that were killed because the end was asked for twice."""
         self._setup_of = setup_of
         self._log_dir = log_dir
+        self._log_format = log_format
         self._looked_s = 0.0
         self._idle = IdleTime()
         self._context = multiprocessing.get_context("forkserver")
@@ -315,7 +318,7 @@ class LocalSwarm:
         if running.health is None:
             running.health = self._context.RawArray(ctypes.c_char, BOARD_BYTES)
         running.health[:] = bytes(BOARD_BYTES)  # of the generation before
-        reports = Reports(self._log_dir / f"{spec.name}.log", running.health, tell)
+        reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         first = not restarts
         setup = replace(
             setup, restarts=restarts, anew=setup.anew and first, takes_over=running.takes_over and first

@@ -1,18 +1,21 @@
-"""Logs of bounded size, with dates, which a full disk cannot harm."""
+"""Logs of bounded size, with dates, as text or JSON, which a full disk cannot harm."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import sys
-from datetime import datetime
+from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from launch_scripts.plain_text import plain
+
+LogFormat = Literal["text", "json"]
 
 MAX_BYTES = 16 << 20
 """A longer log is renamed to NAME.1, in the place of the previous one, and begun again."""
@@ -45,6 +48,31 @@ class Speaker(NamedTuple):
     role: str
     id: str
     run: str
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line, in ASCII: no text of a file or of the network begins a line of its own, or is obeyed
+    by a terminal. Fields are `time` (RFC 3339, UTC), `level`, `role`, `id`, `run`, `logger`, `message`, and
+    `exception`, a traceback, where there is one."""
+
+    def __init__(self, speaker: Speaker | None = None) -> None:
+        super().__init__()
+        self._speaker = {} if speaker is None else speaker._asdict()
+
+    def format(self, record: logging.LogRecord) -> str:
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        told = {
+            "time": time.replace("+00:00", "Z"),
+            "level": record.levelname.lower(),
+            **self._speaker,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            told["exception"] = self.formatException(record.exc_info)
+        if record.stack_info:
+            told["stack"] = record.stack_info
+        return json.dumps(told)
 
 
 class LogFile(RotatingFileHandler):
@@ -82,7 +110,9 @@ class LogFile(RotatingFileHandler):
             super().handleError(record)
 
 
-def log_to(path: Path | None, speaker: Speaker | None = None, *, takes_output: bool = False) -> None:
+def log_to(
+    path: Path | None, format: LogFormat = "text", speaker: Speaker | None = None, *, takes_output: bool = False
+) -> None:
     """Logs to a file, or to standard error if there is none.
 
     speaker  process that writes the log, if known. Also sets the title of this process, as the system's `ps` and
@@ -94,5 +124,5 @@ def log_to(path: Path | None, speaker: Speaker | None = None, *, takes_output: b
 
             setproctitle(f"swarm: {speaker.role} {speaker.id} (run {speaker.run})")
     handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
-    handler.setFormatter(FORMAT)
+    handler.setFormatter(JsonLines(speaker) if format == "json" else FORMAT)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

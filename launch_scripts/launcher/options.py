@@ -14,6 +14,7 @@ from pathlib import Path
 
 import msgspec
 
+from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import (
@@ -241,6 +242,7 @@ class UpOptions:
     began_s          time.monotonic() at which the command was given
     metrics_port     where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
+    log_format       of all logs of this machine
     record_inputs    of every process, for `swarm runs replay`
     takes_over       from the launcher that runs this part of the run here
     stays_watched    goes on beyond the scenario's seconds while a viewer is connected
@@ -259,6 +261,7 @@ class UpOptions:
     takes_over: bool = False
     stays_watched: bool = False
     signals_address: str = LOOPBACK
+    log_format: LogFormat = "text"
 
     @property
     def roles(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
-from launch_scripts.launcher.log_file import Speaker, log_to
+from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.options import (
     UpOptions,
     as_process,
@@ -84,7 +84,7 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    log_to(run_dir / LAUNCHER_LOG, Speaker(LAUNCHER, "0", run_id))
+    log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
@@ -100,7 +100,7 @@ def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
     the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
     if options.joins or options.takes_over:
-        log_to(None)  # it may have to wait, and says so
+        log_to(None, options.log_format)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
     run_id = options.run_id
     if run_id is None and options.is_whole and not options.takes_over:
@@ -123,10 +123,11 @@ class _Run:
         self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
         """Orders in force, once the swarm is watched."""
-        self._terminal = Terminal(options.as_json, options.plain)
+        lines = JsonLines(Speaker(LAUNCHER, "0", run_id)) if options.log_format == "json" else None
+        self._terminal = Terminal(options.as_json, options.plain, lines)
         self._stop_asked = StopAsked()
         self._preparing = "preparing the terrain"
-        self._swarm = LocalSwarm(options.table, self._setup_of, run_dir)
+        self._swarm = LocalSwarm(options.table, self._setup_of, run_dir, options.log_format)
         self._disk = DiskWatch(run_dir)
         self.begun = False
         """True if everything that can be refused before a process starts has been accepted."""

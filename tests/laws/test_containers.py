@@ -76,8 +76,8 @@ def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> 
 def takes(words: list[str], address: str) -> bool:
     """The command line has a role which takes the words of a container."""
     taken = command().commands["role"].commands[words[1]].make_context(words[1], words[2:]).params
-    given = [taken[name] for name in ("health_port", "signals_address", "scenario")]
-    return given == [HEALTH_PORT, address, "/etc/swarm/scenario.toml"]
+    given = [taken[name] for name in ("health_port", "signals_address", "log_format", "scenario")]
+    return given == [HEALTH_PORT, address, "json", "/etc/swarm/scenario.toml"]
 
 
 def test_the_example_lets_pods_reach_routers_and_a_node_be_emptied() -> None:

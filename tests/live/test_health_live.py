@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
 from pathlib import Path
@@ -27,7 +28,7 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
     manager.settimeout(60)
     with manager:
         monkeypatch.setenv("NOTIFY_SOCKET", manager.getsockname())
-        keeper = hands.start("role", "keeper", str(hands.path), "--health-port", str(port))
+        keeper = hands.start("role", "keeper", str(hands.path), "--health-port", str(port), "--log-format", "json")
         monkeypatch.delenv("NOTIFY_SOCKET")
         assert manager.recv(100) == b"STATUS=its start"
 
@@ -54,4 +55,6 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
         keeper.send_signal(signal.SIGINT)
         assert keeper.wait(60) == 0, hands.logs()
     [log] = hands.folder.glob("role-keeper*.log")
-    assert "keeper started" in log.read_text()
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert {(line["role"], line["id"]) for line in lines} == {("keeper", "0")}
+    assert any("keeper started" in line["message"] for line in lines)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import re
 import subprocess
@@ -15,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from launch_scripts.launcher.console import Terminal
-from launch_scripts.launcher.log_file import FORMAT
+from launch_scripts.launcher.log_file import FORMAT, JsonLines, Speaker
 from launch_scripts.observe.run_folder import DiskWatch
 
 WRITER = """
@@ -87,6 +88,28 @@ def test_a_log_that_cannot_be_opened_is_opened_as_soon_as_it_can(tmp_path: Path)
     text = (tmp_path / "later" / "a.log").read_text()
     assert "kept" in text
     assert "1 lines were lost" in text
+
+
+@given(st.text(), st.text(max_size=20), st.text(max_size=20))
+def test_a_line_of_json_is_one_line_that_no_terminal_obeys_whatever_is_logged(text: str, id: str, run: str) -> None:
+    try:
+        raise ValueError(text)
+    except ValueError:
+        record = logging.LogRecord("a.b", logging.WARNING, "", 0, "heard %s", (text,), sys.exc_info())
+    line = JsonLines(Speaker("agent", id, run)).format(record)
+    assert line.isascii()
+    assert line.isprintable()
+    told = json.loads(line)
+    assert told.pop("exception").startswith("Traceback (most recent call last):\n")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", told.pop("time"))
+    assert told == {
+        "level": "warning",
+        "role": "agent",
+        "id": id,
+        "run": run,
+        "logger": "a.b",
+        "message": f"heard {text}",
+    }
 
 
 @given(st.text(), st.text(max_size=30))
