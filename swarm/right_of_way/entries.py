@@ -31,8 +31,9 @@ from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
 
 _MOST_HEARD = 1 << 13
 """Entries of others that are remembered as over; each is told again until a table lists it no more."""
-_MOST_DISCLAIMED = 1 << 10
-"""Entries of a shard: more than tables that lost can have granted to a host."""
+_MOST_DISCLAIMED = 1 << 8
+"""Entries of a shard that one member may ask for: more than tables that lost can have granted to a host, and a liar
+fills no other member's share."""
 BEFORE_ALL: Stamp = (0, 0)
 
 
@@ -46,8 +47,9 @@ class HostEntries:
     away        vehicles that have left in this generation: they take no entry
     paths       vehicle -> its entries in driving order, its own cell first
     placed      vehicles that are on the first cell of their paths; the others are nowhere
+    listed      shard -> vehicle -> its entries in the table acted on
     over        shard -> numbers that this generation has left, given back or passed over, and its table still lists
-    disclaimed  shard -> numbers later than `knows` that we never take, by our word to members
+    disclaimed  shard -> member -> numbers later than `knows` that we never take, by our word to this member
     heard       (number, host) of which that host has said that it is over; entries of paths know it
     knows       shard -> the newest table acted on
     """
@@ -59,8 +61,9 @@ class HostEntries:
     away: set[str] = field(default_factory=set)
     paths: dict[str, list[Entry]] = field(default_factory=dict)
     placed: set[str] = field(default_factory=set)
+    listed: dict[int, dict[str, list[Number]]] = field(default_factory=dict)
     over: dict[int, set[Number]] = field(default_factory=dict)
-    disclaimed: dict[int, set[Number]] = field(default_factory=dict)
+    disclaimed: dict[int, dict[str, set[Number]]] = field(default_factory=dict)
     heard: dict[tuple[Number, str], None] = field(default_factory=dict)
     knows: dict[int, Stamp] = field(default_factory=dict)
 
@@ -88,15 +91,20 @@ class HostEntries:
     def hear_granted(
         self, shard: int, stamp: Stamp, generation: int, grants: Mapping[str, Sequence[Entry]]
     ) -> set[str]:
-        """A usable table of a shard names these entries of our vehicles. Returns the vehicles of which the path has
-        other entries now."""
+        """A usable table of a shard names these entries of the vehicles of which it names others than the table
+        before it. Returns the vehicles of which the path has other entries now."""
         known = self.knows.get(shard, BEFORE_ALL)
         if generation != self.generation or stamp <= known:
             return set()
         self.knows[shard] = stamp
         over = self.over.setdefault(shard, set())
-        over.intersection_update(entry.number for entries in grants.values() for entry in entries)
-        no_more = self.disclaimed.get(shard, set())
+        listed = self.listed.setdefault(shard, {})
+        for vehicle, entries in grants.items():
+            numbers = [entry.number for entry in entries]
+            over.difference_update(set(listed.pop(vehicle, ())).difference(numbers))
+            if numbers:
+                listed[vehicle] = numbers
+        no_more = self.never(shard)
         longer = set()
         for vehicle, entries in grants.items():
             path = self.paths.get(vehicle, [])
@@ -176,12 +184,20 @@ class HostEntries:
             found.setdefault(self.shard_of(entry.cell), []).append(entry.number)
         return found
 
-    def disclaim(self, shard: int, numbers: Iterable[Number]) -> None:
+    def disclaim(self, shard: int, member: str, newest: Stamp, numbers: Iterable[Number]) -> None:
         """Takes none of these numbers that we do not hold. The entries of the run's start are ours until a table
-        says otherwise."""
+        says otherwise.
+
+        newest  the table on the member's file: it lacks no later entry
+        """
         knows = self.knows.get(shard, BEFORE_ALL)
         held = {entry.number for path in self.paths.values() for entry in path}
-        kept = {number for number in self.disclaimed.get(shard, ()) if number[1:] > knows}
+        by_member = self.disclaimed.setdefault(shard, {})
+        kept = {number for number in by_member.get(member, ()) if number[1:] > knows}
         asked = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
-        new = [number for number in asked if number[1] and number[1:] > knows]
-        self.disclaimed[shard] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
+        new = [number for number in asked if number[1] and knows < number[1:] <= newest]
+        by_member[member] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
+
+    def never(self, shard: int) -> set[Number]:
+        """Returns the numbers of a shard which are not held and never taken."""
+        return set[Number]().union(*self.disclaimed.get(shard, {}).values())

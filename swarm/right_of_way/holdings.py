@@ -11,9 +11,9 @@ from itertools import chain, takewhile
 import msgspec
 
 from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
-from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
+from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Left, Number, Stand, Word
+from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
 """A host that has not heard a shard's leader for so long speaks to all members of the shard."""
@@ -42,10 +42,10 @@ _NO_WISH = Wish()
 _NO_STANDS: Mapping[str, _Told] = {}
 
 
-def part_of(generation: int, grants: Mapping[str, Sequence[Entry]]) -> int:
+def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Sequence[Entry]]) -> int:
     """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and a thief
     of a name has a fraction of a second to find other grants with the same digest."""
-    said = msgspec.msgpack.encode((generation, sorted(grants.items())))
+    said = msgspec.msgpack.encode((generation, sorted(grants.items()), sorted(waits.items())))
     return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
 
 
@@ -63,7 +63,7 @@ class _View:
 
     leader    of the last grant, and the time when that was received
     heard     the newest host state of ours that the table in use takes into account
-    seen      vehicle -> its entries in the table in use
+    seen      vehicle -> its entries in the table in use, and `waits` those of them that wait there
     followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
     left      other host -> those of these that are over, as we told it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
@@ -79,7 +79,8 @@ class _View:
     leader: str = ""
     heard_ns: int = 0
     heard: int = 0
-    seen: dict[str, list[Number]] = field(default_factory=dict)
+    seen: dict[str, Held] = field(default_factory=dict)
+    waits: dict[str, list[Entry]] = field(default_factory=dict)
     followed: dict[str, list[Number]] = field(default_factory=dict)
     left: dict[str, tuple[list[Number], int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
@@ -295,20 +296,21 @@ class Holdings:
         view.leader, view.heard_ns = granted.agent, now_ns
         if not self._shards.proven:
             return self._take(view, granted)
-        part = part_of(granted.generation, granted.grants)
+        part = part_of(granted.generation, granted.grants, granted.waits)
         view.words[granted.agent] = granted.epoch, part
         view.pending[granted.agent] = granted, part
         return self._take_agreed(view)
 
     def hear_word(self, word: Word) -> list[str]:
         """A member has something on file for us. Returns the vehicles that have found their place."""
-        if word.agent not in self._shards.members(word.shard):
+        knows = self._entries.knows.get(word.shard, BEFORE_ALL)
+        if word.agent not in self._shards.members(word.shard) or word.epoch > knows[0] + FURTHEST_EPOCH:
             return []
         view = self._views.setdefault(word.shard, _View())
         view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.shard])
-            self._entries.disclaim(word.shard, word.lacks)
+            self._entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), word.lacks)
             view.same, view.told = False, None
         return self._take_agreed(view)
 
@@ -337,19 +339,23 @@ class Holdings:
         view.others = frozenset(granted.occupied)
         view.followed = granted.followed
         self._pushed = None
-        ours = {
-            id: entries
-            for id, entries in granted.grants.items()
+        shard, seen, waits = granted.shard, view.seen, view.waits
+        view.waits = granted.waits
+        view.seen = {
+            id: held
+            for id, held in granted.grants.items()
             if (self._vehicles is None or id in self._vehicles)
-            and {self._shard_of(entry.cell) for entry in entries} == {granted.shard}
+            and (seen.get(id) == held or {*map(self._shard_of, held.cells)} == {shard})
         }
-        before, view.seen = view.seen, {id: [entry.number for entry in entries] for id, entries in ours.items()}
-        changed = self._entries.hear_granted(granted.shard, granted.stamp, granted.generation, ours)
-        self._seen_anew.update(changed, [id for id in before if before[id] != view.seen.get(id)])
+        other = {id for id in seen.keys() | view.seen if seen.get(id) != view.seen.get(id)}
+        other |= {id for id in waits.keys() | view.waits if waits.get(id) != view.waits.get(id)}
+        listed = {id: entries_of(view.seen.get(id, ()), view.waits.get(id, ())) for id in other}
+        changed = self._entries.hear_granted(shard, granted.stamp, granted.generation, listed)
+        self._seen_anew |= other
         for vehicle in changed & self._paths.keys():
             self._set_path(vehicle)
         self._followed = {number for view in self._views.values() for number in chain(*view.followed.values())}
-        for vehicle in ours.keys() & self._paths.keys() if granted.followed else ():
+        for vehicle in view.seen.keys() & self._paths.keys() if granted.followed else ():
             far = [entry.number for entry in self._entries.paths[vehicle][self.keeps + 1 :]]
             if not self._followed.isdisjoint(far):
                 self.give_back(vehicle, self.keeps + 1 + [number in self._followed for number in far].index(True))
@@ -384,13 +390,13 @@ class Holdings:
         for vehicle, cell in entries.bodies.items():
             if vehicle not in entries.paths:
                 self._say_entering(
-                    by_shard, self._shards.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
+                    by_shard, self._shards.of(cell), Stand(vehicle, cell, cell, Held(), [cell], [], 0, 0)
                 )
         for vehicle, path in entries.paths.items():
             if vehicle not in self._paths:
                 cell, end = path[0].cell, path[-1].cell
                 for shard, held in entries.of(vehicle).items():
-                    self._say_entering(by_shard, shard, Stand(vehicle, cell, end, held, [], [cell], 1, 0))
+                    self._say_entering(by_shard, shard, Stand(vehicle, cell, end, Held.of(held), [], [cell], 1, 0))
         self._forget_left(by_shard)
         return [
             Tell(self._listeners(shard, now_ns), self._standing(shard, [stand for stand, _ in stands.values()]))
@@ -413,7 +419,7 @@ class Holdings:
                     continue
                 told, told_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
-                if left and (left != told or not 0 <= now_ns - told_ns < HEARTBEAT_NS):
+                if left and not is_said(left, told, now_ns - told_ns):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
@@ -466,7 +472,7 @@ class Holdings:
             vehicles=stands,
             dead=self._dead,
             ended=self.replaced,
-            never=sorted(self._entries.disclaimed.get(shard, ())),
+            never=sorted(self._entries.never(shard)),
         )
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
@@ -503,7 +509,7 @@ class Holdings:
         stands: dict[int, _Told] = {}
         held = [entry.number for entry in self._entries.paths[vehicle]]
         for shard in near:
-            holds = held if len(near) == 1 else [number for number in held if shard_of(number[0]) == shard]
+            holds = Held.of([number for number in held if len(near) == 1 or shard_of(number[0]) == shard])
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms, self.keeps)
             stands[shard] = stand, (vehicle, path[0], holds, ahead, better)
         return _Said(wish, path, held, stands)

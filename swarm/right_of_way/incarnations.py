@@ -13,12 +13,18 @@ from swarm.journal import Journal
 
 HEARTBEAT_NS = NS_PER_S // 5
 """Period at which an unchanged statement is repeated: by it members know of a leader, and a leader of its hosts."""
+
 FURTHEST_EPOCH = 3 << 20
 """No run advances by this number of epochs while one process does not receive them."""
 _GENERATION_BITS = 32
 """Bits of chance in a generation's number, by which two that begin at once differ."""
 _FURTHEST_GENERATION = 1 << 16
 """Restarts of a host beyond the known number, which no host reaches in a run."""
+
+
+def is_said(says: object, told: object, age_ns: int, again_ns: int = HEARTBEAT_NS) -> bool:
+    """Returns True if the same was told a time ago after which it need not be repeated."""
+    return says == told and 0 <= age_ns < again_ns
 
 
 def first_generation(after: int, chance: int) -> int:

@@ -14,7 +14,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import Entry, Fence, Granted, HostState, Left, Stored, Table
+from swarm.wire.messages.traffic import Entry, Fence, Granted, Held, HostState, Left, Stored, Table
 from swarm.wire.topics import GRANTED, HOST_STATE, LEFT, STORED, TABLE
 from vehicle_agent.service import AgentService
 
@@ -37,7 +37,7 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
             )
         case Table():
             later = {agent: (generation + leap, seq + abs(leap)) for agent, (generation, seq) in said.hosts.items()}
-            anywhere = {"a0-00": [(chance.randrange(cells), 0, 1) for _ in range(5)]}
+            anywhere = {"a0-00": Held.of([(chance.randrange(cells), 0, 1) for _ in range(5)])}
             return chance.choice(
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),
@@ -49,13 +49,15 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
             )
         case Granted():
             somewhere = [Entry((chance.randrange(cells), 0, 1), [(0, 1, "a1-00")]) for _ in range(5)]
+            held = Held.of([entry.number for entry in somewhere])
+            grants, waits = dict.fromkeys(said.grants, held), dict.fromkeys(said.grants, somewhere)
             return chance.choice(
                 (
                     replace(said, epoch=said.epoch + 3 * abs(leap)),
                     replace(said, seq=said.seq + abs(leap)),
                     replace(said, seq=said.seq + 1, generation=said.generation + leap),
                     replace(said, seq=said.seq + 1, heard=said.heard + abs(leap), grants={}),
-                    replace(said, seq=said.seq + 1, grants=dict.fromkeys(said.grants, somewhere)),
+                    replace(said, seq=said.seq + 1, grants=grants, waits=waits),
                 )
             )
         case Left():

@@ -23,7 +23,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.incarnations import GenerationFile
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order
-from swarm.wire.messages.traffic import Table
+from swarm.wire.messages.traffic import Held, Table
 from vehicle_agent.promise_store import FilePromiseStore
 
 COMMITS = 12
@@ -75,7 +75,7 @@ def read_marks(path: Path) -> Parts:
 
 def commit_promises(path: Path, number: int) -> None:
     store = FilePromiseStore(path)
-    grants = {f"a1-{k:02d}": [(1000 * number + k, number, k)] for k in range(8)}
+    grants = {f"a1-{k:02d}": Held.of([(1000 * number + k, number, k)]) for k in range(8)}
     for seq in range(3):
         store.save(number, Table(shard=seq, agent="a1", epoch=number, seq=seq, hosts={"a1": (7, 1)}, grants=grants))
     store.sync()

@@ -17,7 +17,7 @@ from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
-from swarm.wire.messages.traffic import Entry, Number, Table
+from swarm.wire.messages.traffic import Entry, Held, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.cell_requests import CellRequests
@@ -90,7 +90,7 @@ def made_anew(leader: Leader) -> Leader:
     return twin
 
 
-def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, list[Entry]], list[int]]:
+def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, Held], dict[str, list[Entry]], list[int]]:
     """The entries that a table lists of a host, and the cells around its vehicles that others hold."""
     every = [*table.grants.items(), *(each for fence in table.fences for each in fence.entries.items())]
     ours = {vehicle: numbers for vehicle, numbers in table.grants.items() if agent_of(vehicle) == host}
@@ -106,8 +106,9 @@ def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, list[E
     near = {stand.end + step for stand in (standing.vehicles if standing else ()) for step in steps}
     held = {number[0] for _, numbers in every for number in numbers}
     own = {number[0] for numbers in ours.values() for number in numbers}
-    grants = {vehicle: [entry(number, vehicle) for number in numbers] for vehicle, numbers in ours.items()}
-    return grants, sorted(near & (held - own))
+    each = {vehicle: [entry(number, vehicle) for number in numbers] for vehicle, numbers in ours.items()}
+    waits = {vehicle: waits for vehicle, of in each.items() if (waits := [entry for entry in of if entry.after])}
+    return ours, waits, sorted(near & (held - own))
 
 
 @WORLDS
@@ -131,7 +132,7 @@ def test_leaders_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name,
         nonlocal told
         contents = content_of(leader, table)
         for host, content in contents.items():
-            assert (content[0], content[3]) == told_anew(leader, table, host)
+            assert (*content[:2], content[4]) == told_anew(leader, table, host)
             told += 1
         return contents
 

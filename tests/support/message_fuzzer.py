@@ -40,6 +40,7 @@ from swarm.wire.messages.map_data import (
     MarkSets,
 )
 from swarm.wire.messages.planning import PushedRoute
+from swarm.wire.messages.traffic import Held, Number
 from swarm.wire.messages.vehicles import NO_TARGET, Followed, SharedCosts
 from swarm.wire.route_columns import Route, RouteBatch, Routes
 from swarm.wire.topics import Topic
@@ -144,6 +145,8 @@ class MessageFuzzer:
     def _made(self, kind: type[Any]) -> Any:
         if kind is Routes:
             return RouteBatch.of([self._made(Route) for _ in range(self._many(3))]).columns()
+        if kind is Held:
+            return Held.of(self._value("holds", list[Number]))
         if kind is MarkSets:
             author = self._chance.choice(self._authors)
             own = {"author": author, "group": author.partition(".")[0]}

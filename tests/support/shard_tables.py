@@ -9,7 +9,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stand, Table
+from swarm.wire.messages.traffic import Granted, Held, HostState, Number, Stand, Table
 from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
@@ -29,7 +29,7 @@ def table_of(epoch: int, seq: int, **grants: list[int | Number]) -> Table:
     """Vehicles are named by their host: a0=[5] is the vehicle a0-00 on cell 5. A cell is an entry that the table
     (epoch, 1) added."""
     held = {
-        f"{host}-00": [(cell, epoch, 1) if isinstance(cell, int) else cell for cell in cells]
+        f"{host}-00": Held.of([(cell, epoch, 1) if isinstance(cell, int) else cell for cell in cells])
         for host, cells in grants.items()
     }
     hosts = dict.fromkeys(grants, (1, seq))
@@ -39,14 +39,14 @@ def table_of(epoch: int, seq: int, **grants: list[int | Number]) -> Table:
 def cells_of(table: Table | None, vehicle: str) -> list[int]:
     """The cells of a vehicle's entries."""
     assert table is not None
-    return [number[0] for number in table.grants.get(vehicle, ())]
+    return [*table.grants[vehicle].cells] if vehicle in table.grants else []
 
 
 def standing(
     host: str, holds: list[Number], seq: int, knows: tuple[int, int] = (0, 0), **more: object
 ) -> HostState:
     cells = [number[0] for number in holds]
-    stand = Stand(f"{host}-00", cells[0], cells[-1], holds, [], [], 0, 0)
+    stand = Stand(f"{host}-00", cells[0], cells[-1], Held.of(holds), [], [], 0, 0)
     fields = {"generation": 1, "vehicles": [stand], **more}
     return HostState(shard=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
 
@@ -61,23 +61,19 @@ def holdings_of() -> Holdings:
 def granted_of(table: Table, host: str = "a0") -> Granted:
     """The message of a table to one host."""
     generation, heard = table.hosts.get(host, (0, 0))
-    grants = {
-        vehicle: [Entry(number) for number in numbers]
-        for vehicle, numbers in table.grants.items()
-        if vehicle.startswith(host)
-    }
+    grants = {vehicle: held for vehicle, held in table.grants.items() if vehicle.startswith(host)}
     return Granted(
         shard=table.shard, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, generation=generation,
         heard=heard, grants=grants,
     )  # fmt: skip
 
 
-def grants_of(holdings: Holdings, seq: int, cells: Mapping[str, Sequence[int]]) -> dict[str, list[Entry]]:
+def grants_of(holdings: Holdings, seq: int, cells: Mapping[str, Sequence[int]]) -> dict[str, Held]:
     """Entries of cells: those that a vehicle holds, and new ones of table (1, seq)."""
     paths = holdings._entries.paths
     held = {vehicle: {entry.cell: entry.number for entry in path} for vehicle, path in paths.items()}
     return {
-        vehicle: [Entry(held.get(vehicle, {}).get(cell, (cell, 1, seq))) for cell in each]
+        vehicle: Held.of([held.get(vehicle, {}).get(cell, (cell, 1, seq)) for cell in each])
         for vehicle, each in cells.items()
     }
 

@@ -4,14 +4,15 @@ lets it write."""
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from msgspec.structs import replace
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
+from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.right_of_way.holdings import part_of
-from swarm.wire.messages.traffic import Granted, Number, Stored, Table, Word
+from swarm.right_of_way.holdings import Tell, part_of
+from swarm.wire.messages.traffic import Granted, Held, HostState, Left, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import AskPromises
 from vehicle_agent.traffic.right_of_way_core import Action
@@ -24,11 +25,23 @@ class Thief(Process):
     """The process of the stolen name."""
 
     world: ThiefWorld
+    past: list[Table]
+    """Tables of its own."""
+
+    def __init__(self, world: ThiefWorld, agent: str, disk: Disk) -> None:
+        self.past = []
+        super().__init__(world, agent, disk)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
+            if isinstance(action, Table):
+                self.past = [*self.past[-20:], action]
             if isinstance(action, Table) and self.chance.random() < 0.5:
-                self.tell(self.stolen_from(action))
+                self.tell(self.lied_about(action))
+            elif isinstance(action, Tell) and self.chance.random() < 0.3:
+                super().perform([Tell((member,), self.misstated(action.standing)) for member in action.members])
+            elif isinstance(action, Left) and self.chance.random() < 0.3:
+                super().perform([replace(action, entries=[*action.entries, *self.world.entries()][:16])])
             elif isinstance(action, Stored) and self.chance.random() < 0.3:
                 super().perform([replace(action, seq=action.seq + self.chance.choice((-1, 1, 100)))])
             elif isinstance(action, Word) and self.chance.random() < 0.3:
@@ -48,7 +61,7 @@ class Thief(Process):
                 ours = next(epoch for epoch in epochs if self.world.shards.leader(shard, epoch) == self.agent)
                 epoch = ours + self.chance.choice(_EPOCHS) * len(epochs)
                 seq = self.chance.choice((1, 2, 3, 1 << 20))
-                lie = self.stolen_from(replace(member.stored, agent=self.agent, epoch=epoch, seq=seq))
+                lie = self.lied_about(replace(member.stored, agent=self.agent, epoch=epoch, seq=seq))
                 self.world.lies += 1
                 self.tell(lie)
                 if self.chance.random() < 0.2:
@@ -61,14 +74,61 @@ class Thief(Process):
         if self.chance.random() < 0.5:
             return actions
         stored = self.rights._members[shard].stored if shard in self.rights._members else None
-        return actions if stored is None else [replace(self.stolen_from(stored), epoch=max(epoch - 4, 1), seq=9)]
+        return actions if stored is None else [replace(self.lied_about(stored), epoch=max(epoch - 4, 1), seq=9)]
+
+    def lied_about(self, table: Table) -> Table:
+        """The table with a lie of any kind."""
+        lie = self.chance.choice(
+            (self.stolen_from, self.stolen_from, self.added_to, self.dropped_from, self.reordered, self.replayed)
+        )
+        return lie(table)
+
+    def added_to(self, table: Table) -> Table:
+        """Free cells are given to a vehicle of its own, of another, or to one that does not exist."""
+        taken = {number[0] for path in table.grants.values() for number in path}
+        free = [cell for cell in range(self.world.grid.cells) if self.world.shards.of(cell) == table.shard]
+        free = [cell for cell in free if cell not in taken]
+        vehicle = self.chance.choice((f"{self.agent}-00", f"{self.agent}-77", "ghost-00", *table.grants))
+        more = self.chance.sample(free, min(self.chance.choice((1, 2, 20)), len(free)))
+        path = [*table.grants.get(vehicle, ()), *((cell, table.epoch, table.seq) for cell in more)]
+        return replace(table, grants={**table.grants, vehicle: Held.of(path)}) if path else table
+
+    def dropped_from(self, table: Table) -> Table:
+        """Some vehicles have no entry."""
+        kept = {vehicle: path for vehicle, path in table.grants.items() if self.chance.random() < 0.8}
+        return replace(table, grants=kept)
+
+    def reordered(self, table: Table) -> Table:
+        """Two vehicles change places in the orders of cells, or have entries of other tables."""
+        if len(table.grants) < 2:
+            return table
+        one, other = self.chance.sample(sorted(table.grants), 2)
+        if self.chance.random() < 0.5:
+            return replace(table, grants={**table.grants, one: table.grants[other], other: table.grants[one]})
+        early = [(cell, epoch, max(seq - 1, 0)) for cell, epoch, seq in table.grants[one]]
+        return replace(table, grants={**table.grants, one: Held.of(early)})
+
+    def replayed(self, table: Table) -> Table:
+        """What it said once, under a new number."""
+        old = self.chance.choice([*self.past, table])
+        return table if old.shard != table.shard else replace(old, epoch=table.epoch, seq=table.seq)
+
+    def misstated(self, standing: HostState) -> HostState:
+        """As a host: another start of it, of which others have ended; or vehicles that hold what others do."""
+        if self.chance.random() < 0.3:
+            return replace(standing, generation=standing.generation + self.chance.choice((-1, 1, 1 << 32)))
+        if self.chance.random() < 0.3:
+            return replace(standing, dead=[standing.generation, 1], ended=self.chance.random() < 0.5)
+        stolen = [number for number in self.world.entries() if self.world.shards.of(number[0]) == standing.shard]
+        stands = [replace(stand, holds=[*stand.holds, *stolen][:16]) for stand in standing.vehicles]
+        return replace(standing, vehicles=stands, never=stolen[:8], knows=(1 << 20, 1))
 
     def stolen_from(self, table: Table) -> Table:
         """The table, in which a vehicle of one host is given a cell of another."""
         shards, free = self.world.shards, Orders(table)
         thefts: list[tuple[str, Number]] = []
         for vehicle, path in table.grants.items():
-            for cell in self.world.next_to(path[-1][0]):
+            for cell in self.world.next_to([*path.cells][-1]):
                 order = list(free.order(cell).items())
                 thefts += [
                     (vehicle, number)
@@ -89,17 +149,17 @@ class Thief(Process):
         first = (stolen[0], 0, 0) if how == 0 else (stolen[0], table.epoch, table.seq)  # before it, or after it
         grants[vehicle] = [*grants[vehicle], first]
         assert shards.of(stolen[0]) == table.shard
-        return replace(table, grants={id: path for id, path in grants.items() if path}, hosts=hosts)
+        return replace(table, grants={id: Held.of(path) for id, path in grants.items() if path}, hosts=hosts)
 
     def any_of(self, word: Word) -> list[Number]:
         """Entries of a host that it may not have heard of yet."""
         grants = self.rights._members[word.shard].stored.grants.items()
-        return [path[-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
+        return [[*path][-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
 
     def tell(self, table: Table) -> None:
         """Different members and hosts are told different tables of one number, each with the words that go with
         it."""
-        tables = [table, self.stolen_from(table), self.rights._members[table.shard].stored]
+        tables = [table, self.lied_about(table), self.rights._members[table.shard].stored]
         tables[2] = replace(tables[2], agent=self.agent, epoch=table.epoch, seq=table.seq)
         for member in self.world.shards.members(table.shard):
             said = self.chance.choice(tables)
@@ -113,9 +173,9 @@ class Thief(Process):
 
     def words(self, table: Table, host: str) -> Iterator[Granted | Word]:
         """A grant by a table, sometimes without those before; and the word for it."""
-        grants, generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
+        (grants, waits), generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
         if self.chance.random() < 0.2:
-            grants = {id: [replace(entry, after=[]) for entry in entries] for id, entries in grants.items()}
+            waits = {}
         stamp = {"epoch": table.epoch, "seq": table.seq}
         yield Granted(
             shard=table.shard,
@@ -124,9 +184,10 @@ class Thief(Process):
             generation=generation,
             heard=1 << 30,
             grants=grants,
+            waits=waits,
             **stamp,
         )
-        part = part_of(generation, grants)
+        part = part_of(generation, grants, waits)
         yield Word(shard=table.shard, host=host, agent=self.agent, part=part, **stamp)
 
 
@@ -136,16 +197,49 @@ class ThiefWorld(TrafficWorld):
 
     def __init__(self, seed: int, agents: int, per_agent: int, size: int, side: int, faults: Faults) -> None:
         self.lies = 0
+        self.revoked = False
         self.stolen = f"a{seed % agents}"
         super().__init__(seed, agents, per_agent, size, side, faults, proven=True)
 
     def process_of(self, agent: str, disk: Disk) -> Process:
-        return (Thief if agent == self.stolen else Process)(self, agent, disk)
+        process = (Thief if agent == self.stolen else Process)(self, agent, disk)
+        if self.revoked:
+            self.tell_revoked(process)
+        return process
 
     def revoke(self) -> None:
+        """The thief is silent from now on, and the others notice within two seconds."""
         for process in [each for each in self.processes if each.agent == self.stolen]:
             process.alive = False
             self.processes.remove(process)
+        self.revoked = True
+        for process in self.processes:
+            self.at(self.chance.randrange(2 * NS_PER_S), lambda to=process: self.tell_revoked(to))
+
+    def carry(self, source: Process, to: Process, deliver: Callable[[], None]) -> None:
+        """What a revoked name has said is not carried any more."""
+        is_denied = source.agent == self.stolen
+        super().carry(source, to, lambda: None if is_denied and self.revoked else deliver())
+
+    def tell_revoked(self, process: Process) -> None:
+        process.rights.revoke([self.stolen], process.now_ns)
+
+    def entries(self) -> list[Number]:
+        """Some entries that members have on file."""
+        paths = [path for table in self.files() for path in table.grants.values()]
+        return [self.chance.choice([*path]) for path in self.chance.sample(paths, min(4, len(paths)))]
+
+    def files(self) -> list[Table]:
+        """The tables on files of members."""
+        return [member.stored for process in self.processes for member in process.rights._members.values()]
+
+    def is_of_one_mind(self, shard: int) -> bool:
+        """True if all honest members of a shard have the same table on file, and all honest hosts with vehicles
+        there know one of its epoch: they have the words of a majority."""
+        stored = [table for table in self.files() if table.shard == shard]
+        hosts = [process.rights.holdings for process in self.processes]
+        epochs = {host._entries.knows.get(shard, (0, 0))[0] for host in hosts if shard in host.shards}
+        return all(table == stored[0] and epochs <= {table.epoch} for table in stored)
 
     def restart(self, process: Process) -> None:
         if process.agent != self.stolen or not self.quiet:

@@ -25,12 +25,7 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.traffic import (
-    Fence,
-    HostState,
-    Stand,
-    Table,
-)
+from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 _GRID = GridSpec(300, 200, 10.0)
@@ -76,12 +71,12 @@ _NAMED: tuple[Message, ...] = (
     ),
     HostState(
         shard=0, agent="a0", generation=1 << 32, seq=9, knows=(3, 17), dead=[5],
-        vehicles=[Stand("a0-00", 4, 5, [(4, 3, 16), (5, 3, 16)], [6], [], 0, 1200)],
+        vehicles=[Stand("a0-00", 4, 5, Held.of([(4, 3, 16), (5, 3, 16)]), [6], [], 0, 1200)],
     ),
     Table(
         shard=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)},
-        grants={"a0-00": [(4, 3, 16), (5, 3, 16)]},
-        fences=[Fence("a2", 1 << 32, {"a2-00": [(9, 1, 1)]})], pushed={"a0-00": 900},
+        grants={"a0-00": Held.of([(4, 3, 16), (5, 3, 16)])},
+        fences=[Fence("a2", 1 << 32, {"a2-00": Held.of([(9, 1, 1)])})], pushed={"a0-00": 900},
     ),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(

@@ -6,11 +6,11 @@ their own host, or by proof that its generation has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agents import agent_of
-from swarm.wire.messages.traffic import Before, Entry, Fence, Number, Stamp, Table
+from swarm.wire.messages.traffic import Before, Entry, Fence, Held, Number, Stamp, Table
 
 _NO_ENTRIES: Sequence[Number] = []
 _NO_ORDER: Mapping[Number, str] = {}
@@ -43,8 +43,10 @@ class Orders:
         self.fenced: dict[tuple[str, int], dict[str, list[Number]]] = {}
         self.orders: dict[int, dict[Number, str]] = {}
         self._fences: set[Number] = set()
-        self._told: dict[str, list[Entry]] = {}
-        """Vehicle -> its entries, each with those before it, as long as neither these nor those change."""
+        self._held: dict[str, Held] = {}
+        """Vehicle -> its entries as a message has them, until they change."""
+        self._waits: dict[str, list[Entry]] = {}
+        """Vehicle -> its entries that wait, until they or those before them change."""
         self.newest = 0
         """The highest sequence of an entry with which a vehicle has begun."""
         for vehicle, entries in table.grants.items():
@@ -62,9 +64,14 @@ class Orders:
             if shut:
                 self._fences.add(number)
 
-    def table(self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int]) -> Table:
+    def table(
+        self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int], without: str | None = None
+    ) -> Table:
         """Returns the same as a message."""
-        fences = [Fence(host, generation, dict(of)) for (host, generation), of in self.fenced.items()]
+        fences = [
+            Fence(host, generation, {vehicle: Held.of(entries) for vehicle, entries in of.items()})
+            for (host, generation), of in self.fenced.items()
+        ]
         epoch, seq = stamp
         return Table(
             shard=shard,
@@ -72,9 +79,10 @@ class Orders:
             epoch=epoch,
             seq=seq,
             hosts=dict(self.hosts),
-            grants=dict(self.of),
+            grants={vehicle: self._held_by(vehicle) for vehicle in self.of},
             fences=fences,
             pushed=dict(pushed),
+            without=without,
         )
 
     # --- what is so -----------------------------------------------------------------------------------------
@@ -126,19 +134,30 @@ class Orders:
                 if number[0] != cell and len(self.order(number[0])) > 1 and any(self.before(number, vehicle)):
                     yield number[0]
 
-    def granted(self, host: str) -> dict[str, list[Entry]]:
-        """Returns the entries of a host's vehicles, each with those before it."""
+    def granted(self, host: str) -> tuple[dict[str, Held], dict[str, list[Entry]]]:
+        """Returns the entries of a host's vehicles, and of each vehicle those that wait, with those before
+        them."""
         vehicles = self.by_host.get(host, ())
-        for vehicle in vehicles:
-            if vehicle not in self._told:
-                self._told[vehicle] = [self._entry(number, vehicle) for number in self.of[vehicle]]
-        return {vehicle: self._told[vehicle] for vehicle in vehicles}
+        waits = {vehicle: waits for vehicle in vehicles if (waits := self._waiting(vehicle))}
+        return {vehicle: self._held_by(vehicle) for vehicle in vehicles}, waits
 
-    def _entry(self, number: Number, vehicle: str) -> Entry:
+    def _held_by(self, vehicle: str) -> Held:
+        if vehicle not in self._held:
+            self._held[vehicle] = Held.of(self.of[vehicle])
+        return self._held[vehicle]
+
+    def _waiting(self, vehicle: str) -> list[Entry]:
+        if vehicle not in self._waits:
+            of = self.of[vehicle]
+            self._waits[vehicle] = [
+                Entry(number, before) for number in of if (before := self._before(number, vehicle))
+            ]
+        return self._waits[vehicle]
+
+    def _before(self, number: Number, vehicle: str) -> list[Before]:
         if len(self.order(number[0])) <= 1:  # none if a table of a stolen name lists an entry twice
-            return Entry(number)
-        before: list[Before] = [(other[1], other[2], of) for other, of in self.before(number, vehicle)]
-        return Entry(number, before)
+            return []
+        return [(other[1], other[2], of) for other, of in self.before(number, vehicle)]
 
     def followed(self) -> dict[str, dict[str, list[Number]]]:
         """Returns host -> host -> entries of the first behind which vehicles of the second wait."""
@@ -158,7 +177,7 @@ class Orders:
         host: str,
         generation: int,
         seq: int,
-        holds: Mapping[str, Sequence[Number]],
+        holds: Mapping[str, Iterable[Number]],
         knows: Stamp,
         dead: Sequence[int],
         bodies: Mapping[str, int],
@@ -232,10 +251,10 @@ class Orders:
         self._open(host, generation, {})
         return opens
 
-    def remove(self, host: str, holds: Mapping[str, Sequence[Number]], knows: Stamp) -> None:
+    def remove(self, host: str, holds: Mapping[str, Iterable[Number]], knows: Stamp) -> None:
         """Drops the entries that a host which knows a table does not hold any more."""
         for vehicle in list(self.by_host.get(host, ())):
-            held, entries = holds.get(vehicle, ()), self.of[vehicle]
+            held, entries = [*holds.get(vehicle, ())], self.of[vehicle]
             kept = [entry for entry in entries if entry in held or entry[1:] > knows]
             if len(kept) < len(entries):
                 for entry in entries:
@@ -262,7 +281,8 @@ class Orders:
         return True
 
     def _set(self, vehicle: str, entries: list[Number]) -> None:
-        self._told.pop(vehicle, None)
+        self._held.pop(vehicle, None)
+        self._waits.pop(vehicle, None)
         vehicles = self.by_host.setdefault(agent_of(vehicle), {})
         if entries:
             self.of[vehicle] = entries
@@ -275,6 +295,6 @@ class Orders:
         order = self.orders.get(number[0], {})
         order.pop(number, None)
         for vehicle in order.values():
-            self._told.pop(vehicle, None)
+            self._waits.pop(vehicle, None)
         if not order:
             self.orders.pop(number[0], None)

@@ -14,7 +14,7 @@ from swarm.right_of_way.incarnations import FURTHEST_EPOCH, HEARTBEAT_NS
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table, Word
 from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
-from vehicle_agent.traffic.witness import Witness
+from vehicle_agent.traffic.witness import Witness, agreed
 
 LEASE_NS = 3 * HEARTBEAT_NS
 """A leader that is silent for so long may be replaced, later where answers take long. Until then its members refuse
@@ -121,8 +121,10 @@ class Member:
         self._me = me
         self._fleets = fleets
         self._members = shards.members(self.shard)
-        self._witness = Witness(me) if shards.proven else None
+        self._witness = Witness(me, fleets) if shards.proven else None
         self._others = tuple(member for member in self._members if member != me)
+        self._distrusted: set[str] = set()
+        """Revoked names, until members with others have agreed on what they have on file."""
         self._rank = self._members.index(me)
         self._claimed = 0
         self._promises: dict[str, Table] = {}
@@ -144,14 +146,18 @@ class Member:
     # --- timeouts -------------------------------------------------------------------------------------------
 
     @property
+    def _trusted(self) -> set[str]:
+        return {*self._others} - self._distrusted
+
+    @property
     def _lease_ns(self) -> int:
         """A leader speaks once a heartbeat; the table of a new one comes a round trip after our promise. A table
         that is lost is told again after another."""
-        return max(LEASE_NS, HEARTBEAT_NS + 2 * (self._trips.bound_ns(self._others) + self._tick_ns))
+        return max(LEASE_NS, HEARTBEAT_NS + 2 * (self._trips.bound_ns(self._trusted) + self._tick_ns))
 
     def _turn_ns(self) -> int:
         """Time by which this member claims later than the first: that one's claim arrives before."""
-        return self._rank * max(_RANK_NS, self._trips.bound_ns(self._others) + self._tick_ns)
+        return self._rank * max(_RANK_NS, self._trips.bound_ns(self._trusted) + self._tick_ns)
 
     def _ask(self, stamp: Stamp, now_ns: int) -> None:
         """Notes when a claim or a table is sent first. One that is repeated measures nothing: its answer does not
@@ -168,13 +174,21 @@ class Member:
         if asked_ns >= 0:
             self._trips.measure(member, now_ns - asked_ns)
 
+    def revoke(self, name: str, now_ns: int) -> None:
+        """A name is revoked: by what it said as a member or a host, others may have different tables on file."""
+        if self._witness is None or name == self._me:
+            return
+        self._distrusted.add(name)
+        self.leader = None  # all begin again with what they have
+        self._led_until_ns, self._due_ns = now_ns, now_ns + self._turn_ns()
+
     # --- what hosts say -------------------------------------------------------------------------------------
 
     def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
             # A new shard cannot have another leader; and hosts receive no more from the previous one.
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
-            start_ns = max(_START_NS, self._trips.bound_ns(self._others) + self._tick_ns)
+            start_ns = max(_START_NS, self._trips.bound_ns(self._trusted) + self._tick_ns)
             self._due_ns = max(self._due_ns, now_ns + (start_ns if led else 0) + self._turn_ns())
             self._acked_ns = dict.fromkeys(self._others, now_ns)
         self._wanted_ns = now_ns
@@ -205,6 +219,8 @@ class Member:
             if not self._accepts(table):
                 return self._words(now_ns)
             self.promised, self.stored = table.epoch, table
+            if table.without in self._distrusted:
+                self._distrusted.clear()
             actions.append(Save(self.promised, self.stored))
             actions += self._words(now_ns)
         if table.stamp == self.stored.stamp:
@@ -218,6 +234,9 @@ class Member:
         return self.on_file
 
     def _accepts(self, table: Table) -> bool:
+        """Returns True if a leader's table may replace ours. One liar is borne: once it is known, no other lies."""
+        if table.without in self._distrusted and table.agent not in self._distrusted:
+            return True
         return self._witness is None or self._witness.accepts(self.stored, table)
 
     def _words(self, now_ns: int) -> list[MemberAction]:
@@ -260,6 +279,10 @@ class Member:
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq)
+        if self.leader is not None and all(
+            self._has.get(member, (0, 0)) > (self.leader.epoch, 0) for member in self._trusted
+        ):
+            self._distrusted.clear()
         if stored.seq and stored.agent == self._shards.leader(self.shard, stored.epoch):
             return self._hear_same(stored, now_ns)
         self._other_said = max(self._other_said, (stored.epoch, stored.seq))
@@ -345,13 +368,17 @@ class Member:
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
-        if self.leader is not None or len(self._promises) < self._shards.majority:
+        promises = [table for member, table in self._promises.items() if member not in self._distrusted]
+        if self.leader is not None or len(promises) < self._shards.majority:
             return
-        known = sorted(self._promises.values(), key=lambda table: table.stamp, reverse=True)
-        while self._witness is not None and known and self._witness.contradicts(known[0]):
+        known = sorted(promises, key=lambda table: table.stamp, reverse=True)
+        without = min(self._distrusted, default=None)
+        if without is not None:
+            known = [agreed(promises)]
+        while self._witness is not None and not without and known and self._witness.contradicts(known[0]):
             del known[0]  # stored by a member which a thief told another table
-        if known and self._accepts(known[0]):
-            self.leader = Leader(self._shards, self._me, self._claimed, known[0], self._fleets)
+        if known and (without is not None or self._accepts(known[0])):
+            self.leader = Leader(self._shards, self._me, self._claimed, known[0], self._fleets, without)
             self._told = []
             self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.

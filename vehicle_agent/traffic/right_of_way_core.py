@@ -19,7 +19,7 @@ from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import HostState, Known, KnownRequest, Left, Stored, Table
+from swarm.wire.messages.traffic import Held, HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 
 _ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
@@ -94,6 +94,7 @@ class RightOfWay:
         self._saved = dict(saved)
         self._members: dict[int, Member] = {}
         self.silent = False
+        self._revoked: set[str] = set()
 
     # --- beginning a generation -----------------------------------------------------------------------------------
 
@@ -191,6 +192,13 @@ class RightOfWay:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
+    def revoke(self, names: Collection[str], now_ns: int) -> None:
+        """The certificates of these agents are revoked: what they said as members may be false."""
+        for name in {*names} - self._revoked:
+            self._revoked.add(name)
+            for member in self._members.values():
+                member.revoke(name, now_ns)
+
     def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         member = self._member(standing.shard, now_ns)
         if member is not None:
@@ -241,18 +249,21 @@ class RightOfWay:
             return known
         members = self.shards.members(shard)
         noted = {self.agent, *self.own.noted_by}
-        if self.agent not in members or not noted.issuperset(members) or not self._has_quorum:
+        honest = {*members} - self._revoked
+        if self.agent not in members or not noted.issuperset(honest) or not self._has_quorum:
             return None
         promised, stored = self._saved.get(shard) or (0, self._at_start(shard))
         made = self._members[shard] = Member(
             self.shards, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
         )
+        for name in self._revoked:
+            made.revoke(name, now_ns)
         return made
 
     def _at_start(self, shard: int) -> Table:
         """The table from before any leader: vehicles stand where the run begins."""
         grants = {
-            vehicle: [(cell, 0, 1)]
+            vehicle: Held.of([(cell, 0, 1)])
             for fleet in self._spawns.values()
             for vehicle, cell in fleet.items()
             if self.shards.of(cell) == shard

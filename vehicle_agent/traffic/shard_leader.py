@@ -7,6 +7,7 @@ waits for one that stays: it follows only those that have an entry behind the ce
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -16,9 +17,9 @@ from zlib import crc32
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead
+from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Entry, Granted, HostState, Number, Stamp, Stand, Table
+from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
@@ -43,7 +44,7 @@ _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
 TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
-_MOST_CELLS = 64
+MOST_CELLS = 64
 """Limit for one vehicle: the largest `Grant`."""
 
 
@@ -59,6 +60,19 @@ def is_entering(stand: Stand) -> bool:
     return not stand.holds and stand.ahead[:1] == [stand.cell]
 
 
+def exceeds_externals(table: Table, fleets: Mapping[str, Collection[str]]) -> bool:
+    """Returns True if external vehicles have more of a table than leaders grant them."""
+    counts = Counter[str]()
+    for vehicle, entries in table.grants.items():
+        if (host := agent_of(vehicle)) not in fleets:
+            counts[host] += len(entries)
+    return (
+        counts.total() > MOST_CELLS_OF_EXTERNALS
+        or any(count > MOST_CELLS_OF_EXTERNAL for count in counts.values())
+        or len(table.hosts.keys() - fleets.keys()) > MOST_EXTERNALS
+    )
+
+
 @lru_cache(maxsize=1 << 14)
 def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
@@ -69,9 +83,11 @@ def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
     return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
 
 
-_Content = tuple[dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int]
-"""Content of a `Granted`: entries, those that are followed, vehicles to make way, and cells of others; then its
-generation, and what it was heard to say if it waits for that alone."""
+_Content = tuple[
+    dict[str, Held], dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int
+]
+"""Content of a `Granted`: entries, those that wait, those that are followed, vehicles to make way, and cells of
+others; then its generation, and what it was heard to say if it waits for that alone."""
 
 
 @dataclass(slots=True)
@@ -102,10 +118,17 @@ class Leader:
     fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
     (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
+    without  a member with a revoked name, after which the table was agreed by the others
     """
 
     def __init__(
-        self, shards: Shards, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
+        self,
+        shards: Shards,
+        me: str,
+        epoch: int,
+        table: Table,
+        fleets: Mapping[str, Collection[str]],
+        without: str | None = None,
     ) -> None:
         self.epoch = epoch
         self.seq = 0
@@ -114,6 +137,7 @@ class Leader:
         self._shard = table.shard
         self._me = me
         self._fleets = fleets
+        self._without = without or table.without
         self._orders = Orders(table)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
@@ -125,7 +149,7 @@ class Leader:
         self._told_ns = 0
         self._content: dict[Stamp, dict[str, _Content]] = {}
         """Stamp of a table -> host -> what it is told of that."""
-        self._said_of: Table | None = None
+        self._said_of: Stamp | None = None
         self._said_ns = 0
 
     @property
@@ -213,7 +237,8 @@ class Leader:
             return None
         if self._told is None or self._granted or self._changed:
             self.seq += 1
-            self._told = self._orders.table(self._shard, self._me, (self.epoch, self.seq), self._pushed)
+            stamp = self.epoch, self.seq
+            self._told = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
             self._content[self._told.stamp] = self._content_of(self._told)
             if len(self._content) > TABLES_KEPT:
                 del self._content[next(iter(self._content))]
@@ -224,18 +249,18 @@ class Leader:
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
         heartbeat old."""
-        if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
+        if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
             return
-        self._said_of, self._said_ns = table, now_ns
+        self._said_of, self._said_ns = table.stamp, now_ns
         for name, content in self._content.get(table.stamp, {}).items():
             host = self._hosts[name]
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             generation, heard = table.hosts.get(name, (0, 0))
-            if content == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
+            if is_said(content, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
                 continue
             host.told, host.told_ns = content, now_ns
-            grants, behind, pushed, occupied, *_ = content
+            grants, waits, behind, pushed, occupied, *_ = content
             yield Granted(
                 shard=table.shard,
                 host=name,
@@ -245,6 +270,7 @@ class Leader:
                 generation=generation,
                 heard=heard,
                 grants=grants,
+                waits=waits,
                 followed=behind,
                 pushed=pushed,
                 occupied=occupied,
@@ -256,7 +282,7 @@ class Leader:
         held, followed = orders.orders.keys(), orders.followed()
         found: dict[str, _Content] = {}
         for name, host in self._hosts.items():
-            grants = orders.granted(name)
+            grants, waits = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
             others = held - {each[0] for vehicle in grants for each in orders.of[vehicle]}
@@ -264,7 +290,8 @@ class Leader:
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             generation, heard = table.hosts.get(name, (0, 0))
-            found[name] = grants, followed.get(name, {}), pushed, occupied, generation, 0 if stands else heard
+            behind, awaited = followed.get(name, {}), 0 if stands else heard
+            found[name] = grants, waits, behind, pushed, occupied, generation, awaited
         return found
 
     def _plan(self, now_ns: int) -> None:
@@ -361,7 +388,7 @@ class Leader:
             if order and not self._may_follow(stand, order):
                 return
             held = len(orders.entries(vehicle))
-            if held >= _MOST_CELLS or not self._external_may_hold_more(vehicle):
+            if held >= MOST_CELLS or not self._external_may_hold_more(vehicle):
                 return
             if held > stand.keeps and self._is_near(cell, vehicle):
                 return

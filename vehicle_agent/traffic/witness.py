@@ -6,20 +6,26 @@ With both, one liar among four members makes no two vehicles of others meet (doc
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from swarm.config.agents import agent_of
 from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS
-from swarm.wire.messages.traffic import HostState, Number, Stamp, Table, Word
+from swarm.right_of_way.incarnations import is_said
+from swarm.wire.messages.traffic import Fence, Held, HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.shard_leader import SILENT_NS, is_entering
+from vehicle_agent.traffic.shard_leader import MOST_CELLS, SILENT_NS, exceeds_externals, is_entering
 
 _MOST_LACKED = 64
 """Entries that one word asks for; the next asks for more."""
+_REMEMBERED = 16
+"""Statements of a host in which a new entry may be requested: those of more than a second, in which a table
+comes."""
 
 
 def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
@@ -33,6 +39,36 @@ def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
     return found if len(found) == sum(len(numbers) for _, _, numbers in each) else None
 
 
+def agreed(tables: Collection[Table]) -> Table:
+    """Returns what at least two of three tables list, where their members are all that can be honest: what a
+    majority with a liar had on file is on two of them, or over by its host's word. The newest statements count."""
+    newest_first = sorted(tables, key=lambda table: table.stamp, reverse=True)
+    lists = [_listed(table) or {} for table in newest_first]
+    votes = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    hosts: dict[str, tuple[int, int]] = {}
+    for table in newest_first:
+        hosts.update((name, max(said, hosts.get(name, said))) for name, said in table.hosts.items())
+    entries: dict[tuple[str, int], dict[str, list[Number]]] = {}
+    for number, vehicle in (each for each, count in votes.items() if count > 1):
+        host = agent_of(vehicle)
+        of = [each[number][1] for each in lists if each.get(number, ("", 0))[0] == vehicle]
+        # The earliest that may use it. Before a table counts one, the next that does takes the run's first entries.
+        generation = min(filter(None, of), default=hosts.get(host, BEFORE_ALL)[0])
+        entries.setdefault((host, generation), {}).setdefault(vehicle, []).append(number)
+    grants: dict[str, Held] = {}
+    fences: list[Fence] = []
+    for (host, generation), of_vehicles in entries.items():
+        ordered = {
+            id: Held.of(sorted(numbers, key=lambda number: number[1:])[-MOST_CELLS:])
+            for id, numbers in of_vehicles.items()
+        }
+        if generation == hosts.get(host, BEFORE_ALL)[0]:
+            grants.update(ordered)
+        else:
+            fences.append(Fence(host, generation, ordered))
+    return replace(newest_first[0], hosts=hosts, grants=grants, fences=fences, pushed={})
+
+
 @dataclass(slots=True)
 class _Host:
     """Statements of one host.
@@ -43,6 +79,7 @@ class _Host:
                  takes
     there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on
     ended        generations that have ended
+    recent       its last statements, the oldest first
     told         the last word to it, and its time
     """
 
@@ -51,11 +88,13 @@ class _Host:
     generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     there: set[tuple[str, int]] = field(default_factory=set)
     ended: set[int] = field(default_factory=set)
+    recent: deque[HostState] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     told: object = None
     told_ns: int = 0
 
     def hear(self, standing: HostState, now_ns: int) -> None:
         self.spoke_ns = now_ns
+        self.recent.append(standing)
         self.ended.update(standing.dead)
         if standing.ended:
             self.ended.add(standing.generation)
@@ -86,12 +125,30 @@ class _Host:
             (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
         )
 
+    def mentions(self, number: Number, vehicle: str) -> bool:
+        """Returns True if this host requested the cell of an entry lately, or said of the entry that a vehicle
+        holds it, or that none ever takes it."""
+        cell = number[0]
+        return any(
+            number in said.never
+            or any(
+                stand.vehicle == vehicle
+                and (cell in stand.ahead or cell in stand.wants or cell == stand.cell or number in stand.holds)
+                for stand in said.vehicles
+            )
+            for said in reversed(self.recent)
+        )
+
 
 class Witness:
-    """Knowledge of one member about a shard."""
+    """Knowledge of one member about a shard.
 
-    def __init__(self, me: str) -> None:
+    fleets  agent -> its vehicles, all of the scenario's
+    """
+
+    def __init__(self, me: str, fleets: Mapping[str, Collection[str]]) -> None:
         self._me = me
+        self._fleets = fleets
         self._hosts: dict[str, _Host] = {}
         self._of: Table | None = None
         self._orders: Orders | None = None
@@ -103,8 +160,8 @@ class Witness:
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
-        what it adds comes after all that remains in its cell, and it counts no statement that was not made. Hosts
-        of which a statement is missed are asked for it by the next words."""
+        what it adds was requested by its host and comes after all that remains in its cell, and it counts no
+        statement that was not made. Hosts of which a statement is missed are asked for it by the next words."""
         was, lists = _listed(old), _listed(new)
         if was is None or lists is None:
             return False
@@ -127,6 +184,17 @@ class Witness:
             elif not self._hosts[host].is_over(number, generation):
                 self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
+        held = {(number[0], vehicle) for number, (vehicle, _) in was.items()} if added else set()
+        for number, (vehicle, _) in added:
+            host = agent_of(vehicle)
+            if vehicle not in self._fleets.get(host, (vehicle,)):
+                return False
+            if (number[0], vehicle) not in held and not (
+                host in self._hosts and self._hosts[host].mentions(number, vehicle)
+            ):
+                self._lacks.setdefault(host, []).append(number)
+        if added and exceeds_externals(new, self._fleets):
+            return False
         ordered = all(
             (number > last.get(number[0], ()) and number[1:] <= new.stamp)
             or self._passes(was.get(number), vehicle, number)
@@ -158,6 +226,8 @@ class Witness:
         they are new or a heartbeat old."""
         if self._of is not stored or self._orders is None:
             self._of, self._orders = stored, Orders(stored)
+        for name in [name for name, host in self._hosts.items() if not host.recent and name not in self._lacks]:
+            del self._hosts[name]  # a liar may name as many as it likes
         for name in self._lacks:
             self._hosts.setdefault(name, _Host(now_ns - SILENT_NS - 1))
         for name, host in self._hosts.items():
@@ -165,9 +235,9 @@ class Witness:
             if now_ns - host.spoke_ns > SILENT_NS and lacks is None:
                 continue
             generation, _ = stored.hosts.get(name, BEFORE_ALL)
-            part = part_of(generation, self._orders.granted(name))
+            part = part_of(generation, *self._orders.granted(name))
             says = stored.epoch, part, lacks
-            if says == host.told and 0 <= now_ns - host.told_ns < HEARTBEAT_NS:
+            if is_said(says, host.told, now_ns - host.told_ns):
                 continue
             host.told, host.told_ns = says, now_ns
             yield Word(

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate, chain, groupby, pairwise, repeat
 from typing import Annotated
 
 import msgspec
@@ -16,13 +18,63 @@ Stamp = tuple[Natural, Natural]
 """(epoch, seq): which table of a shard. Later ones compare greater."""
 Number = tuple[Cell, Natural, Natural]
 """(cell, epoch, seq): an entry in the order of vehicles for a cell, by the table that added it."""
-Held = Annotated[list[Number], Meta(max_length=64)]
-"""Entries of one vehicle in driving order."""
 Before = tuple[Natural, Natural, VehicleId]
 """(epoch, seq, vehicle) of another entry of the same cell."""
+_MOST_CELLS = 1 << 32
+"""Cells of the largest grid; as those of a `Cell`, the cells of an entry may lie outside the grid."""
+_Turn = Annotated[int, Meta(gt=-2 * _MOST_CELLS, lt=2 * _MOST_CELLS)]
+_Run = Annotated[int, Meta(ge=1, le=64)]
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
 ShardSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_SHARD_REGIONS * REGION_CELLS, multiple_of=REGION_CELLS)]
 """In cells."""
+
+
+class Held(msgspec.Struct, frozen=True, array_like=True):
+    """Entries of one vehicle in driving order, in few bytes: along a route neighbouring ones differ little.
+
+    first   cell of the first entry; 0 if there is none
+    turns   the steps from cell to cell, the first as it is and each other one less the step before it: a straight
+            way is zeros
+    stamps  (epoch, seq, count): the tables which added the entries, each with the number of entries in turn
+    """
+
+    first: Cell = 0
+    turns: Annotated[list[_Turn], Meta(max_length=63)] = []
+    stamps: Annotated[list[tuple[Natural, Natural, _Run]], Meta(max_length=64)] = []
+
+    @classmethod
+    def of(cls, numbers: Sequence[Number]) -> Held:
+        if not numbers:
+            return _NONE_HELD
+        cells = [number[0] for number in numbers]
+        steps = [after - cell for cell, after in pairwise(cells)]
+        turns = [*steps[:1], *(after - step for step, after in pairwise(steps))]
+        runs = groupby(numbers, key=lambda number: number[1:])
+        return cls(cells[0], turns, [(*stamp, len([*run])) for stamp, run in runs])
+
+    def __post_init__(self) -> None:
+        cells = [*self.cells, 0]
+        if (
+            sum(run[2] for run in self.stamps) != len(cells) - 1
+            or max(cells) >= _MOST_CELLS
+            or min(cells) < -_MOST_CELLS // 2
+        ):
+            raise ValueError("expected as many stamps as cells, and cells of 32 bits")
+
+    def __len__(self) -> int:
+        return len(self.turns) + 1 if self.stamps else 0
+
+    @property
+    def cells(self) -> Iterator[int]:
+        """The cells of the entries."""
+        return accumulate(accumulate(self.turns), initial=self.first) if self.stamps else iter(())
+
+    def __iter__(self) -> Iterator[Number]:
+        stamps = chain.from_iterable(repeat((epoch, seq), count) for epoch, seq, count in self.stamps)
+        return ((cell, *stamp) for cell, stamp in zip(self.cells, stamps, strict=True))
+
+
+_NONE_HELD = Held()
 
 
 class Stand(Part, frozen=True, array_like=True):
@@ -87,6 +139,12 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         return self.number[0]
 
 
+def entries_of(held: Iterable[Number], waits: Iterable[Entry]) -> list[Entry]:
+    """Returns the entries of a vehicle, of which these wait."""
+    waiting = {entry.number: entry for entry in waits}
+    return [waiting.get(number) or Entry(number) for number in held]
+
+
 class Fence(Bounded, frozen=True, array_like=True):
     """The entries of an earlier generation of a host, on which its vehicles may still be."""
 
@@ -103,6 +161,8 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     grants  vehicle -> its entries in driving order
     fences  entries of generations that may still drive
     pushed  vehicle -> the age with which it is to make way into another shard
+    without name that was revoked: a leader began with what two of three other members had on file, or with a table
+            that followed from such a one
     """
 
     shard: Shard
@@ -110,9 +170,10 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     epoch: Natural
     seq: Natural
     hosts: Annotated[dict[Id, tuple[Natural, Natural]], IDS]
-    grants: Annotated[dict[VehicleId, Annotated[Held, Meta(min_length=1)]], LARGE]
+    grants: Annotated[dict[VehicleId, Held], LARGE]
     fences: Annotated[list[Fence], IDS] = []
     pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
+    without: Id | None = None
 
     @property
     def stamp(self) -> Stamp:
@@ -134,7 +195,8 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     agent              the shard's leader
     epoch, seq         of the table
     generation, heard  the newest host state of the host that counts in the table; 0 if none does
-    grants             vehicle of the host -> its entries, in driving order
+    grants             vehicle of the host -> its entries
+    waits              vehicle of the host -> those of its entries that wait for others
     followed           host -> entries of this one behind which its vehicles wait
     pushed             vehicle of the host -> the age with which it is to make way into another shard
     occupied           of the cells around where vehicles of the host end, those that others hold
@@ -147,7 +209,8 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     seq: Natural
     generation: Natural
     heard: Natural
-    grants: Annotated[dict[VehicleId, Annotated[list[Entry], Meta(min_length=1, max_length=64)]], SMALL] = {}
+    grants: Annotated[dict[VehicleId, Held], SMALL] = {}
+    waits: Annotated[dict[VehicleId, Annotated[list[Entry], Meta(max_length=64)]], SMALL] = {}
     followed: Annotated[dict[Id, Annotated[list[Number], SMALL]], IDS] = {}
     pushed: Annotated[dict[VehicleId, Milliseconds], SMALL] = {}
     occupied: Annotated[list[Cell], LARGE] = []
@@ -175,7 +238,7 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     seq: Natural
     part: Natural
     asks: bool = False
-    lacks: Held = []
+    lacks: Annotated[list[Number], Meta(max_length=64)] = []
 
 
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):

@@ -14,7 +14,7 @@ from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.incarnations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.traffic import Fence, Granted, HostState, Known, Stand, Table
+from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table
 from vehicle_agent.traffic import shard_leader as leaders
 from vehicle_agent.traffic.shard_leader import Leader
 
@@ -32,7 +32,7 @@ def leader_of(**of: object) -> Leader:
 def entering(
     name: str, cell: int, seq: int = 1, ahead: list[int] | None = None, generation: int = 1 << 32
 ) -> HostState:
-    stand = Stand(f"{name}-00", cell, cell, [], ahead or [cell], [], 0, 0)
+    stand = Stand(f"{name}-00", cell, cell, Held(), ahead or [cell], [], 0, 0)
     return HostState(shard=0, agent=name, generation=generation, seq=seq, knows=(0, 0), vehicles=[stand])
 
 
@@ -99,7 +99,7 @@ def test_a_host_may_speak_for_vehicles_of_its_own_name_only() -> None:
     leader = leader_of()
     lie = entering("rover", 70)
     for vehicle in ("a1-00", "other-00", "rover2-00"):
-        stand = Stand(vehicle, 70, 70, [], [70], [], 0, 0)
+        stand = Stand(vehicle, 70, 70, Held(), [70], [], 0, 0)
         leader.take_host_state(
             HostState(shard=0, agent="rover", generation=5, seq=lie.seq, knows=(0, 0), vehicles=[stand]), 0
         )
@@ -115,7 +115,7 @@ def test_no_external_vehicle_and_not_all_together_take_all_cells(monkeypatch: py
         held = list(leader._orders.of["rover-00"])
         end = held[-1][0]
         ahead = list(range(end + 1, end + 13))
-        stand = Stand("rover-00", 0, end, held, ahead, ahead[:1], 1, 0)
+        stand = Stand("rover-00", 0, end, Held.of(held), ahead, ahead[:1], 1, 0)
         leader.take_host_state(
             HostState(shard=0, agent="rover", generation=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0
         )
@@ -208,17 +208,17 @@ def test_a_replaced_external_vehicle_says_nothing_and_takes_nothing() -> None:
 
 
 def test_cells_shut_for_an_external_vehicle_are_opened_only_by_a_generation_that_counts() -> None:
-    held = {"rover-00": [(70, 1, 1), (71, 1, 1)]}
-    leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, held)])
+    held = [(70, 1, 1), (71, 1, 1)]
+    leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, {"rover-00": Held.of(held)})])
     older = entering("rover", 70, generation=1 << 33)
     leader.take_host_state(HostState(**{**fields_of(older), "dead": [5]}), 0)
-    assert leader._orders.fenced == {("rover", 5): held}
+    assert leader._orders.fenced == {("rover", 5): {"rover-00": held}}
     leader.take_host_state(entering("a1", 71), 0)
     younger = entering("rover", 70, generation=(1 << 40) + 1)
     leader.take_host_state(HostState(**{**fields_of(younger), "dead": [5]}), 0)
     table = leader.tick(0)
     assert table is not None
-    assert table.grants["rover-00"] == [(70, 1, 1)]
+    assert [*table.grants["rover-00"]] == [(70, 1, 1)]
 
 
 def fields_of(standing: HostState) -> dict[str, object]:

@@ -65,7 +65,7 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     assert (
         holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + HEARTBEAT_NS - 1) == []
     )
-    assert (said.vehicles[0].holds, said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
+    assert ([*said.vehicles[0].holds], said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
     hear(holdings, table_of(1, 3, a0=[9, *entries(1, 2, 10, 11)]))  # it has not heard that yet
     assert list(holdings.path("a0-00")) == [9]
     hear(holdings, table_of(1, 4, a0=[9, (10, 1, 4)]))
@@ -85,7 +85,7 @@ def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(
         assert holdings.path("a0-00") == left
     assert [word.entries for word in holdings.lefts(S)] == [[(13, 1, 1)]]
     (told,) = holdings.standings(wish, S)
-    assert told.standing.vehicles[0].holds == [(cell, 1, 1) for cell in cells[:5]]
+    assert [*told.standing.vehicles[0].holds] == [(cell, 1, 1) for cell in cells[:5]]
 
 
 def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left() -> None:
@@ -95,7 +95,7 @@ def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left() ->
     hear(holdings, table_of(1, 1, a0=cells))
 
     def held_by_word() -> list[int]:
-        return [cell for told in holdings.standings(wish, S) for cell, *_ in told.standing.vehicles[0].holds]
+        return [cell for told in holdings.standings(wish, S) for cell in told.standing.vehicles[0].holds.cells]
 
     assert held_by_word() == cells
     holdings.moved("a0-00", 10)
@@ -113,8 +113,8 @@ def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
     waits = Entry((10, 1, 2), [(1, 1, "a1-00")])
-    held = {"a0-00": [Entry((9, 1, 1)), waits]}
-    granted = msgspec.structs.replace(granted_of(table_of(1, 2, a0=[9])), grants=held)
+    table = table_of(1, 2, a0=[9, waits.number])
+    granted = msgspec.structs.replace(granted_of(table), waits={"a0-00": [waits]})
     holdings.hear_granted(granted, S)
     assert (holdings.path("a0-00"), holdings.open("a0-00")) == ([9, 10], [9])
     with pytest.raises(ValueError, match="must not enter cell 10"):

@@ -13,7 +13,7 @@ from support.shard_tables import (
 )
 
 from swarm.right_of_way.incarnations import HEARTBEAT_NS
-from swarm.wire.messages.traffic import Granted, Stand, Stored, Table
+from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
 from vehicle_agent.traffic.member import Member, Refused, Save
 
 
@@ -145,7 +145,7 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    wants = [Stand("a0-00", 9, 9, [(9, 0, 1)], [], [18, 10], 2, 0)]
+    wants = [Stand("a0-00", 9, 9, Held.of([(9, 0, 1)]), [], [18, 10], 2, 0)]
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
@@ -155,7 +155,7 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
     assert isinstance(granted, Granted)
     assert (granted.host, granted.stamp, granted.heard) == ("a0", table.stamp, 2)
-    assert [entry.cell for entry in granted.grants["a0-00"]] == [9, 10]
+    assert [*granted.grants["a0-00"].cells] == [9, 10]
     assert granted.occupied == [18]
     assert member.hear_stored(stored, 2 * S) == []  # told just now
     assert [type(each) for each in member.hear_stored(stored, 2 * S + HEARTBEAT_NS)] == [Granted]

@@ -16,14 +16,14 @@ from msgspec.msgpack import encode
 from support.effort import few
 
 from swarm.errors import DamagedError, StoreError
-from swarm.wire.messages.traffic import Table
+from swarm.wire.messages.traffic import Held, Table
 from vehicle_agent import promise_store
 from vehicle_agent.promise_store import FilePromiseStore
 from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 
 def table(shard: int, seq: int) -> Table:
-    return Table(shard=shard, agent="a0", epoch=3, seq=seq, hosts={}, grants={"a0-00": [(seq, 3, seq)]})
+    return Table(shard=shard, agent="a0", epoch=3, seq=seq, hosts={}, grants={"a0-00": Held.of([(seq, 3, seq)])})
 
 
 def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
@@ -81,13 +81,13 @@ def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_
 _PROMISES = """
 import itertools, sys
 from pathlib import Path
-from swarm.wire.messages.traffic import Table
+from swarm.wire.messages.traffic import Held, Table
 from vehicle_agent.promise_store import FilePromiseStore
 store = FilePromiseStore(Path(sys.argv[1]))
 start = max((promised for promised, _ in store.saved.values()), default=0)
 for promised in itertools.count(start + 1):
     for shard in range(3):
-        grants = {f"a0-{n}": [(n, promised, n)] for n in range(40)}
+        grants = {f"a0-{n}": Held.of([(n, promised, n)]) for n in range(40)}
         store.save(promised, Table(shard=shard, agent="a0", epoch=promised, seq=1, hosts={}, grants=grants))
     store.sync()
     print(promised, flush=True)

@@ -8,7 +8,7 @@ from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, tabl
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import Fence, Known, KnownRequest, Table
+from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
@@ -67,7 +67,7 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     None
 ):
     """No other process can: the later incarnation has another file. It had left that shard long ago."""
-    table = msgspec.structs.replace(table_of(1, 1), fences=[Fence("a4", 1 << 32, {"a4-00": [(9, 1, 1)]})])
+    table = msgspec.structs.replace(table_of(1, 1), fences=[Fence("a4", 1 << 32, {"a4-00": Held.of([(9, 1, 1)])})])
     member = rights_of(MEMBERS[0], {0: (1, table)})
     (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
     assert isinstance(known, Known)

@@ -7,7 +7,7 @@ from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_o
 
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.incarnations import HEARTBEAT_NS, first_generation, is_far_ahead
-from swarm.wire.messages.traffic import Stand
+from swarm.wire.messages.traffic import Held, Stand
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import Leader
 
@@ -37,9 +37,9 @@ def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_d
         table = leader.tick(0)
         assert table is not None
         assert [(each.agent, each.generation, each.entries) for each in table.fences] == [
-            ("a1", 1, {"a1-00": entries(1, 1, 9, 10)})
+            ("a1", 1, {"a1-00": Held.of(entries(1, 1, 9, 10))})
         ]
-        assert table.grants["a1-00"] == [(9, 3, 2)]  # a new one, behind that of the older generation
+        assert [*table.grants["a1-00"]] == [(9, 3, 2)]  # a new one, behind that of the older generation
         leader.take_host_state(end, 0)
         assert all(each.generation != 1 for each in leader.tick(S).fences)  # type: ignore[union-attr]
 
@@ -47,13 +47,13 @@ def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_d
 def test_the_entry_of_a_body_passes_to_the_generation_that_proves_the_older_one_ended() -> None:
     for dead, cells in (([1], [(10, 1, 1)]), ([], [])):
         leader = Leader(SHARDS, "a0", 3, table_of(1, 1, rover=[9, 10]), {"a1": ["a1-00"]})
-        stands = Stand("rover-00", 10, 10, [], [10], [], 0, 0)
+        stands = Stand("rover-00", 10, 10, Held(), [10], [], 0, 0)
         leader.take_host_state(
             standing("rover", [(10, 0, 0)], 1, generation=1 << 32, dead=dead, vehicles=[stands]), 0
         )
         table = leader.tick(0)
         assert table is not None
-        assert table.grants.get("rover-00", []) == cells
+        assert [*table.grants.get("rover-00", [])] == cells
 
 
 def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_heard_the_younger() -> None:
@@ -91,7 +91,7 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
         held = table_of(1, 1, **{host: [cell] for host, cell in places.items()})
         leader = Leader(SHARDS, "a0", 3, held, {host: [f"{host}-00"] for host in places})
         for host, cell in places.items():
-            stand = Stand(f"{host}-00", cell, cell, [(cell, 1, 1)], [27], [27], 1, step << 12)
+            stand = Stand(f"{host}-00", cell, cell, Held.of([(cell, 1, 1)]), [27], [27], 1, step << 12)
             leader.take_host_state(standing(host, [(cell, 1, 1)], seq=2, vehicles=[stand]), 0)
         table = leader.tick(0)
         assert table is not None
@@ -111,7 +111,9 @@ def plan(stands: dict[str, Stand]) -> dict[str, list[int]]:
 
 
 def stand_of(host: str, cells: list[int], ahead: list[int] = [], wants: list[int] = [], age: int = 0) -> Stand:  # noqa: B006
-    return Stand(f"{host}-00", cells[0], cells[-1], entries(1, 1, *cells), ahead, wants, len(wants), age << 12)
+    return Stand(
+        f"{host}-00", cells[0], cells[-1], Held.of(entries(1, 1, *cells)), ahead, wants, len(wants), age << 12
+    )
 
 
 def test_a_vehicle_follows_one_that_goes_on_and_none_that_stays() -> None:
