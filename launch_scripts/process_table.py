@@ -95,7 +95,7 @@ TABLE: dict[str, Role] = {
         takes_over="beside",
     ),
     "places": Role(
-        entry="planner_service.places.main:run",
+        entry="planner_service.main:run_places",
         jobs=places_of,
         standbys=lambda scenario: scenario.standbys.planner,
         stops=2,

@@ -241,7 +241,7 @@ class Followers:
     def get(self, vehicle: str) -> Follower | None:
         return self._by_id.get(vehicle)
 
-    def is_stale(self, vehicle: str) -> None:
+    def mark_stale(self, vehicle: str) -> None:
         """There may be a better route for a vehicle than the one it has."""
         if vehicle in self._by_id:
             self._by_id[vehicle].stale = True

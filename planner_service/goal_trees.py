@@ -134,10 +134,7 @@ class GoalTrees:
             return GoalAnswer(Route(status=RouteStatus.UNREACHABLE, start=start), lethal_goal=True)
         if not self.costs.cell_cost[at] < np.inf:
             return GoalAnswer(Route(status=RouteStatus.LETHAL_START, start=start))
-        kept = self._kept.get(goal)
-        if kept is not None and not self._look(kept):
-            self._drop(goal)
-            kept = None
+        kept = self._up_to_date(goal)
         known: _Found | None = None
         if kept is not None:
             self._kept.move_to_end(goal)
@@ -155,8 +152,23 @@ class GoalTrees:
             Route(status=RouteStatus.NO_TARGET, start=start, lower_bound_s=frontier_s), grown_cells=grown
         )
 
-    def _look(self, kept: _Kept) -> bool:
-        """Collects the changes near a tree since it was looked at last. Returns False if they are too many."""
+    def still_cheapest(self, goal: int, start: int) -> bool:
+        """Returns True if the cheapest routes between two cells are known to cost what they did before the last
+        changes. Nothing is grown, and the cache keeps its order."""
+        kept = self._up_to_date(goal)
+        return kept is not None and self._known(kept, self.costs.pad(start)) is not None
+
+    def _up_to_date(self, goal: int) -> _Kept | None:
+        """The tree of a goal with the changes near it since it was asked last; None, and dropped, if those are too
+        many."""
+        kept = self._kept.get(goal)
+        if kept is not None and not self._collect(kept):
+            self._drop(goal)
+            return None
+        return kept
+
+    def _collect(self, kept: _Kept) -> bool:
+        """Collects the changes near a tree. Returns False if they are too many."""
         if kept.seen < self._forgotten:
             return False
         fresh = self._log[kept.seen - self._forgotten :]

@@ -8,16 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from planner_service.strategy import (
-    AHEAD,
-    STRATEGIES,
-    FullGrowth,
-    Growths,
-    OnMove,
-    Strategy,
-    StrategyRow,
-    WidestWindow,
-)
+from planner_service.strategy import AHEAD, STRATEGIES, Growths, OnMove, Strategy, StrategyRow
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
@@ -27,9 +18,9 @@ MODEL_NS_PER_CELL = 15
 """Model cost of a full search per cell, for choices that must be the same on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
-MODEL_PIECES_NS_PER_ROW = 5_000
-"""The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096. It counts
-until a move has been measured."""
+MODEL_PIECES_NS_PER_ROW = 2_400
+"""The same of a tree in pieces, for each row of a square map: `bench moves` measures 1.2 ms at 512 x 512, 4 at
+2048, 10 at 4096. It counts until a move has been measured."""
 PIECES_CELLS = 1 << 18
 """Maps of this number of cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as
 by the parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
@@ -83,6 +74,9 @@ class GrowthTimes:
         self._tick_hz = config.tick_hz
         self._has_worker = has_worker
         self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
+        strategy = self._chosen_by
+        self.may_stop = not isinstance(strategy, StrategyRow) or strategy.stops_at_askers
+        """True if a row may come into force by which growths stop: askers are then noted under the others, too."""
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
@@ -123,8 +117,10 @@ class GrowthTimes:
         median_ns = _median_with(self._full_took_ns, took_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
-        # growth, and twice the memory.
-        if not self._exact_took_ns and not self.in_pieces:
+        # growth, and twice the memory. Beside windows, no exact move is measured, and growths tell that a load of
+        # the machine has ended.
+        if not self.row.is_exact or not (self._exact_took_ns or self.in_pieces):
+            self._exact_took_ns.clear()
             self.exact_ns = self.exact_ns * median_ns // self.full_ns
         self.full_ns = max(1, median_ns)
         self._choose()
@@ -138,7 +134,7 @@ class GrowthTimes:
         self._choose()
 
     def _choose(self) -> None:
-        widest = self.widest(WidestWindow.WHILE_CHEAPER)
+        widest = self.widest(thins_far_cells=False)
         exact_ns = min(self.exact_ns if self.mends_quickly else math.inf, self.near_ns)
         self._chosen_at = self._moves_per_tick
         times = Growths(
@@ -146,9 +142,9 @@ class GrowthTimes:
         )
         self.row = self._chosen_by.row(times)
 
-    def widest(self, rule: WidestWindow) -> int:
+    def widest(self, thins_far_cells: bool) -> int:
         """Half width of the widest window that is searched without a worker, in cells."""
-        if rule is WidestWindow.SHARE_OF_MAP:
+        if thins_far_cells:
             side = max(self._grid.rows, self._grid.cols)
             return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
@@ -319,7 +315,7 @@ class WindowLimit:
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, new, self._config.k_min)
             return (min(half, max(fine, least)) if has_strides else half), half
-        widest = self._times.widest(row.widest_window)
+        widest = self._times.widest(row.thins_far_cells)
         if has_strides and self._schedule.beyond(new, widest):
             return max(widest, fine, least), self._side
         half = max(self._schedule.half(new, widest), least)
@@ -328,4 +324,4 @@ class WindowLimit:
     def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
         """Returns True if the whole tree is due to become exact, which takes this time."""
         within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
-        return row.full_growth is FullGrowth.WITHIN_BUDGET and within_budget
+        return row.renews_within_budget and within_budget

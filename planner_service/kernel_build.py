@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -79,7 +79,6 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     stride_network.join_nodes,
     stride_growth.tighten,
     stride_network.write_paths,
-    route_walk.relabel,
     partition_search.improve_tiles,
     partition.relabel_tiles,
     partition_totals.add_up,
@@ -124,13 +123,18 @@ def needed_kernels(scenario: Scenario) -> NeededKernels:
     ground, aloft = scenario.cost.directional, bool(aloft_classes(scenario))
     first, classes = _first_kernels(scenario)
     later = [*_of_kind(LATER, ground), *(_of_kind(LATER, True) if aloft else [])]
-    return NeededKernels(*_once(first, [*classes, *later]))
+    return _needed(first, [*classes, *later])
 
 
 def place_kernels(scenario: Scenario) -> NeededKernels:
     """Returns the kernels that the process which plans to places calls."""
     first, classes = _first_kernels(scenario)
-    return NeededKernels(*_once([*first, *GOALS], classes))
+    return _needed([*first, *GOALS], classes)
+
+
+def _needed(first: Iterable[Kernel], later: Iterable[Kernel]) -> NeededKernels:
+    once = dict.fromkeys(first)
+    return NeededKernels(tuple(once), tuple(each for each in dict.fromkeys(later) if each not in once))
 
 
 def _first_kernels(scenario: Scenario) -> tuple[list[Kernel], list[Kernel]]:
@@ -142,20 +146,8 @@ def _first_kernels(scenario: Scenario) -> tuple[list[Kernel], list[Kernel]]:
 
 def all_kernels() -> list[Kernel]:
     """Returns the kernels of planners on any map, each once: those needed more often come first."""
-    return [
-        *chain(*_once(*(_of_kind(part, kind) for part in (FIRST, LATER, GOALS, [PULL]) for kind in (False, True))))
-    ]
-
-
-def _once(*parts: Sequence[Kernel]) -> list[tuple[Kernel, ...]]:
-    """The same parts, each kernel in the first of them that has it."""
-    known: set[str] = set()
-    kept = []
-    for part in parts:
-        fresh = {name_of(kernel): kernel for kernel in part if name_of(kernel) not in known}
-        known |= fresh.keys()
-        kept.append(tuple(fresh.values()))
-    return kept
+    parts = (_of_kind(part, kind) for part in (FIRST, LATER, GOALS, [PULL]) for kind in (False, True))
+    return list(dict.fromkeys(chain(*parts)))
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:

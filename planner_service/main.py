@@ -1,4 +1,4 @@
-"""The planner of one target, as a process."""
+"""The processes that plan: the planner of one target, and that of routes to places."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.growth_times import is_slow_to_grow
-from planner_service.kernel_build import KernelLoader, needed_kernels
+from planner_service.kernel_build import KernelLoader, NeededKernels, needed_kernels, place_kernels
+from planner_service.place_planner import PlacesService
+from planner_service.planning_process import Planning
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.terrain.store import load_terrain
+from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
@@ -20,7 +23,7 @@ from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.job_slots import JobSlots
-from swarm.runtime.process import ThreadWorker, tick_phase
+from swarm.runtime.process import Service, ThreadWorker, tick_phase
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -33,25 +36,55 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     if target not in scenario.target_ids:
         ids = ", ".join(scenario.target_ids)
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
+    terrain = _load_ground(setup)
+    kernels = _load_kernels(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
+
+    def make(boundary: Boundary, planning: Planning) -> Service:
+        stopwatch = boundary.function("stopwatch", time.thread_time_ns, int)
+        all_kernels = boundary.function("all kernels", lambda: kernels.complete, bool)
+        return PlannerService(planning, all_kernels, stopwatch, boundary.external(prepared, PREPARED_COSTS))
+
+    _serve(setup, terrain, stop_when, make, "grow-tree", JobSlots(setup.run_dir))
+
+
+def run_places(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+    """Plan to any place until SIGTERM, SIGINT or the end of the launcher."""
+    terrain = _load_ground(setup)
+    kernels = _load_kernels(place_kernels(setup.scenario), whole=False)
+
+    def make(boundary: Boundary, planning: Planning) -> Service:
+        return PlacesService(planning, boundary.function("all kernels", lambda: kernels.complete, bool))
+
+    _serve(setup, terrain, stop_when, make, "grow-places")
+
+
+def _load_ground(setup: RoleSetup) -> Terrain:
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
-    kernels = KernelLoader(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
+    return terrain
+
+
+def _load_kernels(needed: NeededKernels, whole: bool) -> KernelLoader:
+    kernels = KernelLoader(needed, whole)
     kernels.load_first(log.info)
-    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
+    return kernels
+
+
+def _serve(
+    setup: RoleSetup,
+    terrain: Terrain,
+    stop_when: Callable[[], None] | None,
+    make: Callable[[Boundary, Planning], Service],
+    worker_name: str,
+    slots: JobSlots | None = None,
+) -> None:
     inbox = Inbox()
+    with closing(ThreadWorker(worker_name, inbox, slots)) as worker:
 
-    def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> PlannerService:
-        return PlannerService(
-            setup,
-            terrain,
-            bus,
-            inbox.post,
-            boundary.worker(worker),
-            boundary.function("stopwatch", time.thread_time_ns, int),
-            boundary.function("all kernels", lambda: kernels.complete, bool),
-            boundary.external(prepared, PREPARED_COSTS),
+        def service(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> Service:
+            return make(boundary, Planning(setup, terrain, bus, inbox.post, boundary.worker(worker)))
+
+        run_role(
+            setup, terrain.digest, stop_when, service, inbox, setup.scenario.planner.tick_hz, tick_phase(setup.id)
         )
-
-    with closing(ThreadWorker("grow-tree", inbox, JobSlots(setup.run_dir))) as worker:
-        tick_hz = scenario.planner.tick_hz
-        run_role(setup, terrain.digest, stop_when, make, inbox, tick_hz, tick_phase(setup.id))

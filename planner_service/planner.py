@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,13 @@ import numpy as np
 from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, MapIntake
 from planner_service.gap_statistics import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
 from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.target_watch import TargetWatch
+from planner_service.tree.partitioned_tree import GrownTree
 from planner_service.tree.strides import StrideNetwork
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
@@ -27,6 +28,7 @@ from swarm.grid import Window
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import MOST_VEHICLES, pack_column
 from swarm.wire.messages.planning import (
+    Believed,
     CostReply,
     CostRequest,
     PlannerStatus,
@@ -52,7 +54,24 @@ GOOD_GAP = 1.05
 good already: four of five such growths gave back the route that was there
 (docs/design/zenoh-topology-and-inboxes.md)."""
 
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A request that is not answered, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Work:
+    """Run `job` on a worker, and bring what it returns to `Planner.adopt` or `Planner.adopt_strides`."""
+
+    job: Callable[[], GrownTree] | Callable[[], StrideNetwork]
+
+
 Answer = RouteReply | CostReply | Refusal
+Action = Work | PushedRoute | PlannerStatus | Believed
+"""Action of a planner: a search to run, or a message to publish."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 SEARCH_COUNTS = ("searches", "search_places")
@@ -182,7 +201,7 @@ class Planner:
         actions = self._keep_up(now_ns)
         self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
-            actions.append(FindStrides(self.tree.stride_job()))
+            actions.append(Work(self.tree.stride_job()))
         self.followers.drop_silent(now_ns)
         if self.leads:
             actions.extend(self._pushes(now_ns))
@@ -307,12 +326,12 @@ class Planner:
             self._unseen_mark_ns = max(stamp_ns, self._unseen_mark_ns or 0)
         return dirty
 
-    def _grow(self, now_ns: int) -> GrowTree:
+    def _grow(self, now_ns: int) -> Work:
         assert self._told is not None
         self._growing_since_ns = now_ns
         self._dirty_since_snapshot = []
         self._wants_full = False
-        return GrowTree(self.tree.full_job(self._told[0]))
+        return Work(self.tree.full_job(self._told[0]))
 
     def _changed(self, update: Update, dirty: Sequence[Window], now_ns: int) -> None:
         """The tree is another than before."""

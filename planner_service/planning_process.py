@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import LearnedGauges
@@ -25,6 +26,17 @@ from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.topics import PUSHED_ROUTE, Topic
 
 
+@dataclass(frozen=True, slots=True)
+class Planning:
+    """Surroundings of a process that plans, live or simulated."""
+
+    setup: RoleSetup
+    terrain: Terrain
+    bus: Bus
+    post: Post
+    worker: Worker
+
+
 class PlanningProcess:
     """One process of several with one job, of which the leader serves.
 
@@ -36,18 +48,15 @@ class PlanningProcess:
 
     def __init__(
         self,
-        setup: RoleSetup,
-        terrain: Terrain,
-        bus: Bus,
-        post: Post,
-        worker: Worker,
+        planning: Planning,
         groups: frozenset[str] | None,
         served: Mapping[Topic, dict[str, str]],
         all_kernels: Callable[[], bool] | None,
     ) -> None:
+        setup, terrain, bus, post = planning.setup, planning.terrain, planning.bus, planning.post
         scenario = setup.scenario
         self._scenario, self._job, self._incarnation = scenario, job_of(setup.id), setup.incarnation
-        self._bus, self._post, self._worker = bus, post, worker
+        self._bus, self._post, self._worker = bus, post, planning.worker
         self._served_topics = served
         self._all_kernels = all_kernels or (lambda: True)
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
@@ -87,7 +96,7 @@ class PlanningProcess:
                 self._candidacy.on_election_event,
                 self._obedience.on_order_event,
             )
-            any(handle(event, now_ns) for handle in handlers)
+            any(takes(event, now_ns) for takes in handlers)
 
     def _take_map(self, now_ns: int) -> None:
         """Begins a tick: takes what others say about the map."""

@@ -8,26 +8,24 @@ from functools import partial
 
 import msgspec
 
-from planner_service.planner import Answer, Planner
-from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
-from planner_service.planning_process import PlanningProcess
+from planner_service.planner import Action, Answer, Planner, Refusal, Work
+from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
+from planner_service.tree.partitioned_tree import GrownTree
 from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_filter import readable_for_target
 from shared_map.sightings import Presence, Sightings, pose_of
-from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, Heard, LinkChanged, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, Heard, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
     Believed,
@@ -55,7 +53,6 @@ from swarm.wire.topics import (
 
 log = logging.getLogger(__name__)
 
-_GROW, _STRIDES = "grow-tree", "find-strides"
 _PRESENCE_NS = 5 * NS_PER_S
 """A vehicle of which nothing was heard for so long sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
@@ -73,23 +70,20 @@ class PlannerService(PlanningProcess):
 
     def __init__(
         self,
-        setup: RoleSetup,
-        terrain: Terrain,
-        bus: Bus,
-        post: Post,
-        worker: Worker,
-        stopwatch: Callable[[], int] | None = None,
+        planning: Planning,
         all_kernels: Callable[[], bool] | None = None,
+        stopwatch: Callable[[], int] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
+        setup, grid = planning.setup, planning.terrain.grid
         scenario, self._target = setup.scenario, job_of(setup.id)
         self._heard_groups = readable_for_target(scenario, self._target)
         key = {"target": self._target}
         served = dict.fromkeys((ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST), key)
-        super().__init__(setup, terrain, bus, post, worker, self._heard_groups, served, all_kernels)
+        super().__init__(planning, self._heard_groups, served, all_kernels)
         self._stopwatch, self._prepared = stopwatch, prepared
         # Position of the target.
-        self._watch = TargetWatch(self._target, terrain.grid, self.counters, scenario.time_scale, leads=False)
+        self._watch = TargetWatch(self._target, grid, self.counters, leads=False)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(self._mark_filter)
         self._presence = Presence(_PRESENCE_NS, self._mark_filter)
@@ -99,7 +93,7 @@ class PlannerService(PlanningProcess):
         # The planners, one of each class with queries.
         self._faults: list[str] = []
         """Faults of the strategy's plug-in that are not reported yet."""
-        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
+        world = StrategyWorld(self._target, grid, scenario.planner)
         self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
         tree = self._new_tree(self._cost_maps[GROUND])
         if prepared is not None:
@@ -249,15 +243,15 @@ class PlannerService(PlanningProcess):
         if not seen and 0 <= sighted.cell < self._cost_maps[GROUND].grid.cells:
             self._search.remember(sighted, now_ns)
 
-    def _tag(self, work: str, name: str) -> str:
+    def _tag(self, name: str) -> str:
         """Returns the tag of a job for the planner of a class."""
-        return f"{work}/{name}/{self._planners.begun_ns(name)}"
+        return f"{name}/{self._planners.begun_ns(name)}"
 
     def _asked_by(self, tag: str) -> Planner | None:
         """The planner that asked for a piece of work; None if it was dropped since: another one of its class has
         begun with the map as it was later."""
-        work, name, _ = tag.split("/")
-        return self._planners.held(name) if tag == self._tag(work, name) else None
+        name, _ = tag.split("/")
+        return self._planners.held(name) if tag == self._tag(name) else None
 
     def _take_fleet(self, now_ns: int) -> None:
         """Takes the positions of vehicles, which may see a target without a living tracker."""
@@ -377,10 +371,8 @@ class PlannerService(PlanningProcess):
         name = planner.vehicle_class
         for action in actions:
             match action:
-                case GrowTree(job):
-                    self._worker.submit(self._tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
-                case FindStrides(job):
-                    self._worker.submit(self._tag(_STRIDES, name), job, self._post, planner.tree.times.model_ns)
+                case Work(job):
+                    self._worker.submit(self._tag(name), job, self._post, planner.tree.times.model_ns)
                 case PlannerStatus() if name != GROUND:
                     pass  # the planner of "ground" has published the same about the target
                 case PushedRoute() as pushed:

@@ -37,29 +37,16 @@ class OnMove(Enum):
     """Ours: windows of doubling width, each searched again once the target has moved by a 16th of its reach."""
 
 
-class FullGrowth(Enum):
-    """Condition for a full search of a strategy with windows, beside windows that cannot be searched."""
-
-    WHEN_FORCED = "when forced"
-    """Section 3.3.2, the passive strategy: only when a vehicle whose route has run out asks."""
-    WITHIN_BUDGET = "within the budget"
-    """Full searches at the rate which `planner.cpu_budget` allows."""
-
-
-class WidestWindow(Enum):
-    """Largest width of a scheduled window before other work takes its place."""
-
-    WHILE_CHEAPER = "while cheaper than a full growth"
-    SHARE_OF_MAP = "a 16th of the map's side"
-    """The fine part of multi-resolution: what lies beyond belongs to the strides."""
-
-
 @dataclass(frozen=True, slots=True)
 class StrategyRow:
     """One strategy.
 
+    renews_within_budget  full searches at the rate which `planner.cpu_budget` allows, beside windows that cannot be
+                        searched. If not, section 3.3.2, the passive strategy: only when a vehicle whose route has
+                        run out asks
     thins_far_cells     section 3.3.3, multi-resolution: far from the target only the ways between blocks of 16,
-                        32, ... cells are grown, a stride that doubles with the distance
+                        32, ... cells are grown, a stride that doubles with the distance. Scheduled windows reach a
+                        16th of the map's side then: what lies beyond belongs to the strides
     stops_at_askers     a growth for a move goes only as far as the farthest asker, which is "as fast as a
                         single-path planning procedure from the target to the farthest vehicle" (section 3.3.1).
                         With exact moves, while that takes less time
@@ -68,9 +55,8 @@ class StrategyRow:
     """
 
     on_move: OnMove
-    full_growth: FullGrowth = FullGrowth.WHEN_FORCED
+    renews_within_budget: bool = False
     thins_far_cells: bool = False
-    widest_window: WidestWindow = WidestWindow.WHILE_CHEAPER
     renews_loose_bounds: bool = False
     stops_at_askers: bool = False
 
@@ -130,9 +116,7 @@ ROWS: Mapping[str, StrategyRow] = {
     "full": StrategyRow(OnMove.WHOLE_TREE, stops_at_askers=True),
     "exact": StrategyRow(OnMove.EXACT_MOVE),
     "variable_range": StrategyRow(OnMove.BLOCK_WINDOW),
-    "multi_resolution": StrategyRow(
-        OnMove.SCHEDULED_WINDOW, thins_far_cells=True, widest_window=WidestWindow.SHARE_OF_MAP
-    ),
+    "multi_resolution": StrategyRow(OnMove.SCHEDULED_WINDOW, thins_far_cells=True),
     "variable_range+multi_resolution": StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True),
 }
 """Every strategy of one row; `auto` goes through those of `STAGES`."""
@@ -141,7 +125,7 @@ Stage = Literal["exact", "rotate"]
 
 STAGES: Mapping[Stage, StrategyRow] = {
     "exact": StrategyRow(OnMove.EXACT_MOVE, renews_loose_bounds=True, stops_at_askers=True),
-    "rotate": StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True),
+    "rotate": StrategyRow(OnMove.SCHEDULED_WINDOW, renews_within_budget=True, renews_loose_bounds=True),
 }
 """`auto`: exact moves while one fits into a tick; then windows, with exact trees in turn
 (docs/method/paper.md says why no strides)."""

@@ -19,13 +19,22 @@ from numpy.typing import NDArray
 from planner_service.growth_times import Askers, GrowthTimes, WindowLimit, exact_half
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.route_walk import UNREACHABLE
-from planner_service.planner_actions import GrownTree, can_be_root, growth_job, offered_gaps
-from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
+from planner_service.strategy import HYSTERESIS, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
-from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
+from planner_service.tree.partitioned_tree import (
+    AnyTree,
+    GrownTree,
+    PieceTree,
+    can_be_root,
+    empty_tree,
+    growth_job,
+    in_cells,
+    in_pieces,
+    offered_gaps,
+)
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import StrideNetwork, find_strides
 from shared_map.array_files import Floats
@@ -299,7 +308,7 @@ class TargetTree:
         window = self._grid.around(target, half)
         grown_cells = 0
         has_windows = self.strategy.on_move is not OnMove.WHOLE_TREE
-        if half <= self.times.widest(self.strategy.widest_window) and has_windows and self._tree.precise:
+        if half <= self.times.widest(thins_far_cells=False) and has_windows and self._tree.precise:
             grown_cells = self._tree.move(target, window)
         if not grown_cells:
             return Update("none", wants_full=not self._job_out)
@@ -454,7 +463,7 @@ class TargetTree:
         """A tree before a window makes its costs upper bounds: they are taken for a heuristic if they are exact."""
         if tree.fine:
             if not tree.precise:
-                tree.relabel()
+                tree.mend()
             if self._is_better_bound and tree.exact:
                 self._bounds.take(tree.cost.copy())
             self._is_better_bound = False
@@ -500,7 +509,8 @@ class TargetTree:
             return False
         if row.on_move is OnMove.WHOLE_TREE:
             return self._is_quick or self.times.is_short(self.times.near_ns)
-        return self.times.near_ns < self.times.exact_ns
+        # A whole tree is given up for a clear gain only: to have it again takes a growth.
+        return self.times.near_ns < self.times.exact_ns * (HYSTERESIS if self._is_whole else 1.0)
 
     @property
     def _is_whole(self) -> bool:
@@ -550,7 +560,7 @@ class TargetTree:
 
     def _reach(self, asked: NDArray[np.int64]) -> None:
         """Goes on with a growth that has stopped as far as these cells."""
-        if not self.strategy.stops_at_askers and self._is_whole:
+        if not self.times.may_stop and self._is_whole:
             return
         tree, starts = self._tree, self._open(self._inside(asked))
         if not self._is_whole and isinstance(tree, CostToGoTree):
@@ -630,8 +640,10 @@ class TargetTree:
 
     @property
     def _can_mend(self) -> bool:
-        """Returns True if the tree can be made exact here and now, by its parents."""
-        return self.times.mends_quickly and self._all_kernels() and self._tree.fine
+        """Returns True if the tree can be made exact here and now, by its parents. Where exact trees are in pieces,
+        to make another exact takes as long as to grow it."""
+        fits = isinstance(self._tree, PieceTree) or not self.times.in_pieces
+        return fits and self.times.mends_quickly and self._all_kernels() and self._tree.fine
 
     def _mend(self) -> Update:
         """Makes the tree exact; where a growth costs less, grow it or ask a worker to."""

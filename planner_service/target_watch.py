@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
@@ -11,12 +10,7 @@ from swarm.runtime.stats import Counters
 from swarm.runtime.tracking import Tracking, Verdict
 from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
-COUNTS = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off", "trackers_lost")
-FASTEST_M_PER_S = 100.0
-"""On the terrain. A target that moves faster without a jump was teleported: by a fault of its tracker, or by two
-that share a name."""
-_NOISE_CELLS = 8
-_CLOCK_OFF_NS = 60 * NS_PER_S
+COUNTS = ("poses_refused", "poses_outside", "trackers_lost")
 _REFUSED_OFTEN = 3
 """Poses of a tracker that are refused before it is named: the last of one that was replaced may come late."""
 _MOST_NAMED = 256
@@ -37,18 +31,14 @@ class TargetWatch:
 
     Each oddity of a tracker is counted every time, and reported once in a sentence for operators.
 
-    time_scale  seconds on the terrain per second
-    leads       false for a standby, which neither counts nor reports: the leader does
+    leads  false for a standby, which neither counts nor reports: the leader does
     """
 
-    def __init__(
-        self, target: str, grid: GridSpec, counters: Counters, time_scale: float = 1.0, leads: bool = True
-    ) -> None:
+    def __init__(self, target: str, grid: GridSpec, counters: Counters, leads: bool = True) -> None:
         self.target = target
         self.leads = leads
         self._grid = grid
         self._counters = counters
-        self._fastest_m_per_s = FASTEST_M_PER_S * time_scale
         self._tracking = Tracking(grid)
         self._lost = False
         self._lost_since_ns = 0
@@ -81,11 +71,8 @@ class TargetWatch:
         """A tracker tells a pose of the target."""
         if pose.target != self.target:
             return
-        before, heard_ns = self._tracking.pose, self._tracking.heard_ns
         verdict = self._tracking.judge(pose, now_ns)
         if verdict is Verdict.COUNTS:
-            self._check_clock(pose, now_ns)
-            self._check_speed(before, heard_ns, pose, now_ns)
             self._owned_by(pose, now_ns)
         elif verdict is Verdict.REFUSED:
             self._refuse(pose)
@@ -153,34 +140,15 @@ class TargetWatch:
             why = f"poses of {_name(pose)} are refused, as {_name(owner)} owns it"
         self._name_once("tracker-refused", pose, why)
 
-    def _check_clock(self, pose: TargetPose, now_ns: int) -> None:
-        off_ns = pose.stamp_ns - now_ns
-        if abs(off_ns) >= _CLOCK_OFF_NS:
-            self._count("tracker_clocks_off")
-            way = "ahead" if off_ns > 0 else "behind"
-            said = f"the clock of {_name(pose)} is {abs(off_ns) / NS_PER_S:.0f} s {way}, by which nothing changes"
-            self._name_once("tracker-clock", pose, said)
-
-    def _check_speed(self, before: TargetPose | None, heard_ns: int, pose: TargetPose, now_ns: int) -> None:
-        if before is None or before.jumps != pose.jumps:
-            return
-        moved_m = math.hypot(pose.x_m - before.x_m, pose.y_m - before.y_m)
-        elapsed_s = max(now_ns - heard_ns, pose.stamp_ns - before.stamp_ns, NS_PER_S // 10) / NS_PER_S
-        free_m = _NOISE_CELLS * self._grid.resolution_m
-        if moved_m > free_m + self._fastest_m_per_s * elapsed_s:
-            self._count("poses_teleported")
-            said = f"{_name(pose)} moved it by {moved_m:.0f} m in {elapsed_s:.1f} s without reporting a jump"
-            self._name_once("pose-teleported", pose, said, pose.cell)
-
     def _count(self, name: str) -> None:
         if self.leads:
             self._counters.count(name)
 
-    def _name_once(self, kind: str, pose: TargetPose, text: str, cell: int | None = None) -> None:
+    def _name_once(self, kind: str, pose: TargetPose, text: str) -> None:
         told = (kind, _key(pose))
         if told not in self._named and len(self._named) < _MOST_NAMED:
             self._named.add(told)
-            self._tell(kind, text, cell)
+            self._tell(kind, text)
 
     def _tell(self, kind: str, text: str, cell: int | None = None) -> None:
         self._to_tell.append(Tell(kind, f"target {self.target}: {text}", cell))

@@ -46,7 +46,7 @@ ZONE_COLOURS: dict[str, Colour] = {
     "quick": colours.FAST_MARK,
     "pace": palette.rgb(palette.PINK),
 }
-_WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")
+_WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside")
 _SHOWN_TARGETS = 12
 """Lines of the table beside the view, chosen by eye: more would have to be scrolled to. A line below tells how many
 more there are."""

@@ -42,8 +42,8 @@ _MOST_NAMES = 1 << 14
 """Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
 _MOST_SETS = 1 << 17
 """Sets of marks that are remembered: of a map of 4096 x 4096 cells, those of eight authors on each tile."""
-_ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
-"""Counts of planners: poses which do not count, or look wrong."""
+_ODD_POSES = ("poses_refused", "poses_outside")
+"""Counts of planners: poses which do not count."""
 
 
 @dataclass(frozen=True, slots=True)

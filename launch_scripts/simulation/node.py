@@ -11,7 +11,8 @@ from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.world.walks import WAY_MODULES
 from planner_service.kernel_build import needed_kernels, place_kernels
 from planner_service.kernels.compile import load
-from planner_service.places.service import PlacesService
+from planner_service.place_planner import PlacesService
+from planner_service.planning_process import Planning
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
@@ -73,13 +74,13 @@ def built(
             worker = boundary.worker(worker)
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
-            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, prepared)
+            return PlannerService(Planning(setup, terrain, bus, post, worker), kernels, stopwatch, prepared)
         case "places":
             worker = boundary.worker(worker)
             of_places: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
-            return PlacesService(setup, terrain, bus, post, worker, of_places)
+            return PlacesService(Planning(setup, terrain, bus, post, worker), of_places)
         case "targets":
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)

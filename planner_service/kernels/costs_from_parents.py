@@ -22,34 +22,22 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.compile import helper, prefetch, step_kernel
-from planner_service.kernels.layout import (
-    BUCKETS,
-    GRID,
-    INF,
-    LABELS,
-    NONE,
-    RULE_OCTILE,
-    SQRT2,
-    step_offsets,
-)
-from planner_service.kernels.parents import point_row_to_parents
+from planner_service.kernels.layout import BUCKETS, GRID, LABELS, NONE, RULE_OCTILE, SQRT2, step_offsets
 from planner_service.kernels.repair import (
+    ANY_COST,
     FINE_ROW,
     SCRATCH,
     clear_rows,
-    near_rows,
     point_near,
     row_factor,
-    span_near,
     spread,
+    sweep,
 )
 
 _ONE = np.uint64(1)
 _TWO = np.uint64(2)
 _AHEAD = np.uint64(24)
 """Cells of the walk whose memory is asked for before their turn."""
-_PART = np.uint64(64)
-"""Cells of a row that are looked through at once."""
 _TURNS = 12
 """Rounds of improvement after which a full search costs less: half as many are rare
 (docs/design/incremental-trees.md)."""
@@ -132,38 +120,6 @@ def _evaluate(grid, climbs, cost, root, walk, queue, keys):
 
 
 @helper
-def _improve(grid, climbs, labels, rows, best, lowered):
-    """Point the cells of `rows`, and those next to them, to the neighbour that offers them least, and lower them to
-    that offer where they cost more. Writes those to `lowered`; returns how many there are."""
-    cell_cost, _, stride, _, _ = grid
-    cost, parent, root = labels
-    first, last = rows
-    count = np.uint64(0)
-    from_row, to_row = near_rows(first, last)
-    for row in range(from_row, to_row):
-        begin, end = span_near(first, last, stride, row)
-        if end <= begin:
-            continue
-        point_row_to_parents(grid, climbs, cost, begin, end, parent, best)
-        at, width = np.uint64(begin), np.uint64(end - begin)
-        # In parts, as nearly none has a cell to lower: to ask vectorises.
-        for part in range(np.uint64(0), width, _PART):
-            until = min(part + _PART, width)
-            found = np.int32(0)
-            for i in range(part, until):
-                found += np.int32((best[i] < cost[at + i]) & (cell_cost[at + i] < INF))
-            if not found:
-                continue
-            for i in range(part, until):
-                if best[i] < cost[at + i] and cell_cost[at + i] < INF:
-                    cost[at + i] = best[i]
-                    lowered[count] = at + i
-                    count += _ONE
-    parent[root] = NONE
-    return np.int64(count)
-
-
-@helper
 def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
     """Lowers what hangs on the `count` cells of `queue`, whose costs have fallen, along the parents, and note all
     that in `rows`. A cell that hangs on two of them may be lowered twice. Returns how many times one was, or -1
@@ -225,7 +181,8 @@ def mend(grid, climbs, labels, buckets, farthest, most, scratch, walk):
         return visited, highest, False
     _note_all(rows, stride)
     for turn in range(_TURNS):
-        count = _improve(grid, climbs, labels, rows, best, lowered)
+        count = sweep(grid, climbs, cost, parent, rows, ANY_COST, best, lowered, np.int64(0))
+        parent[root] = NONE
         if count == 0:
             return visited, highest, True
         clear_rows(rows, cell_cost.size)
@@ -244,5 +201,6 @@ def mend(grid, climbs, labels, buckets, farthest, most, scratch, walk):
                 break
             visited += most
     _note_all(rows, stride)
-    _improve(grid, climbs, labels, rows, best, lowered)
+    sweep(grid, climbs, cost, parent, rows, ANY_COST, best, lowered, np.int64(0))
+    parent[root] = NONE
     return visited, highest, False

@@ -31,41 +31,22 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _parents_of_four(cell_cost, cost, s, first, last, parent, least):
+def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
+    """A diagonal counts if the more expensive of its two corners costs at most `limit`, and none where `step`, its
+    length, is inf. Free of branches: it vectorises."""
     for i in range(first, last):
-        best = cost[i - s] + cell_cost[i - s]
+        north, east, south, west = cell_cost[i - s], cell_cost[i + _ONE], cell_cost[i + s], cell_cost[i - _ONE]
+        best = cost[i - s] + north
         code = np.uint8(0)
-        key = cost[i + _ONE] + cell_cost[i + _ONE]
+        key = cost[i + _ONE] + east
         code = np.uint8(2) if key < best else code
         best = min(best, key)
-        key = cost[i + s] + cell_cost[i + s]
+        key = cost[i + s] + south
         code = np.uint8(4) if key < best else code
         best = min(best, key)
-        key = cost[i - _ONE] + cell_cost[i - _ONE]
+        key = cost[i - _ONE] + west
         code = np.uint8(6) if key < best else code
         best = min(best, key)
-        parent[i] = code if max(cost[i], best) < INF else NONE
-        if least is not None:
-            least[i - first] = best
-
-
-@helper
-def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
-    """A diagonal counts if the more expensive of its two corners costs at most `limit`. Free of branches: it
-    vectorises."""
-    for i in range(first, last):
-        north = cost[i - s] + cell_cost[i - s]
-        east = cost[i + _ONE] + cell_cost[i + _ONE]
-        south = cost[i + s] + cell_cost[i + s]
-        west = cost[i - _ONE] + cell_cost[i - _ONE]
-        best = north
-        code = np.uint8(0)
-        code = np.uint8(2) if east < best else code
-        best = min(best, east)
-        code = np.uint8(4) if south < best else code
-        best = min(best, south)
-        code = np.uint8(6) if west < best else code
-        best = min(best, west)
         key = cost[i - s + _ONE] + cell_cost[i - s + _ONE] * step
         key = key if max(north, east) <= limit else INF
         code = np.uint8(1) if key < best else code
@@ -82,7 +63,8 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, leas
         key = key if max(north, west) <= limit else INF
         code = np.uint8(7) if key < best else code
         best = min(best, key)
-        parent[i] = code if max(cost[i], best) < INF else NONE
+        if parent is not None:
+            parent[i] = code if max(cost[i], best) < INF else NONE
         if least is not None:
             least[i - first] = best
 
@@ -123,7 +105,8 @@ def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
             _shut_diagonals(cell_cost, climbs, first, n, one, other)
         _take_less(climbs, n, np.float32(k))
     for i in range(n):
-        parent[first + i] = np.uint8(codes[i]) if cost[first + i] < INF else NONE
+        if parent is not None:
+            parent[first + i] = np.uint8(codes[i]) if cost[first + i] < INF else NONE
         if least is not None:
             least[i] = best[i]
 
@@ -132,14 +115,13 @@ def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
 def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
     """Like `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out.
 
-    least  float32 (last - first,), written: the lowest offer to each, s; None if not needed
+    parent  None if not needed
+    least   float32 (last - first,), written: the lowest offer to each, s; None if not needed
     """
     cell_cost, _, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
     if climbs is not None:
         _parents_by_climb(grid, climbs, cost, begin, end, parent, least)
-    elif rule == RULE_FOUR:
-        _parents_of_four(cell_cost, cost, s, begin, end, parent, least)
     else:
         limit = INF if corners else HUGE
         _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)

@@ -14,54 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from planner_service.kernels import partition
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import (
-    BOX,
-    GRID,
-    INF,
-    NONE,
-    RULE_FOUR,
-    RULE_OCTILE,
-    SQRT2_EXACT,
-    cuts_corner,
-)
-from planner_service.kernels.partition import (
-    ALTERED,
-    BITS,
-    CELLS,
-    CHECK,
-    CHECKED_CUT_OFF,
-    CHECKING,
-    COSTLIER,
-    CUT_OFF,
-    KEPT,
-    LINKING,
-    NEARBY,
-    NO_PIECE,
-    PIECES,
-    RECHECK,
-    RELINK,
-    RELINK_INTO,
-    ROOT_PIECE,
-    SCHEDULE,
-    SCRATCH,
-    SIDE,
-    TILES,
-    TOTAL,
-    TREE,
-    WIDE,
-    border_index,
-    cell_behind,
-    corner_of,
-    in_scratch,
-    load_offsets,
-    next_in,
-    push_around,
-    step_cost,
-    step_of,
-    store_offsets,
-    tile_of,
-)
+from planner_service.kernels.layout import BOX, GRID, INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2_EXACT, cuts_corner
+from planner_service.kernels.partition import BITS, CELLS, PIECES, SIDE, TOTAL, WIDE
 from planner_service.kernels.partition_totals import begin, evaluate_totals, queue_checks, settle
 from planner_service.kernels.queue_heap import heap_lower, heap_pop
 
@@ -85,7 +41,7 @@ def _load_line(count, first, steps, other, grid, tree, scratch):
         cost[at] = np.inf
         if cell_cost[g] < INF:
             name = np.int64(piece[other * CELLS + cell])
-            cost[at] = tree.total[other * PIECES + name, TOTAL] + rim[other * PIECES + border_index(cell)]
+            cost[at] = tree.total[other * PIECES + name, TOTAL] + rim[other * PIECES + partition.border_index(cell)]
         g += steps[0]
         cell += steps[1]
         at += steps[2]
@@ -97,8 +53,8 @@ def _load_tile(t, grid, tree, tiles, scratch):
     stride = grid[2]
     piece, across = tree.piece, tiles.across
     cost, inner = scratch.cost, scratch.inner
-    load_offsets(t, grid, tree, tiles, scratch)
-    origin, rows, cols = corner_of(grid, across, t)
+    partition.load_offsets(t, grid, tree, tiles, scratch)
+    origin, rows, cols = partition.corner_of(grid, across, t)
     if rows < SIDE or cols < SIDE:
         for i in range(cost.size):
             cost[i] = np.inf
@@ -141,7 +97,7 @@ def _mark_improvable(cost, own, begin, end, diagonal, corners, less):
         offer = cost[i - s - _ONE] + own[i - s - _ONE] * diagonal
         best = min(best, offer if corners or max(north, west) < np.inf else np.inf)
         best = best if own[i] < np.inf else np.inf
-        less[i] = 1 if best < cost[i] * KEPT else 0
+        less[i] = 1 if best < cost[i] * partition.KEPT else 0
 
 
 @helper
@@ -165,22 +121,22 @@ def _relax(at, t, cell, grid, tree, tiles, scratch):
     for code in range(8):
         u = at + around[code]
         if _open(own, around, rule, corners, at, code):
-            offer = cost[u] + step_cost(rule, own[u], code)
+            offer = cost[u] + partition.step_cost(rule, own[u], code)
             if offer < best:
                 best, by = offer, code
-    if not best < cost[at] * KEPT:
+    if not best < cost[at] * partition.KEPT:
         return False
     cost[at] = best
-    origin, _, _ = corner_of(grid, across, t)
+    origin, _, _ = partition.corner_of(grid, across, t)
     parent[origin + (cell >> BITS) * stride + (cell & (SIDE - 1))] = by
-    other, beside = cell_behind(across, t, cell, by)
+    other, beside = partition.cell_behind(across, t, cell, by)
     i = t * CELLS + cell
     if other == t:
         u = at + around[by]
         piece[i] = piece[t * CELLS + beside]
-        inner[at] = inner[u] + step_cost(rule, own[u], by)
+        inner[at] = inner[u] + partition.step_cost(rule, own[u], by)
         return True
-    name = border_index(cell)
+    name = partition.border_index(cell)
     if piece[i] != name or inner[at] > 0.0:
         exits, many = tiles.exits, tiles.many
         exits[t * PIECES + many[t]] = name
@@ -202,7 +158,7 @@ def _spread(t, grid, tree, tiles, scratch, count):
     cost, own, inner, around = scratch.cost, scratch.own, scratch.inner, scratch.around
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     first = t * CELLS
-    origin, rows, cols = corner_of(grid, across, t)
+    origin, rows, cols = partition.corner_of(grid, across, t)
     while count > 0:
         at = np.int64(queue[0])
         heap_pop(keys, queue, spot, count)
@@ -212,24 +168,24 @@ def _spread(t, grid, tree, tiles, scratch, count):
         rim = row == 0 or col == 0 or row == rows - 1 or col == cols - 1
         for code in range(8):
             u = at + around[code]
-            offer = cost[at] + step_cost(rule, own[at], code)
+            offer = cost[at] + partition.step_cost(rule, own[at], code)
             child = parent[v + offsets[code]] == (code + 4) & 7
             # A child always follows, so that the stated cost of a cell is the one driven.
-            if not offer < cost[u] * (1.0 if child else KEPT) or not own[u] < np.inf:
+            if not offer < cost[u] * (1.0 if child else partition.KEPT) or not own[u] < np.inf:
                 continue
             if not child and not _open(own, around, rule, corners, at, code):
                 continue
-            down, right = step_of(code)
+            down, right = partition.step_of(code)
             down += row
             right += col
             if rim and (down | right) & -SIDE:
                 other = t + (down >> BITS) * across + (right >> BITS)
                 # A child's tile sees that its total changes.
-                wanted[other] |= RELINK_INTO if child else CHECK
+                wanted[other] |= partition.RELINK_INTO if child else partition.CHECK
                 continue
             cost[u] = offer
             piece[first + (down << BITS) + right] = piece[first + (row << BITS) + col]
-            inner[u] = inner[at] + step_cost(rule, own[at], code)
+            inner[u] = inner[at] + partition.step_cost(rule, own[at], code)
             parent[v + offsets[code]] = (code + 4) & 7
             count = heap_lower(keys, queue, spot, count, np.float32(offer), u)
 
@@ -243,7 +199,7 @@ def _improve_tile(t, grid, tree, tiles, scratch):
     names, cost, own, less = scratch.border, scratch.cost, scratch.own, scratch.less
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     _load_tile(t, grid, tree, tiles, scratch)
-    _, rows, cols = corner_of(grid, across, t)
+    _, rows, cols = partition.corner_of(grid, across, t)
     diagonal = np.inf if rule == RULE_FOUR else (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
     _mark_improvable(*(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, less))
     count = 0
@@ -260,12 +216,12 @@ def _improve_tile(t, grid, tree, tiles, scratch):
     if count == 0:
         return False
     _spread(t, grid, tree, tiles, scratch, count)
-    store_offsets(t, tree, scratch)
+    partition.store_offsets(t, tree, scratch)
     # Exits whose path leads on inside the tile by now are none any more; no piece leads over them.
     kept = 0
     for j in range(many[t]):
         name = np.int64(exits[t * PIECES + j])
-        if name == ROOT_PIECE or piece[t * CELLS + names[name]] == name:
+        if name == partition.ROOT_PIECE or piece[t * CELLS + names[name]] == name:
             exits[t * PIECES + kept] = name
             kept += 1
     many[t] = kept
@@ -281,7 +237,7 @@ def _is_next(t, across, schedule):
     for i in range(max(row - 1, 0), min(row + 2, down)):
         for j in range(max(col - 1, 0), min(col + 2, across)):
             other = i * across + j
-            if turn[other] < turn[t] and sets[CHECKING, place[other]]:
+            if turn[other] < turn[t] and sets[partition.CHECKING, place[other]]:
                 return False
     return True
 
@@ -295,10 +251,10 @@ def _any_cut_off(t, wanted, across):
     for i in range(max(row - 1, 0), min(row + 2, down)):
         for j in range(max(col - 1, 0), min(col + 2, across)):
             what |= wanted[i * across + j]
-    return what & CUT_OFF != 0
+    return what & partition.CUT_OFF != 0
 
 
-@kernel(GRID, TREE, TILES, SCRATCH, SCHEDULE, "f8")
+@kernel(GRID, partition.TREE, partition.TILES, partition.SCRATCH, partition.SCHEDULE, "f8")
 def improve_tiles(grid, tree, tiles, scratch, schedule, most):
     """Evaluates totals, checks tiles and repairs them, until the tree is optimal or `most` tiles have been checked;
     a repaired one counts three times. Returns (tiles checked, tiles repaired, rounds, whether some are left).
@@ -317,25 +273,25 @@ def improve_tiles(grid, tree, tiles, scratch, schedule, most):
     while True:
         rounds += 1
         queue_checks(tree, tiles, scratch, schedule)
-        n = next_in(CHECKING, 0, sets, words)
+        n = partition.next_in(partition.CHECKING, 0, sets, words)
         if n >= order.size or looked + 2 * mended > most:
             return looked, mended, rounds, n < order.size
         while n < order.size:
             t = order[n]
             if _is_next(t, across, schedule):
                 looked += 1
-                wanted[t] &= ~(CHECK | RECHECK | CHECKED_CUT_OFF)
-                wanted[t] |= CHECKED_CUT_OFF if _any_cut_off(t, wanted, across) else np.uint8(0)
+                wanted[t] &= ~(partition.CHECK | partition.RECHECK | partition.CHECKED_CUT_OFF)
+                wanted[t] |= partition.CHECKED_CUT_OFF if _any_cut_off(t, wanted, across) else np.uint8(0)
                 falls[2, t] = 0.0
-                sets[NEARBY, n] = 1
+                sets[partition.NEARBY, n] = 1
                 if _improve_tile(t, grid, tree, tiles, scratch):
                     # Until totals are evaluated its own are what its exits were offered, and those of others too
                     # high.
-                    wanted[t] |= RELINK
-                    push_around(LINKING, t, across, place, sets)
-                    push_around(NEARBY, t, across, place, sets)
+                    wanted[t] |= partition.RELINK
+                    partition.push_around(partition.LINKING, t, across, place, sets)
+                    partition.push_around(partition.NEARBY, t, across, place, sets)
                     mended += 1
-            n = next_in(CHECKING, n + 1, sets, words)
+            n = partition.next_in(partition.CHECKING, n + 1, sets, words)
         evaluate_totals(grid, tree, tiles, scratch.border, schedule, np.int64(0))
 
 
@@ -355,14 +311,14 @@ def _merge_tile(t, grid, tree, across, window, inner, old_root, changed):
                 continue
             v = (row + 1) * stride + col + 1
             cell = ((row - top) << BITS) + col - left
-            cost = total[t * PIECES + np.int64(piece[t * CELLS + cell]), TOTAL] + inner[in_scratch(cell)]
+            cost = total[t * PIECES + np.int64(piece[t * CELLS + cell]), TOTAL] + inner[partition.in_scratch(cell)]
             code = NONE if v == root else part_parent[i]
             if (part[i] < cost + way or v == old_root) and parent[v] != code:
                 parent[v] = code
-                changed[t] = ALTERED
+                changed[t] = partition.ALTERED
 
 
-@kernel(GRID, TREE, TILES, SCRATCH, _WINDOW, "i8", "u1[::1]")
+@kernel(GRID, partition.TREE, partition.TILES, partition.SCRATCH, _WINDOW, "i8", "u1[::1]")
 def merge_parents(grid, tree, tiles, scratch, window, old_root, changed):
     """Takes the parents of a window that was grown around a new root (`tree`), where its costs are less than the
     tree's and the way from the old root to the new one.
@@ -377,14 +333,14 @@ def merge_parents(grid, tree, tiles, scratch, window, old_root, changed):
     for row in range(row0 >> BITS, ((row1 - 1) >> BITS) + 1):
         for col in range(col0 >> BITS, ((col1 - 1) >> BITS) + 1):
             t = row * across + col
-            load_offsets(t, grid, tree, tiles, scratch)
+            partition.load_offsets(t, grid, tree, tiles, scratch)
             _merge_tile(t, grid, tree, across, window, scratch.inner, old_root, changed)
     for v in (tree.root, old_root):
-        t, _ = tile_of(v, grid[2], across)
-        changed[t] = ALTERED
+        t, _ = partition.tile_of(v, grid[2], across)
+        changed[t] = partition.ALTERED
 
 
-@kernel(GRID, TREE, "i8", "i8[::1]", "f4[::1]", "u1[::1]")
+@kernel(GRID, partition.TREE, "i8", "i8[::1]", "f4[::1]", "u1[::1]")
 def cut_parents(grid, tree, across, cells, before, changed):
     """Cells that became lethal, and those whose step they forbid, lose their parent.
 
@@ -395,8 +351,8 @@ def cut_parents(grid, tree, across, cells, before, changed):
     parent = tree.parent
     for j in range(cells.size):
         x = cells[j]
-        t, _ = tile_of(x, stride, across)
-        what = COSTLIER if cell_cost[x] > before[j] else ALTERED
+        t, _ = partition.tile_of(x, stride, across)
+        what = partition.COSTLIER if cell_cost[x] > before[j] else partition.ALTERED
         changed[t] |= what
         lethal = not cell_cost[x] < INF and before[j] < INF
         if lethal:
@@ -408,13 +364,13 @@ def cut_parents(grid, tree, across, cells, before, changed):
                 continue
             into = way == (code + 4) & 7
             if into or (lethal and not corners and cuts_corner(v, way, x, offsets)):
-                t, _ = tile_of(v, stride, across)
+                t, _ = partition.tile_of(v, stride, across)
                 changed[t] |= what
                 if lethal:
                     parent[v] = NONE
 
 
-@kernel(GRID, TREE, TILES, "i8[::1]")
+@kernel(GRID, partition.TREE, partition.TILES, "i8[::1]")
 def drop_cut_off(grid, tree, tiles, which):
     """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
     _, _, stride, _, _ = grid
@@ -423,15 +379,15 @@ def drop_cut_off(grid, tree, tiles, which):
     exits, many, wanted, across = tiles.exits, tiles.many, tiles.wanted, tiles.across
     for n in range(which.size):
         t = which[n]
-        wanted[t] &= ~CUT_OFF
-        origin, rows, cols = corner_of(grid, across, t)
+        wanted[t] &= ~partition.CUT_OFF
+        origin, rows, cols = partition.corner_of(grid, across, t)
         for row in range(rows):
             for col in range(cols):
                 i = t * CELLS + (row << BITS) + col
                 v = origin + row * stride + col
                 if not total[t * PIECES + np.int64(piece[i]), TOTAL] < np.inf and v != root:
                     parent[v] = NONE
-                    piece[i] = NO_PIECE
+                    piece[i] = partition.NO_PIECE
         count = 0
         for j in range(many[t]):
             name = np.int64(exits[t * PIECES + j])

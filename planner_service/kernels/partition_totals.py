@@ -15,49 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from planner_service.kernels import partition
 from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, NONE, check_cells
-from planner_service.kernels.partition import (
-    BEFORE,
-    BITS,
-    CELLS,
-    CHANGED,
-    CHECK,
-    CHECKED_CUT_OFF,
-    CHECKING,
-    CUT_OFF,
-    FINEST,
-    INSIDE,
-    LINKING,
-    NEARBY,
-    NO_PIECE,
-    NOTED,
-    OFFSET,
-    PIECES,
-    RECHECK,
-    RECONNECTED,
-    RELINK,
-    RELINK_INTO,
-    ROOT_PIECE,
-    SCHEDULE,
-    SCRATCH,
-    SIDE,
-    STAMP,
-    SUCCESSOR,
-    SUMMING,
-    TILES,
-    TOTAL,
-    TREE,
-    WIDE,
-    border_index,
-    cell_behind,
-    corner_of,
-    next_in,
-    push_around,
-    step_cost,
-    step_of,
-    tile_of,
-)
+from planner_service.kernels.partition import BITS, CELLS, INSIDE, OFFSET, PIECES, SIDE, SUCCESSOR, TOTAL, WIDE
 
 _ONE = np.uint64(1)
 _DRIFT = 4.0
@@ -77,7 +38,7 @@ def settle(t, tiles):
 def _change(total, y):
     """By how much the total of a piece has changed in the last evaluation, if its tile's totals have; 0 of one that
     has no way, or never had one."""
-    cost, before = total[y, TOTAL], abs(total[y, BEFORE])
+    cost, before = total[y, TOTAL], abs(total[y, partition.BEFORE])
     return cost - before if cost < np.inf and before < np.inf else 0.0
 
 
@@ -91,20 +52,20 @@ def note_changes(t, tree, tiles):
     what = np.uint8(0)
     for j in range(many[t]):
         y = t * PIECES + np.int64(exits[t * PIECES + j])
-        cost, before = total[y, TOTAL], total[y, BEFORE]
+        cost, before = total[y, TOTAL], total[y, partition.BEFORE]
         change = _change(total, y)
         had = 0.0 <= before < np.inf
         if not cost < np.inf:
-            what |= CUT_OFF | (RECHECK if had else np.uint8(0))
+            what |= partition.CUT_OFF | (partition.RECHECK if had else np.uint8(0))
         elif not had:
-            what |= RECONNECTED
+            what |= partition.RECONNECTED
         least = min(least, change)
         most = max(most, change)
         near = min(near, cost)
         far = max(far, cost)
-    wanted[t] = (wanted[t] & ~CUT_OFF) | what
-    if not what & CUT_OFF:
-        wanted[t] &= ~RECHECK
+    wanted[t] = (wanted[t] & ~partition.CUT_OFF) | what
+    if not what & partition.CUT_OFF:
+        wanted[t] &= ~partition.RECHECK
     falls[0, t] = least
     falls[1, t] = most
     ends[0, t] = near
@@ -114,7 +75,7 @@ def note_changes(t, tree, tiles):
 @helper
 def _differ(a, b):
     """uint8, not 0: whether two groups differ, and both are some."""
-    return np.uint8((a != b) & (a != NO_PIECE) & (b != NO_PIECE))
+    return np.uint8((a != b) & (a != partition.NO_PIECE) & (b != partition.NO_PIECE))
 
 
 @helper
@@ -138,7 +99,7 @@ def _meet_inside(t, tree, tiles, scratch, fine):
             changes[groups] = change
             groups += 1
         less[one] = group
-    less[NO_PIECE] = np.int32(NO_PIECE)
+    less[partition.NO_PIECE] = np.int32(partition.NO_PIECE)
     for row in range(SIDE):
         i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(SIDE)):
@@ -162,19 +123,19 @@ def _meet(t, other, way, tree, schedule, fine):
     piece, total = tree.piece, tree.total
     place, sets = schedule.place, schedule.sets
     down, right = way
-    noted, other_noted = sets[NOTED, place[t]], sets[NOTED, place[other]]
+    noted, other_noted = sets[partition.NOTED, place[t]], sets[partition.NOTED, place[other]]
     count = 1 if down and right else SIDE
     step = 1 if down else SIDE
     cell = (INSIDE << BITS if down > 0 else 0) + (INSIDE if right > 0 else 0)
     beside = (INSIDE << BITS if down < 0 else 0) + (INSIDE if right < 0 else 0)
     for n in range(count):
         one = piece[t * CELLS + cell + n * step]
-        if one == NO_PIECE:
+        if one == partition.NO_PIECE:
             continue
         change = (_change(total, t * PIECES + np.int64(one)) if noted else 0.0) - fine
         for k in range(max(n - 1, 0), min(n + 2, count)):
             one = piece[other * CELLS + beside + k * step]
-            if one == NO_PIECE:
+            if one == partition.NO_PIECE:
                 continue
             if change > (_change(total, other * PIECES + np.int64(one)) if other_noted else 0.0):
                 return True
@@ -215,13 +176,13 @@ def _rise(t, tiles):
             least = min(least, falls[0, other])
             near = min(near, ends[0, other])
             what |= wanted[other]
-    if what & RECONNECTED:
-        if wanted[t] & CHECKED_CUT_OFF:
-            wanted[t] |= CHECK
-        if wanted[t] & CUT_OFF:
-            wanted[t] |= RECHECK
+    if what & partition.RECONNECTED:
+        if wanted[t] & partition.CHECKED_CUT_OFF:
+            wanted[t] |= partition.CHECK
+        if wanted[t] & partition.CUT_OFF:
+            wanted[t] |= partition.RECHECK
     if not near < np.inf:
-        wanted[t] &= ~RECHECK
+        wanted[t] &= ~partition.RECHECK
     return falls[1, t] - least if falls[1, t] > least else 0.0
 
 
@@ -232,38 +193,38 @@ def queue_checks(tree, tiles, scratch, schedule):
     of `NEARBY`, are asked; others stay in it or out of it."""
     wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
     order, place, sets, words = schedule.order, schedule.place, schedule.sets, schedule.words
-    n = next_in(CHANGED, 0, sets, words)
+    n = partition.next_in(partition.CHANGED, 0, sets, words)
     while n < order.size:
-        sets[CHANGED, n] = 0
-        sets[NOTED, n] = 1
+        sets[partition.CHANGED, n] = 0
+        sets[partition.NOTED, n] = 1
         note_changes(order[n], tree, tiles)
-        push_around(NEARBY, order[n], across, place, sets)
-        n = next_in(CHANGED, n + 1, sets, words)
-    n = next_in(NEARBY, 0, sets, words)
+        partition.push_around(partition.NEARBY, order[n], across, place, sets)
+        n = partition.next_in(partition.CHANGED, n + 1, sets, words)
+    n = partition.next_in(partition.NEARBY, 0, sets, words)
     while n < order.size:
-        sets[NEARBY, n] = 0
+        sets[partition.NEARBY, n] = 0
         t = order[n]
         nearest = ends[0, t] if ends[0, t] < np.inf else 0.0
-        rise, fine = _rise(t, tiles), _EVEN * FINEST * nearest
+        rise, fine = _rise(t, tiles), _EVEN * partition.FINEST * nearest
         if rise > 2.0 * fine and not _any_meet(t, tree, tiles, scratch, schedule, fine):
             rise = 2.0 * fine
         falls[2, t] += rise
-        risen = ends[0, t] < np.inf and falls[2, t] > _DRIFT * FINEST * nearest
-        sets[CHECKING, n] = risen or wanted[t] & (CHECK | RECHECK) != 0
-        n = next_in(NEARBY, n + 1, sets, words)
-    n = next_in(NOTED, 0, sets, words)
+        risen = ends[0, t] < np.inf and falls[2, t] > _DRIFT * partition.FINEST * nearest
+        sets[partition.CHECKING, n] = risen or wanted[t] & (partition.CHECK | partition.RECHECK) != 0
+        n = partition.next_in(partition.NEARBY, n + 1, sets, words)
+    n = partition.next_in(partition.NOTED, 0, sets, words)
     while n < order.size:
-        sets[NOTED, n] = 0
-        wanted[order[n]] &= ~RECONNECTED
+        sets[partition.NOTED, n] = 0
+        wanted[order[n]] &= ~partition.RECONNECTED
         settle(order[n], tiles)
-        n = next_in(NOTED, n + 1, sets, words)
+        n = partition.next_in(partition.NOTED, n + 1, sets, words)
 
 
 @helper
 def _forget(total, y):
     """Changes of a piece's total are reckoned from now on."""
-    cost, before = total[y, TOTAL], total[y, BEFORE]
-    total[y, BEFORE] = cost if cost < np.inf else (-abs(before) if before < np.inf else np.inf)
+    cost, before = total[y, TOTAL], total[y, partition.BEFORE]
+    total[y, partition.BEFORE] = cost if cost < np.inf else (-abs(before) if before < np.inf else np.inf)
 
 
 @helper
@@ -280,17 +241,17 @@ def _link(t, name, grid, tree, across, names):
     parent, piece, rim = tree.parent, tree.piece, tree.rim
     total, successor = tree.total, tree.successor
     y = t * PIECES + name
-    if name == ROOT_PIECE:
+    if name == partition.ROOT_PIECE:
         successor[y, SUCCESSOR] = -1
         total[y, OFFSET] = 0.0
         return
-    origin, _, _ = corner_of(grid, across, t)
+    origin, _, _ = partition.corner_of(grid, across, t)
     cell = np.int64(names[name])
     v = origin + (cell >> BITS) * stride + (cell & INSIDE)
     way = np.int64(parent[v])
-    other, beside = cell_behind(across, t, cell, way)
+    other, beside = partition.cell_behind(across, t, cell, way)
     successor[y, SUCCESSOR] = other * PIECES + np.int64(piece[other * CELLS + beside])
-    total[y, OFFSET] = rim[other * PIECES + border_index(beside)] + step_cost(
+    total[y, OFFSET] = rim[other * PIECES + partition.border_index(beside)] + partition.step_cost(
         rule, cell_cost[v + offsets[way]], way
     )
 
@@ -301,25 +262,26 @@ def _link_all(grid, tree, tiles, names, schedule):
     successor = tree.successor
     exits, many, wanted, across = tiles.exits, tiles.many, tiles.wanted, tiles.across
     order, sets, words = schedule.order, schedule.sets, schedule.words
-    n = next_in(LINKING, 0, sets, words)
+    n = partition.next_in(partition.LINKING, 0, sets, words)
     while n < order.size:
         t = order[n]
-        anew = wanted[t] & RELINK != 0
+        anew = wanted[t] & partition.RELINK != 0
         if anew:
-            sets[SUMMING, n] = sets[CHANGED, n] = 1
+            sets[partition.SUMMING, n] = sets[partition.CHANGED, n] = 1
             _forget_all(t, tree, tiles)
-        for j in range(many[t] if wanted[t] & (RELINK | RELINK_INTO) else 0):
+        for j in range(many[t] if wanted[t] & (partition.RELINK | partition.RELINK_INTO) else 0):
             name = np.int64(exits[t * PIECES + j])
             y = t * PIECES + name
-            if anew or (successor[y, SUCCESSOR] >= 0 and wanted[successor[y, SUCCESSOR] // PIECES] & RELINK):
+            next = successor[y, SUCCESSOR]
+            if anew or (next >= 0 and wanted[next // PIECES] & partition.RELINK):
                 _link(t, name, grid, tree, across, names)
-                sets[SUMMING, n] = 1
-        n = next_in(LINKING, n + 1, sets, words)
-    n = next_in(LINKING, 0, sets, words)
+                sets[partition.SUMMING, n] = 1
+        n = partition.next_in(partition.LINKING, n + 1, sets, words)
+    n = partition.next_in(partition.LINKING, 0, sets, words)
     while n < order.size:
-        sets[LINKING, n] = 0
-        wanted[order[n]] &= ~(RELINK | RELINK_INTO)
-        n = next_in(LINKING, n + 1, sets, words)
+        sets[partition.LINKING, n] = 0
+        wanted[order[n]] &= ~(partition.RELINK | partition.RELINK_INTO)
+        n = partition.next_in(partition.LINKING, n + 1, sets, words)
 
 
 @helper
@@ -351,12 +313,12 @@ def _add_up_all(tree, tiles, schedule):
         next = order[min(n + 1, order.size - 1)]
         for j in range(many[next]):
             prefetch(total, (next * PIECES + np.int64(exits[next * PIECES + j])) * 4)
-        sets[SUMMING, n] = sets[CHANGED, n] = 0
-        sets[NOTED, n] = sets[NEARBY, n] = 1
+        sets[partition.SUMMING, n] = sets[partition.CHANGED, n] = 0
+        sets[partition.NOTED, n] = sets[partition.NEARBY, n] = 1
         for j in range(many[t]):
             y = t * PIECES + np.int64(exits[t * PIECES + j])
             steps = 0
-            while y >= 0 and successor[y, STAMP] != now:
+            while y >= 0 and successor[y, partition.STAMP] != now:
                 stack[steps] = y
                 steps += 1
                 y = np.int64(successor[y, SUCCESSOR])
@@ -366,7 +328,7 @@ def _add_up_all(tree, tiles, schedule):
                 cost += total[y, OFFSET]
                 _forget(total, y)
                 total[y, TOTAL] = cost
-                successor[y, STAMP] = now
+                successor[y, partition.STAMP] = now
         note_changes(t, tree, tiles)
 
 
@@ -384,16 +346,16 @@ def evaluate_totals(grid, tree, tiles, names, schedule, now):
     _link_all(grid, tree, tiles, names, schedule)
     if now:
         _add_up_all(tree, tiles, schedule)
-    n = next_in(SUMMING, 0, sets, words)
+    n = partition.next_in(partition.SUMMING, 0, sets, words)
     while n < order.size:
-        sets[SUMMING, n] = 0
-        if _add_up(order[n], tree, tiles, not sets[CHANGED, n]):
-            sets[CHANGED, n] = 1
-            push_around(SUMMING, order[n], across, place, sets)
-            sets[SUMMING, n] = 0
-        n = next_in(SUMMING, n + 1, sets, words)
+        sets[partition.SUMMING, n] = 0
+        if _add_up(order[n], tree, tiles, not sets[partition.CHANGED, n]):
+            sets[partition.CHANGED, n] = 1
+            partition.push_around(partition.SUMMING, order[n], across, place, sets)
+            sets[partition.SUMMING, n] = 0
+        n = partition.next_in(partition.SUMMING, n + 1, sets, words)
         if n >= order.size:
-            n = next_in(SUMMING, 0, sets, words)
+            n = partition.next_in(partition.SUMMING, 0, sets, words)
 
 
 @helper
@@ -403,13 +365,13 @@ def begin(tiles, schedule):
     order, place, sets = schedule.order, schedule.place, schedule.sets
     for n in range(order.size):
         t = order[n]
-        if wanted[t] & RELINK:
-            push_around(LINKING, t, across, place, sets)
-        sets[NEARBY, n] = wanted[t] & (CHECK | RECHECK) != 0 or falls[2, t] > 0.0
-        sets[CHECKING, n] = 0
+        if wanted[t] & partition.RELINK:
+            partition.push_around(partition.LINKING, t, across, place, sets)
+        sets[partition.NEARBY, n] = wanted[t] & (partition.CHECK | partition.RECHECK) != 0 or falls[2, t] > 0.0
+        sets[partition.CHECKING, n] = 0
 
 
-@kernel(GRID, TREE, TILES, SCRATCH, SCHEDULE)
+@kernel(GRID, partition.TREE, partition.TILES, partition.SCRATCH, partition.SCHEDULE)
 def add_up(grid, tree, tiles, scratch, schedule):
     """Evaluates totals, and note where they have risen."""
     begin(tiles, schedule)
@@ -417,7 +379,7 @@ def add_up(grid, tree, tiles, scratch, schedule):
     queue_checks(tree, tiles, scratch, schedule)
 
 
-@kernel(GRID, TREE, SCRATCH, "i8", "i8[::1]", "f8[::1]")
+@kernel(GRID, partition.TREE, partition.SCRATCH, "i8", "i8[::1]", "f8[::1]")
 def costs_at(grid, tree, scratch, across, cells, costs):
     """costs := float64, s, of padded cells; inf where there is no way. Raises ValueError where one is no cell."""
     cell_cost, offsets, stride, rule, _ = grid
@@ -426,7 +388,7 @@ def costs_at(grid, tree, scratch, across, cells, costs):
     check_cells(cells, cell_cost.size)
     for i in range(cells.size):
         v = cells[i]
-        t, cell = tile_of(v, stride, across)
+        t, cell = partition.tile_of(v, stride, across)
         costs[i] = total[t * PIECES + np.int64(piece[t * CELLS + cell]), TOTAL]
         if place[t] >= 0:
             costs[i] += kept[np.int64(place[t]) * CELLS + cell]
@@ -435,13 +397,13 @@ def costs_at(grid, tree, scratch, across, cells, costs):
         way = np.int64(parent[v])
         steps = 0
         while way != NONE:
-            down, right = step_of(way)
+            down, right = partition.step_of(way)
             row += down
             col += right
             if (row | col) & -SIDE:
                 break
             v += offsets[way]
-            steps_s[steps] = step_cost(rule, cell_cost[v], way)
+            steps_s[steps] = partition.step_cost(rule, cell_cost[v], way)
             steps += 1
             way = np.int64(parent[v])
         # Summed from the exit, as elsewhere: the same numbers in another order are another sum.

@@ -135,18 +135,12 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
             (below - _ONE, cost[below - _ONE], min(south, west)),
             (below + _ONE, cost[below + _ONE], min(south, east)),
         )
-        if not corners:
-            # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
-            for i, old, gate in around:
-                offer = max(key, -gate)
-                cost[i] = min(old, offer)
-                touched[count] = i
-                count += np.uint64(old - offer == INF)
-            continue
-        for i, old, _ in around:
-            cost[i] = min(old, key)
+        # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
+        for i, old, gate in around:
+            offer = key if corners else max(key, -gate)
+            cost[i] = min(old, offer)
             touched[count] = i
-            count += np.uint64(old == INF)
+            count += np.uint64(old - offer == INF)
     return count
 
 
@@ -173,17 +167,11 @@ def offer_around(cell_cost, cost, s, corners, batch, n, touched):
             cost[i] = min(old, key)
             touched[count] = i
             count += np.uint64(old == INF)
-        if not corners:
-            for i, old, gate in around:
-                offer = max(key, -gate)
-                cost[i] = min(old, offer)
-                touched[count] = i
-                count += np.uint64(old - offer == INF)
-            continue
-        for i, old, _ in around:
-            cost[i] = min(old, key)
+        for i, old, gate in around:
+            offer = key if corners else max(key, -gate)
+            cost[i] = min(old, offer)
             touched[count] = i
-            count += np.uint64(old == INF)
+            count += np.uint64(old - offer == INF)
     return count
 
 

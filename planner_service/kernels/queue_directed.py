@@ -31,7 +31,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy, step_price
+from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy
 from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
@@ -60,8 +60,6 @@ _LEVELS = np.uint64(-(-63 // BASE_BITS))
 _NEAR, _MOST_INDEX = np.float32(2.0**30), np.float32(2.0**62)
 _FEW, _SHARE = np.uint64(8), np.uint64(5)
 """A bucket is served in parts while this number of its cells may lead into it, and of n cells n >> _SHARE more."""
-_ONE_BY_ONE = np.uint64(4)
-"""Up to this number, cells make their offers one by one."""
 _ALL = np.float32(-1.0)
 _SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), u8[::1], {QUEUE}))"
 
@@ -171,32 +169,6 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
 
 
 @helper
-def _offer_one_by_one(grid, cost, climbs, batch, n, touched):
-    """Like `_offer`, for the first `n` cells of a small batch: there passes and prefetches cost more than branches
-    do."""
-    cell_cost, offsets, _, rule, corners = grid
-    every = 2 if rule == RULE_FOUR else 1
-    count = _ZERO
-    for i in range(n):
-        u = np.int64(batch[i])
-        base, own = -cost[u], cell_cost[u]
-        for k in range(0, 8, every):
-            v = u + offsets[k]
-            odd = k & 1
-            # No step costs less than the cell cost of the cell that it enters, which is u.
-            if not base + own < cost[v]:
-                continue
-            if odd and not corners and min(cost[u + offsets[k - 1]], cost[u + offsets[(k + 1) & 7]]) == WALL:
-                continue
-            key = base + own * step_price(climbs, v, u, k ^ 4)
-            if key < cost[v]:
-                cost[v] = key
-                touched[count] = v
-                count += _ONE
-    return count
-
-
-@helper
 def _index(cost, inverse):
     """uint64: how many finest widths a cost has."""
     return np.uint64(np.int64(min(cost * inverse, _MOST_INDEX)))
@@ -239,7 +211,7 @@ def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
 
 
 @helper
-def _look(cell_cost, cost, inverse, end, batch, n):
+def _keep_unserved(cell_cost, cost, inverse, end, batch, n):
     """Keeps those cells of a batch that were not served yet. Returns how many; how many of them may offer less than
     index `end`; and the least that any may offer."""
     kept = _ZERO
@@ -291,11 +263,6 @@ def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
     touched, chosen, batch, steps, waiting, queue = scratch
     s = np.uint64(stride)
     n = _serve_once(cost, batch, n)
-    if n <= _ONE_BY_ONE:
-        count = _offer_one_by_one(grid, cost, climbs, batch, n, touched)
-        _choose(cost, inverse, served, level, touched, count, waiting, chosen)
-        put(queue, touched, count, chosen, _MASK, _ZERO)
-        return
     first = _ZERO
     while first < n:
         some = min(_PIECE, n - first)
@@ -314,11 +281,11 @@ def _find_level(waiting):
 
 
 @kernel(f"({GRID}, f4[::1], i8, {CLIMBS}, f8, b1, {_SCRATCH})")
-def grow_directed_by_buckets(grid, cost, root, climbs, width, look, scratch):
+def grow_directed_by_buckets(grid, cost, root, climbs, width, may_lead_back, scratch):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
     width    s, of the finest buckets. Costs are exact whatever it is
-    look     False: it is at most `WIDTH` lowest cell costs, so that up to `_SURE` no cell of a finest bucket
+    may_lead_back  False: it is at most `WIDTH` lowest cell costs, so that up to `_SURE` no cell of a finest bucket
              leads back into it
     scratch  as `make_scratch` returns it
     """
@@ -345,8 +312,8 @@ def grow_directed_by_buckets(grid, cost, root, climbs, width, look, scratch):
         served = ((now & ~_LAST) | (b & _LAST)) << shift
         n = take(queue, b, batch)
         waiting[level] -= n
-        if look or level > _ZERO or served >= _SURE:
-            n, within, least = _look(cell_cost, cost, inverse, served + (_ONE << shift), batch, n)
+        if may_lead_back or level > _ZERO or served >= _SURE:
+            n, within, least = _keep_unserved(cell_cost, cost, inverse, served + (_ONE << shift), batch, n)
             if level > _ZERO and within > _FEW + (n >> _SHARE):
                 level -= _ONE
                 n = _put_back(cost, inverse, served, level, batch, n, _ALL, scratch)

@@ -35,6 +35,10 @@ _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)
 FINE_ROW = np.uint64(44)
 _STRAIGHT = np.float32(1.0)
+_PART = np.uint64(64)
+"""Cells of a row that are looked through at once."""
+ANY_COST = np.float32(-INF)
+"""A floor of `sweep` that all costs reach."""
 
 
 Rows = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -121,63 +125,36 @@ def span_near(first, last, stride, row):
 
 
 @helper
-def _key(cell_cost, cost, climbs, v, u, way, length):
-    """Returns the offer to v by its neighbour u, which lies in direction `way`."""
-    return offered(cost[u], cell_cost[u], climbs, v, u, way, length)
-
-
-@helper
-def _best_offers(cell_cost, cost, climbs, s, begin, end, diagonal, corners, best):
-    """best[0 : end - begin] := the smallest exit key among the neighbours of each cell of a part of a row.
-
-    Free of branches, so that it vectorises; `diagonal`, the length of such a step, is inf where there is none.
-    """
-    for i in range(begin, end):
-        north = cell_cost[i - s]
-        east = cell_cost[i + _ONE]
-        south = cell_cost[i + s]
-        west = cell_cost[i - _ONE]
-        least = min(
-            min(
-                _key(cell_cost, cost, climbs, i, i - s, 0, _STRAIGHT),
-                _key(cell_cost, cost, climbs, i, i + _ONE, 2, _STRAIGHT),
-            ),
-            min(
-                _key(cell_cost, cost, climbs, i, i + s, 4, _STRAIGHT),
-                _key(cell_cost, cost, climbs, i, i - _ONE, 6, _STRAIGHT),
-            ),
-        )
-        key = _key(cell_cost, cost, climbs, i, i - s + _ONE, 1, diagonal)
-        least = min(least, key if corners or max(north, east) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i + s + _ONE, 3, diagonal)
-        least = min(least, key if corners or max(south, east) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i + s - _ONE, 5, diagonal)
-        least = min(least, key if corners or max(south, west) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i - s - _ONE, 7, diagonal)
-        least = min(least, key if corners or max(north, west) < INF else INF)
-        best[i - begin] = least
-
-
-@helper
-def _sweep(grid, climbs, cost, rows, floor, best, lowered, count):
+def sweep(grid, climbs, cost, parent, rows, floor, best, lowered, count):
     """Lowers the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
-    more and are offered less. Appends them to the `count` that are in `lowered`; returns how many there are."""
-    cell_cost, _, stride, rule, corners = grid
+    more and are offered less. Appends them to the `count` that are in `lowered`; returns how many there are.
+
+    parent  of all these cells the neighbour that offers least is written; None if not wanted
+    """
+    cell_cost, _, stride, _, _ = grid
     first, last = rows
-    diagonal = diagonal_length(rule)
     from_row, to_row = near_rows(first, last)
+    n = np.uint64(count)
     for row in range(from_row, to_row):
         begin, end = span_near(first, last, stride, row)
         if end <= begin:
             continue
-        s, at, until = np.uint64(stride), np.uint64(begin), np.uint64(end)
-        _best_offers(cell_cost, cost, climbs, s, at, until, diagonal, corners, best)
-        for i in range(begin, end):
-            if best[i - begin] < cost[i] and cost[i] >= floor and cell_cost[i] < INF:
-                cost[i] = best[i - begin]
-                lowered[count] = i
-                count += 1
-    return count
+        point_row_to_parents(grid, climbs, cost, begin, end, parent, best)
+        at, width = np.uint64(begin), np.uint64(end - begin)
+        # In parts, as nearly none has a cell to lower: to ask vectorises.
+        for part in range(np.uint64(0), width, _PART):
+            until = min(part + _PART, width)
+            found = np.int32(0)
+            for i in range(part, until):
+                found += np.int32((best[i] < cost[at + i]) & (cost[at + i] >= floor) & (cell_cost[at + i] < INF))
+            if not found:
+                continue
+            for i in range(part, until):
+                if best[i] < cost[at + i] and cost[at + i] >= floor and cell_cost[at + i] < INF:
+                    cost[at + i] = best[i]
+                    lowered[n] = at + i
+                    n += _ONE
+    return np.int64(n)
 
 
 @helper
@@ -399,13 +376,13 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     if many > most_detached:
         return -1, INF
     clear_rows(rows, cell_cost.size)
-    count = np.int64(0)  # a literal would have `_sweep` compiled twice
+    count = np.int64(0)  # a literal would have `sweep` compiled twice
     if many:
         _note(first, last, stride, detached, many)
-        count = _sweep(grid, climbs, cost, rows, INF, best, lowered, count)
+        count = sweep(grid, climbs, cost, None, rows, INF, best, lowered, count)
     if any_cheaper:
         _note_cheaper(cheaper, cell_cost, stride, changed, before)
-        count = _sweep(grid, climbs, cost, cheaper, np.float32(-INF), best, lowered, count)
+        count = sweep(grid, climbs, cost, None, cheaper, ANY_COST, best, lowered, count)
     served, highest = spread(grid, climbs, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
     if served < 0:
         return -1, INF

@@ -16,19 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.climbs import CLIMBS, offered, step_price
+from planner_service.kernels.climbs import CLIMBS, step_price
 from planner_service.kernels.compile import helper, step_kernel
-from planner_service.kernels.layout import (
-    GRID,
-    INF,
-    LABELS,
-    NONE,
-    RULE_OCTILE,
-    SQRT2_EXACT,
-    check_cells,
-    step_length,
-    step_offsets,
-)
+from planner_service.kernels.layout import INF, NONE, RULE_OCTILE, SQRT2_EXACT, check_cells, step_offsets
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
 """Result of a requested route."""
@@ -40,30 +30,6 @@ Ways = tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float64], int, in
 """(parent, offsets, lengths, root, stride): the parents, what `moves_of` returns, the padded root."""
 _WAYS = "Tuple((u1[::1], u8[::1], f8[::1], i8, i8))"
 _WALKS = "Tuple((u1[::1], i8[::1], f8[::1], f8[::1], i8[::1]))"
-
-
-@step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
-def relabel(grid, climbs, labels, trail):
-    """Sets costs to those driven from each cell along its parents. They are written whole; parents are read.
-    `trail` has room for all cells."""
-    cell_cost, offsets, _, rule, _ = grid
-    cost, parent, root = labels
-    unknown = np.float32(-1.0)
-    for i in range(cost.size):
-        cost[i] = unknown if parent[i] != NONE else INF
-    cost[root] = np.float32(0.0)
-    for i in range(cost.size):
-        v = i
-        many = 0
-        while cost[v] == unknown:
-            trail[many] = v
-            many += 1
-            v += offsets[parent[v]]
-        for j in range(many - 1, -1, -1):
-            v = np.int64(trail[j])
-            k = parent[v]
-            u = v + offsets[k]
-            cost[v] = offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, k & 1))
 
 
 @helper

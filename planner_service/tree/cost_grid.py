@@ -28,7 +28,6 @@ from planner_service.tree.growth import grow_tree, padded_climbs, with_scratch
 from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
-from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
 
 
@@ -353,17 +352,8 @@ class CostGrid:
                 yield row0, col0, row1, col1
 
     def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        """The exact tree of a padded root. Arrays are written whole; no cost exceeds the returned one, s.
-
-        Raises OutsideGridError unless the root is a padded cell, ValueError where it is lethal or an array has
-        another size than the map.
-        """
-        if not 0 <= root < self.size:
-            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        if not self.cell_cost[root] < np.inf:
-            raise ValueError(f"padded root {root} is lethal: no tree can lead there")
-        if cost.size != self.size or parent.size != self.size:
-            raise ValueError(f"a tree of this map has {self.size} cells")
+        """The exact tree of a padded root, a passable cell. Arrays of the map's size are written whole; no cost
+        exceeds the returned one, s."""
         bounds = self.lowest_cell_cost, self.highest_cell_cost, self.dearest_step
         return grow_tree(self.padded, self.climbs, bounds, root, cost, parent)
 
@@ -381,7 +371,7 @@ class CostGrid:
         most      steps of a route; 0 for all of it
         statuses  (n,), written: then `starts` are any numbers of cells of the grid, which become padded ones.
                   Starts without a route become the root, and the cost driven from there is inf
-        Raises ValueError where a start or the root is no padded cell.
+        Raises ValueError where a start is no padded cell.
         """
         count = starts.size
         ends, last = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -400,7 +390,7 @@ class CostGrid:
 
     def rests(self, parent: NDArray[np.uint8], root: int, starts: Cells, cell_cost: Floats) -> NDArray[np.float64]:
         """Returns float64, s: the cost driven from padded cells along the parents to a padded root; inf without a
-        path. Raises ValueError where a start or the root is no padded cell."""
+        path. Raises ValueError where a start is no padded cell."""
         rests = np.empty(starts.size)
         many = min(1 << 16, 64 << starts.size.bit_length())
         known = np.zeros(many, np.uint32), np.empty(many)
@@ -412,8 +402,6 @@ class CostGrid:
         return rests
 
     def _ways(self, parent: NDArray[np.uint8], root: int) -> route_walk.Ways:
-        if not 0 <= root < self.size:
-            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
         return parent, *self._moves, root, self.stride
 
     def passable(self, cell: int) -> bool:

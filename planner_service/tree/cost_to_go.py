@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import route_walk, stride_growth
+from planner_service.kernels import stride_growth
 from planner_service.kernels.cell_costs import find_rim, merge_window
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
 from planner_service.kernels.layout import NONE, Labels
@@ -46,15 +46,15 @@ class CostToGoTree:
         """The map that the tree lies on. A caller that changes it calls `repair`, or rebuilds the tree."""
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
-        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten`, `relabel` and
-        `repair` change it."""
+        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten` and `repair`
+        change it."""
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
         self.root = -1
         """The target's cell, of the grid; -1 before the first growth. `grow`, `take` and `move` set it."""
         self.offset = 0.0
         """s; how much the stored costs lack at most. `move` adds the cost from the old root to the new one; `grow`,
-        `take`, `mend` and `relabel` reset it."""
+        `take` and `mend` reset it."""
         self.exact = False
         """True if cost-to-go is exact on the current map (then the offset is 0). `grow`, `take` and `mend` set it,
         `move` to another root and `grow_strides` reset it, `repair` keeps it."""
@@ -90,23 +90,17 @@ class CostToGoTree:
 
     def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
         """Becomes a tree that was searched elsewhere, exactly, on the map as it was or is now. Raises as `grow`,
-        except that the root may have become lethal since, and ValueError unless the arrays are as `cost` and
-        `parent` here."""
+        except that the root may have become lethal since."""
         self.cost_grid.grid.row_col(root)
-        size = self.cost_grid.size
-        if cost.shape != (size,) or parent.shape != (size,) or cost.dtype != np.float32 or parent.dtype != np.uint8:
-            raise ValueError(f"a tree of this map is float32 and uint8, {size} cells each")
         self.cost = cost
         self.parent = parent
         self.reach = reach
         self._become_exact(root)
 
     def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
-        """Becomes a tree that was made elsewhere on the current map; costs are those driven along it. Raises as
-        `take`."""
-        self.take(root, np.empty(self.cost_grid.size, np.float32), parent, 0.0)
-        self.relabel()
-        self.reach = float(self.cost[np.isfinite(self.cost)].max())
+        """Becomes a tree that was made elsewhere on the current map, made exact by `mend`. Raises as `take`."""
+        self.take(root, np.full(self.cost_grid.size, np.inf, np.float32), parent, 0.0)
+        self.mend()
 
     def take_grown(self, root: int, growth: PartialGrowth) -> None:
         """Becomes the tree in hand of a growth that has stopped: exact as far as that went. The work follows the
@@ -288,12 +282,8 @@ class CostToGoTree:
             grid = self.cost_grid
             stamps = self._stamps_now()
             ways = grid.padded, grid.climbs, self._labels
-            stride_growth.tighten(*ways, stamps, self._now, cells, self._trail)
-
-    @property
-    def _trail(self) -> NDArray[np.uint32]:
-        """Scratch that holds the longest way."""
-        return np.empty(self.cost_grid.size, np.uint32)
+            trail = np.empty(grid.size, np.uint32)  # which holds the longest way
+            stride_growth.tighten(*ways, stamps, self._now, cells, trail)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
         if self._stamps is None:
@@ -306,12 +296,6 @@ class CostToGoTree:
         if self._now > 254:
             self._now = 1
             self._stamps = None
-
-    def relabel(self) -> None:
-        """Sets every cost to the one driven along the parents, and the offset to 0."""
-        route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
-        self.reach += self.offset
-        self.offset = 0.0
 
     @property
     def fine(self) -> bool:

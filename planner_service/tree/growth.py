@@ -121,8 +121,8 @@ def grow_directed_costs(
     if key not in kept:
         kept.clear()
         kept[key] = make_scratch(cell_cost.size)
-    width, look = _width(cell_cost, *bounds[:2])
-    grow_directed_by_buckets(padded, cost, root, climbs, width, look, kept[key])
+    width, may_lead_back = _width(cell_cost, *bounds[:2])
+    grow_directed_by_buckets(padded, cost, root, climbs, width, may_lead_back, kept[key])
 
 
 def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:

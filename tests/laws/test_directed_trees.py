@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.planner_play import Play
-from support.planner_strategies import (
-    RULES,
-    STRATEGIES,
-    Marks,
-    Move,
-    random_climb,
-    random_pace,
-)
+from support.planner_strategies import RULES, STRATEGIES, Marks, Move, random_climb, random_pace
 from support.repaired_tree import Patchwork
 
 from planner_service.kernels.layout import NONE
@@ -37,7 +30,7 @@ def ground_of(seed: int, rows: int = 40, cols: int = 43) -> Patchwork:
 
 
 @pytest.mark.seeds(4)
-def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
+def test_costs_told_are_what_is_driven(seed: int) -> None:
     ground = ground_of(seed)
     tree, costs = ground.tree, ground.costs
     moved = 0
@@ -51,8 +44,6 @@ def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
     driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
     assert (tree.cost[starts] + tree.offset > driven * 1.0001).any()
     np.testing.assert_allclose(tree.cost_at(starts), driven, rtol=1e-13)
-    tree.relabel()
-    np.testing.assert_allclose(tree.cost[starts], driven, rtol=1e-5)
 
 
 @pytest.mark.seeds(4)

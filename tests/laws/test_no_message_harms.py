@@ -26,6 +26,7 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.simulation.world.service import TargetsService
+from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KeeperStore
@@ -187,7 +188,7 @@ class Lied(SwarmModel):
                     scene = Scene(Pen([rr.RecordingStream("lied")], TerrainMesh(terrain)))
                     return MonitorService(setup, terrain, bus, post, scene)
                 case "planner":
-                    return PlannerService(setup, terrain, bus, post, InlineWorker(self.scheduler))
+                    return PlannerService(Planning(setup, terrain, bus, post, InlineWorker(self.scheduler)))
                 case "targets":
                     return TargetsService(setup, terrain, truth, bus, post)
             return AgentService(setup, terrain, truth, bus, post, self.promises[id])

@@ -128,7 +128,7 @@ def test_a_plugin_that_fails_is_named_once_and_the_swarm_goes_on(kind: str, answ
 
 WILD = """
 import numpy as np
-from planner_service.strategy import FullGrowth, OnMove, StrategyRow
+from planner_service.strategy import OnMove, StrategyRow
 from vehicle_agent.sensing.sensor import Sight
 class Wild:
     def __init__(self, world, options):
@@ -143,7 +143,7 @@ class Wild:
         chosen = self.chance.integers(-1, len(table.targets), len(table.vehicles))
         return np.where(np.isfinite(table.costs_s[chosen, np.arange(len(chosen))]), chosen, -1)
     def speed(self, stretch): return float(self.chance.choice([0.0, 0.01, 3.0, 1e300]))
-    def row(self, growths): return StrategyRow(OnMove.BLOCK_WINDOW, FullGrowth.WHEN_FORCED, thins_far_cells=True)
+    def row(self, growths): return StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True)
 """
 WILD_SCENARIO = """
 time_scale = 5.0

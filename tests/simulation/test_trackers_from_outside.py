@@ -185,8 +185,7 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     assert owners(simulation) == {"radar"}
     assert not ear.ask().tracker_lost
     assert VehicleState.OUTDATED not in states(simulation)
-    odd = ["tracker-clock"] if clock_off_s else []
-    assert kinds(simulation) == [*odd, "tracker-lost", "tracker-back"]
+    assert kinds(simulation) == ["tracker-lost", "tracker-back"]
     simulation.finish()
     tracking = simulation.report(30)["tracking"]
     assert tracking["lost"] == 1

@@ -12,6 +12,7 @@ from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
 
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL
+from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
@@ -127,7 +128,7 @@ class Swarm(SwarmModel):
         worker = InlineWorker(self.scheduler)
         return self.start(
             f"planner-{target}-{incarnation}",
-            lambda bus, post: PlannerService(setup, self.terrain, bus, post, worker),
+            lambda bus, post: PlannerService(Planning(setup, self.terrain, bus, post, worker)),
             phase_ns=0,
         )
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.growth_times import GrowthTimes
-from planner_service.planner import Planner
-from planner_service.planner_actions import Action, GrownTree, GrowTree
+from planner_service.planner import Action, Planner, Work
 from planner_service.target_tree import TargetTree, Update
 from planner_service.target_watch import TargetWatch, Tell
+from planner_service.tree.partitioned_tree import GrownTree
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -186,7 +186,7 @@ class World:
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
         """Do a growth that was asked for."""
-        assert isinstance(action, GrowTree)
+        assert isinstance(action, Work)
         return self.planner.adopt(action.job(), took_ns, self.now_ns)
 
 

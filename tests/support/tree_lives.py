@@ -17,8 +17,8 @@ from support.planner_strategies import RULES, random_climb, random_pace
 from support.slow_twins import Cells, Driven, cost_to_go, drive
 
 from planner_service.kernel_build import load_all
-from planner_service.planner_actions import GrownTree
 from planner_service.target_tree import TargetTree
+from planner_service.tree.partitioned_tree import GrownTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window

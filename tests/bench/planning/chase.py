@@ -22,7 +22,7 @@ from support.slow_twins import drive
 
 from bench.harness import cpu_ms, track
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
-from planner_service.strategy import ROWS, STAGES, FullGrowth
+from planner_service.strategy import ROWS, STAGES
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy, Walk
@@ -290,7 +290,7 @@ class _Racer:
         row = ROWS.get(self._strategy, STAGES["rotate"])
         if row.is_exact:
             return
-        grows = row.is_exact or row.full_growth is not FullGrowth.WHEN_FORCED or row.thins_far_cells
+        grows = row.renews_within_budget or row.thins_far_cells
 
         def follow() -> None:
             for n, cell in enumerate(targets):

@@ -15,6 +15,7 @@ from support.far_processes import Far, asked
 from support.made_up_swarm import some_fleet
 
 from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
+from planner_service.planning_process import Planning
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -54,7 +55,7 @@ def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET
     scenario = Scenario(network=network, targets=(TargetConfig(name=target),))
     setup = RoleSetup(scenario, "bench", "planner", target, time.time_ns(), time.time_ns())
     with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox)) as worker:
-        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
+        service = PlannerService(Planning(setup, terrain, bus, inbox.post, worker), stopwatch=clock.now_ns)
         kept = serve_raw(bus)
         pipe.send("ready")
         run_service(service, bus, inbox, pipe, lambda *_: None)

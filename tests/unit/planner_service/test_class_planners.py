@@ -16,6 +16,7 @@ from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
 from planner_service import vehicle_class_planners as class_planners
+from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
@@ -147,7 +148,7 @@ class _World(SwarmModel):
         worker = InlineWorker(self.scheduler)
         self.service = self.start(
             "planner-t",
-            lambda bus, post: PlannerService(setup, terrain, bus, post, worker, all_kernels=all_kernels),
+            lambda bus, post: PlannerService(Planning(setup, terrain, bus, post, worker), all_kernels),
             phase_ns=0,
         )
         self.target = _open_cell()
@@ -207,7 +208,7 @@ def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(
     tags = []
     for _ in range(2):
         world.ask(CostRequest(cells=[world.target], vehicle_class="low"))
-        tags.append(world.service._tag("grow-tree", "low"))
+        tags.append(world.service._tag("low"))
         assert [world.service._asked_by(tag) is not None for tag in tags] == [False] * (len(tags) - 1) + [True]
         world.run(2)
         assert world.trees() == ["ground"]

@@ -89,21 +89,6 @@ def test_one_step_and_many_steps_read_the_same_table():
     np.testing.assert_array_equal(climb.along(tails, heads), alone.astype(np.float32))
 
 
-# --- trees ------------------------------------------------------------------------------------------------------
-
-
-def test_a_part_of_a_route_says_what_is_left_of_it():
-    climb = climb_on(ramp(5, 30))
-    pace = np.full((5, 30), 0.1, np.float32)
-    tree = TargetTree(climb.grid, PlannerConfig(), climb)
-    tree.update(pace, 2 * 30 + 29, [], 0)
-    whole, part = tree.routes([60], 0)[0], tree.routes([60], 7)[0]
-    assert len(part.directions) == 7
-    assert part.cost_s == pytest.approx(whole.cost_s)
-    assert part.remaining_s == pytest.approx(whole.cost_s * 22 / 29)
-    assert whole.cost_s == pytest.approx(29.0 * climb.of_step(0, 1))  # 10 m x 0.1 s/m: a second a cell on the level
-
-
 # --- in a run ---------------------------------------------------------------------------------------------------
 
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import random
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from planner_service import followers as module
-from planner_service.followers import Followers, MapIntake
+from planner_service.followers import Followers
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import Route, RouteBatch, RouteOutline, RouteStatus
+from swarm.wire.route_columns import Route, RouteOutline, RouteStatus
 
 GRID = GridSpec(20, 30, 10.0)
 
@@ -171,23 +170,3 @@ def test_that_there_is_no_way_is_told_once() -> None:
     ((_, follower),) = followers.all_items()
     assert not followers.is_news(follower, RouteOutline(RouteStatus.UNREACHABLE, 7, b"", 0.0))
     assert followers.is_news(follower, RouteOutline(RouteStatus.OK, 7, b"\x02", 0.0))
-
-
-@pytest.mark.parametrize("away", range(4))
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("across", [False, True])
-def test_a_change_concerns_routes_through_it_and_in_the_row_or_column_beside_it(
-    away: int, side: int, across: bool
-) -> None:
-    """A diagonal step depends on the cells beside it."""
-    followers, directions = Followers(GRID, 10, 0), bytes([4 if across else 2] * 6)
-    route = Route(status=RouteStatus.OK, start=GRID.cell(7, 7), directions=directions, cost_s=1.0)
-    followers.given("v", route, 0, 0, 0)
-    row, col = (9, 7 + side * away) if across else (7 + side * away, 9)
-    changed, concerned = [Window(row, col, row + 1, col + 1)], away <= 1
-    assert followers.any_due_in(changed, 0) == concerned
-    intake = MapIntake(SimpleNamespace(dirty=changed, grid=GRID, take_dirty=list), followers)  # type: ignore[arg-type]
-    assert intake.is_due(5, 9), "nothing was taken yet"
-    intake.take(5)
-    assert [intake.is_due(now_ns, 9) for now_ns in (4, 6, 14)] == [True, concerned, True]
-    assert intake.concerns(RouteBatch.of([route])) == concerned

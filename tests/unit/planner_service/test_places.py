@@ -11,8 +11,9 @@ import pytest
 from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, rough
 from support.swarm_model import SwarmModel
 
-import planner_service.places.service as places
-from planner_service.places.service import PlacesService, _ClassTrees
+import planner_service.place_planner as places
+from planner_service.place_planner import PlacesService, _ClassTrees
+from planner_service.planning_process import Planning
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
@@ -37,8 +38,10 @@ class PlacesWorld(SwarmModel):
     def __init__(self, pace: Pace, groups: str = "[[groups]]", job: str = "all") -> None:
         super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario(f"[[targets]]\n{groups}"))
         setup, self._job = self.setup("places", job), job
+        worker = InlineWorker(self.scheduler)
         self.service = self.start(
-            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+            "places",
+            lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)),
         )
         self.client = self.bus("client")
         self.pushed: list[PushedRoute] = []
@@ -155,6 +158,23 @@ def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_o
     writer.sync.publish(writer.replica.write(marked, MarkKind.PACE, 0.01, world.now_ns))
     world.run(3.0)
     assert {each.vehicle for each in world.pushed} <= {"a0-00"}, "who goes nowhere is pushed nothing"
+
+
+def test_a_cheaper_cell_has_only_those_vehicles_asked_for_again_whose_route_it_may_outdo() -> None:
+    world = PlacesWorld(flat())
+    writer = world.writer("all.a0.1")
+    goals = {f"a0-{row:02d}": (GRID.cell(row, 2), GRID.cell(row, 14)) for row in (2, 14, 26, 38)}
+    for id, (cell, to) in goals.items():
+        world.answer(to, cell, vehicles=[id], asker="agent.a0")
+    world.tell(goals)
+    asked: list[str] = []
+    wait = world.service._wait
+    world.service._wait = lambda question: (asked.extend(question.request.vehicles), wait(question))[1]  # type: ignore[method-assign]
+    for row, col, outdone in ((20, 45, []), (13, 8, ["a0-14"])):
+        writer.sync.publish(writer.replica.write([GRID.cell(row, col)], MarkKind.PACE, 0.05, world.now_ns))
+        world.run(2.0)
+        world.tell(goals)
+        assert asked == outdone
 
 
 def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scripted_planner import COLS, GRID, ROWS, World, pose
 
-from planner_service.planner_actions import Action, GrownTree, GrowTree
+from planner_service.planner import Action, Work
 from planner_service.target_tree import Update
+from planner_service.tree.partitioned_tree import GrownTree
 from swarm.clock import NS_PER_S
 from swarm.grid import Window
 from swarm.wire.route_columns import RouteStatus
@@ -88,7 +89,7 @@ def test_a_full_growth_is_handed_to_the_worker_with_its_snapshot_and_version(wor
     world.mark(5)
     world.tree.answers = [Update("none", wants_full=True)]
     (grow,) = world.tick()
-    assert isinstance(grow, GrowTree)
+    assert isinstance(grow, Work)
     assert world.tree.named("full_job") == [("full_job", GRID.cell(10, 20), 1)]
     assert world.tick() == []
     assert not world.tree.ready
@@ -109,7 +110,7 @@ def test_marks_seen_while_growing_cost_one_more_tree_not_one_each(ready: World) 
     ready.tree.answers = [Update("none", wants_full=True)] * 4
     ready.mark(1)
     (grow,) = ready.tick()
-    assert isinstance(grow, GrowTree)
+    assert isinstance(grow, Work)
     for cell in (10, 20, 29):
         ready.mark(cell)
         assert ready.tick() == []
@@ -125,7 +126,7 @@ def test_adoption_is_told_all_that_changed_since_the_snapshot_and_only_that(read
     ready.tree.answers = [Update("none", wants_full=True), Update("repair", Window(0, 0, 3, 3), 9)]
     ready.mark(0)
     (grow,) = ready.tick()
-    assert isinstance(grow, GrowTree)
+    assert isinstance(grow, Work)
     ready.mark(GRID.cell(5, 5))
     ready.tick()
     ready.mark(GRID.cell(15, 15))
@@ -143,7 +144,7 @@ def test_a_growth_is_of_the_map_that_it_was_decided_on_whatever_changes_before_i
     ready.mark(1)
     (grow,) = ready.tick()
     ready.mark(2)
-    assert isinstance(grow, GrowTree)
+    assert isinstance(grow, Work)
     assert grow.job().map_version == 1
     assert ready.map.version == 2
 
@@ -155,7 +156,7 @@ def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: 
     jobs: list[Callable[[], GrownTree]] = []
 
     def take(actions: list[Action]) -> None:
-        jobs.extend(action.job for action in actions if isinstance(action, GrowTree))
+        jobs.extend(action.job for action in actions if isinstance(action, Work))
 
     for seq in range(1, 30):
         world.tree.answers = [Update("full", GRID.window, 1, wants_full=chance.random() < 0.4)]
@@ -206,7 +207,7 @@ def test_gaps_are_measured_at_full_growths_and_told(ready: World) -> None:
     status = ready.planner.status(0)
     assert status.gap_mean == pytest.approx(1.04)
     assert status.gap_max == pytest.approx(1.1)
-    assert ready.counters.histograms["gap"].count == 3
+    assert ready.counters.histograms["gap_excess"].count == 3
     assert ready.counters.histograms["gap_excess"].quantile(1.0) == pytest.approx(0.1, rel=0.03)
 
 
@@ -219,13 +220,13 @@ def test_growths_of_its_own_thread_are_measured_once_in_a_period_for_64_follower
     for seq in range(2, 12):  # a second of ticks
         ready.pose(10, 18 + seq, seq)
         ready.tick()
-    assert ready.counters.histograms["gap"].count == measured
+    assert ready.counters.histograms["gap_excess"].count == measured
 
 
 def test_every_served_route_carries_its_proven_gap_into_the_books(ready: World) -> None:
     ready.tree.gap = 1.25
     ready.ask(0, 5, GRID.cells)
-    assert ready.counters.histograms["certified_gap"].count == 2
+    assert ready.counters.histograms["certified_gap_excess"].count == 2
     assert ready.counters.counts["routes_served"] == 3
 
 

@@ -2,41 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from support.scripted_planner import COLS, GRID, World
+from support.scripted_planner import GRID, World
 
-from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
-from planner_service.planner_actions import Refusal
+from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer, Refusal
 from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
-from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.route_columns import RouteStatus
 
 
 def test_a_person_asks_by_row_and_col(ready: World) -> None:
     reply = ready.ask(row=10, col=17)
     (route,) = reply.routes
     assert (route.start, list(route.directions)) == (GRID.cell(10, 17), [2, 2, 2])
-
-
-def test_outside_is_a_status(ready: World) -> None:
-    assert ready.ask(row=10, col=COLS).routes[0].status is RouteStatus.OUTSIDE
-    statuses = [route.status for route in ready.ask(-1, GRID.cells, 2**31, 0).routes]
-    assert statuses == [RouteStatus.OUTSIDE] * 3 + [RouteStatus.OK]
-
-
-def test_costs_come_as_a_column_with_inf_outside(ready: World) -> None:
-    reply = ready.planner.answer(CostRequest(cells=[3, GRID.cells]), ready.now_ns)
-    assert isinstance(reply, CostReply)
-    assert column(reply.cost_to_go_s, "<f4").tolist() == [3.0, math.inf]
-
-
-def test_asking_again_gives_the_same_answer(ready: World) -> None:
-    assert ready.ask(3, 4, force=True) == ready.ask(3, 4, force=True)
 
 
 def test_nothing_is_forced_for_routes_that_are_proven_good(ready: World) -> None:

@@ -7,8 +7,6 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
 
 from planner_service.kernel_build import load_all
@@ -34,7 +32,7 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import CHASERS, COST, POSE, ROUTE, Topic
+from swarm.wire.topics import COST, ROUTE
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -100,26 +98,6 @@ def lethal_alarms(swarm: Swarm) -> list[int | None]:
     """The end of the newest alarm about the target's ground; None while it lasts."""
     alarms = swarm.planners["t"]._member.alarms.current()
     return [each.over_ns for each in alarms if each.kind == "target-lethal"][:1]
-
-
-def test_a_pose_outside_of_the_terrain_is_not_used_and_the_target_is_lost_until_the_next_inside() -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(10, 10)
-    swarm.run(0.3)
-    swarm.cells["t"] = GRID.cells + 3
-    swarm.run(1.0)
-    reply = swarm.ear.routes(0)
-    assert (reply.target_cell, reply.routes[0].status) == (GRID.cell(10, 10), RouteStatus.OK)
-    assert not reply.tracker_lost
-    swarm.run(2.0)
-    reply = swarm.ear.routes(0)
-    assert (reply.target_cell, reply.tracker_lost) == (GRID.cell(10, 10), True)
-    assert reply.pose_age_s is not None
-    assert 2.7 < reply.pose_age_s < 3.2
-    swarm.cells["t"] = GRID.cell(10, 12)
-    swarm.run(0.3)
-    reply = swarm.ear.routes(0)
-    assert (reply.target_cell, reply.tracker_lost) == (GRID.cell(10, 12), False)
 
 
 def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None:
@@ -197,7 +175,7 @@ def test_gaps_are_measured_over_those_who_follow() -> None:
     assert status.following == 3
     assert 1.0 <= status.gap_mean <= status.gap_max < 1.0001
     stats = swarm.ear.last_stats()
-    for name in ("gap", "gap_excess", "certified_gap", "growth_ms"):
+    for name in ("gap_excess", "certified_gap_excess", "growth_ms"):
         assert sum(stats.histograms[name].values()) > 0, name
 
 
@@ -232,20 +210,6 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
     assert isinstance(reply, RouteReply)
     assert all(route.remaining_s > 0 for route in reply.routes)
     assert len(encode(reply)) < ROUTE.answer_bytes
-
-
-@settings(deadline=None, max_examples=15)
-@given(st.binary(max_size=60), st.sampled_from([POSE, CHASERS]))
-def test_garbage_on_the_wire_changes_nothing(payload: bytes, topic: Topic) -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(10, 10)
-    swarm.run(0.3)
-    before = swarm.ear.routes(0).routes
-    fields = {"target": "t", **({} if topic is POSE else {"author": "x"})}
-    swarm.ear.bus.publish_bytes(topic, payload, fields)
-    swarm.run(0.1)
-    assert swarm.ear.routes(0).routes == before
-    assert swarm.buses["planner-t-1"].counts["payloads_dropped"] == 1
 
 
 def test_questions_that_waited_for_a_tree_are_answered_in_bounded_work_a_tick_and_agents_first() -> None:

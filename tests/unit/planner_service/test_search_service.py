@@ -10,6 +10,7 @@ import pytest
 from support.planner_swarm import Ear
 from support.swarm_model import SwarmModel
 
+from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import Event, Heard
@@ -55,7 +56,7 @@ class World(SwarmModel):
         worker = InlineWorker(self.scheduler)
         return self.start(
             f"planner-h{self.generation}",
-            lambda bus, post: PlannerService(setup, self.ground, bus, post, worker),
+            lambda bus, post: PlannerService(Planning(setup, self.ground, bus, post, worker)),
             phase_ns=0,
         )
 

@@ -17,8 +17,6 @@ from planner_service import growth_times
 from planner_service.growth_times import WindowSchedule
 from planner_service.strategy import AHEAD, STAGES, Auto, Growths
 from planner_service.tree import strides
-from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
@@ -141,26 +139,6 @@ def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:
         found[weight] = float(lengths[np.isfinite(lengths)].sum()), float(costs[np.isfinite(costs)].sum())
     assert found[10.0][0] < found[0.0][0]
     assert found[10.0][1] > found[0.0][1]
-
-
-def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() -> None:
-    """Windows raise the costs beyond them move by move; a cut route says what going on along the parents costs."""
-    pace = random_pace(np.random.default_rng(2), 80, 80, 5.0, 0.1)
-    grid = GridSpec(80, 80, 1.0)
-    ground = CostGrid(grid, PlannerConfig())
-    ground.load(pace)
-    tree = CostToGoTree(ground)
-    target = int(np.flatnonzero(np.isfinite(pace[40]))[20]) + 40 * 80
-    tree.grow(target)
-    for turn in range(40):
-        step = 1 if turn % 2 else -1
-        if np.isfinite(pace[40, tree.root % 80 + step]):
-            tree.move(tree.root + step, grid.around(tree.root, 8))
-    starts = np.flatnonzero((ground.cell_cost < np.inf) & (tree.cost < np.inf))
-    before = tree.cost[starts] + tree.offset
-    driven = ground.walk(tree.parent, ground.pad(tree.root), starts, 0, ground.cell_cost).driven
-    assert before.max() > driven[before.argmax()] * 1.05
-    np.testing.assert_allclose(tree.cost_at(starts), driven, rtol=1e-13)
 
 
 def test_on_a_large_map_a_forced_range_grows_as_far_as_the_vehicle_without_a_worker(

@@ -22,9 +22,9 @@ TICK_NS = NS_PER_S // 10
 class Watch:
     """A planner's watch over target t0, ten ticks a second."""
 
-    def __init__(self, time_scale: float = 1.0) -> None:
+    def __init__(self) -> None:
         self.counters = Counters()
-        self.watch = TargetWatch("t0", GRID, self.counters, time_scale)
+        self.watch = TargetWatch("t0", GRID, self.counters)
         self.now_ns = START_NS
         self.seq = 0
         self.told: list[Tell] = []
@@ -74,36 +74,13 @@ def test_a_place_outside_without_a_cell_is_named_by_its_metres() -> None:
     ]
 
 
-def test_a_target_that_moves_faster_than_anything_is_followed_counted_and_said_once() -> None:
-    here = Watch()
-    for n in range(6):
-        here.hear(row=0 if n % 2 else 19, col=0 if n % 2 else 29)
-        here.tick()
-    assert here.watch.pose is not None
-    assert here.watch.pose.cell == 0
-    assert here.sentences() == ["target t0: tracker radar moved it by 347 m in 0.1 s without reporting a jump"]
-    assert here.counted() == {"poses_teleported": 5}
-
-
-@pytest.mark.parametrize("how", ["with a jump", "in time", "in scaled time", "a little"])
-def test_a_target_that_moves_as_targets_may_is_no_oddity(how: str) -> None:
-    here = Watch(time_scale=100.0 if how == "in scaled time" else 1.0)
-    here.hear(row=0, col=0)
-    here.tick(40 if how == "in time" else 1)
-    here.told.clear()
-    far = {"row": 4, "col": 4} if how == "a little" else {"row": 19, "col": 29}
-    here.hear(**far, jumps=1 if how == "with a jump" else 0)
-    assert "poses_teleported" not in here.counted()
-
-
-@pytest.mark.parametrize(("off_s", "way"), [(3600, "3600 s ahead"), (-3600, "3600 s behind")])
-def test_a_clock_that_is_an_hour_off_changes_nothing_and_is_said_once(off_s: int, way: str) -> None:
+@pytest.mark.parametrize("off_s", [3600, -3600])
+def test_a_clock_that_is_an_hour_off_changes_nothing(off_s: int) -> None:
     here = Watch()
     for _ in range(5):
         here.hear(stamp_ns=here.now_ns + off_s * NS_PER_S, incarnation=START_NS + off_s * NS_PER_S)
         here.tick()
-    assert here.sentences() == [f"target t0: the clock of tracker radar is {way}, by which nothing changes"]
-    assert here.counted() == {"tracker_clocks_off": 5}
+    assert (here.sentences(), here.counted()) == ([], {})
     assert here.watch.age_s(here.now_ns) == pytest.approx(0.1)
     assert not here.watch.lost(here.now_ns)
 

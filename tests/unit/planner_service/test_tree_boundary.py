@@ -40,7 +40,6 @@ def test_no_tree_leads_to_a_cell_outside_the_grid(tree: CostToGoTree, cell: int)
         lambda: tree.move(cell, GRID.window),
         lambda: tree.take(cell, cost, parent, 1.0),
         lambda: tree.cost_grid.passable(cell),
-        lambda: tree.cost_grid.grow(cell if cell != GRID.cells else tree.cost_grid.size, cost, parent),
     ]
     for attempt in attempts:
         with pytest.raises(OutsideGridError):
@@ -56,8 +55,6 @@ def test_no_tree_leads_to_a_lethal_cell(tree: CostToGoTree) -> None:
         tree.grow(LETHAL)
     with pytest.raises(ValueError, match="lethal"):
         tree.move(LETHAL, GRID.window)
-    with pytest.raises(ValueError, match="lethal"):
-        tree.cost_grid.grow(tree.cost_grid.pad(LETHAL), tree.cost, tree.parent)
     assert tree.root == 0
     np.testing.assert_array_equal(tree.cost, cost)
 
@@ -99,13 +96,6 @@ def test_a_window_holds_the_old_root_and_the_new_one(tree: CostToGoTree, root: i
 
 def test_a_tree_that_was_never_grown_says_so() -> None:
     tree = CostToGoTree(CostGrid(GRID, PlannerConfig()))
-    for attempt in (tree.relabel, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
+    for attempt in (tree.mend, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
         with pytest.raises(ValueError, match="no root"):
             attempt()
-
-
-def test_only_arrays_of_the_map_become_its_tree(tree: CostToGoTree) -> None:
-    with pytest.raises(ValueError, match="cells each"):
-        tree.take(0, tree.cost[:-1], tree.parent, 1.0)
-    with pytest.raises(ValueError, match="cells each"):
-        tree.take(0, tree.cost.astype(np.float64), tree.parent, 1.0)  # type: ignore[arg-type]

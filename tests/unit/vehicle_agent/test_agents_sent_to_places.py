@@ -9,7 +9,8 @@ import pytest
 from msgspec.structs import replace
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
-from planner_service.places.service import PlacesService
+from planner_service.place_planner import PlacesService
+from planner_service.planning_process import Planning
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
@@ -41,8 +42,10 @@ class SentWorld(AgentWorld):
     def start_places(self) -> None:
         self.generations += 1
         setup = self.setup("places", "all", self.generations)
+        worker = InlineWorker(self.scheduler)
         self.start(
-            "places", lambda bus, post: PlacesService(setup, self.terrain, bus, post, InlineWorker(self.scheduler))
+            "places",
+            lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)),
         )
 
     def _told(self, event: Event) -> None:

@@ -1,4 +1,4 @@
-"""The shell of `places`: routes between any two cells of the map, for groups that share their marks.
+"""The process `places`: routes between any two cells of the map, for groups that share their marks.
 
 A place is a goal without a process of its own: its tree is grown as far as its askers are and is kept for the next
 (`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
@@ -21,12 +21,11 @@ import numpy as np
 from planner_service.followers import Followers
 from planner_service.goal_trees import GoalTrees
 from planner_service.planner import FOLLOWER_LEASE_NS, MOST_ROUTES, MOST_STEPS
-from planner_service.planning_process import PlanningProcess
+from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
-from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, LinkChanged, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.agents import (
     PLACE_TREES_BYTES,
@@ -42,7 +41,6 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.liveness import job_of
 from swarm.runtime.fair_queue import FairQueue
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
@@ -95,24 +93,26 @@ class _Question:
 class _News(NamedTuple):
     """Changes of the map for the worker, in copies: the map goes on changing meanwhile.
 
-    pace  of the whole map; only what lies in the windows counts
+    pace       of the whole map; only what lies in the windows counts
+    following  vehicles with a route, the cells where they are and to which they go
     """
 
     version: int
     pace: Floats
     windows: list[Window]
+    following: list[tuple[str, int, int]]
 
 
 class _Slice(NamedTuple):
     """Work done on a question.
 
     changed   windows of the map that have changed
-    cheaper   whether some cell costs less than before: any route may be worse than another now
+    outdone   vehicles whose routes may cost more than another, as some cell costs less than before
     """
 
     grown: int
     changed: Sequence[Window] = ()
-    cheaper: bool = False
+    outdone: Sequence[str] = ()
 
 
 class _ClassTrees:
@@ -134,28 +134,36 @@ class _ClassTrees:
         self.kept_up_ns = now_ns
         pace, windows = self.cost_map.pace_s_per_m, self.cost_map.take_dirty()
         if self._version < 0:
-            return _News(self.cost_map.version, pace.copy(), [self.cost_map.grid.window])
+            return _News(self.cost_map.version, pace.copy(), [self.cost_map.grid.window], [])
         if not windows:
             return None
+        following = [
+            (id, each.cell, each.goal)
+            for id, each in self.followers.all_items()
+            if each.goal is not None and not each.stale
+        ]
         copied = np.empty_like(pace)  # of which only what is written becomes memory
         for window in windows:
             part = np.s_[window.row0 : window.row1, window.col0 : window.col1]
             copied[part] = pace[part]
-        return _News(self.cost_map.version, copied, windows)
+        return _News(self.cost_map.version, copied, windows, following)
 
     def work(self, question: _Question, news: _News | None) -> _Slice:
         """Takes the news, and answers as much of a question as a slice of cells gives."""
         changed: Sequence[Window] = ()
-        cheaper = False
+        outdone: list[str] = []
         if news is not None and self._version < 0:
             self.trees.costs.load(news.pace)
         elif news is not None:
             changes = self.trees.costs.apply(news.pace, news.windows)
             self.trees.changed(changes)
-            changed, cheaper = news.windows, bool((changes.after < changes.before).any())
+            changed = news.windows
+            if changes.any_lower:
+                keeps = self.trees.still_cheapest
+                outdone = [id for id, cell, goal in news.following if not keeps(goal, cell)]
         if news is not None:
             self._version = news.version
-        return _Slice(self._answer(question), changed, cheaper)
+        return _Slice(self._answer(question), changed, outdone)
 
     def _answer(self, question: _Question) -> int:
         request, grown = question.request, 0
@@ -185,23 +193,15 @@ class _ClassTrees:
 class PlacesService(PlanningProcess):
     """Serves routes between any two cells. The process is named after the first group that it serves."""
 
-    def __init__(
-        self,
-        setup: RoleSetup,
-        terrain: Terrain,
-        bus: Bus,
-        post: Post,
-        worker: Worker,
-        all_kernels: Callable[[], bool] | None = None,
-    ) -> None:
-        job, groups = job_of(setup.id), readable_groups(setup.scenario, job_of(setup.id))
+    def __init__(self, planning: Planning, all_kernels: Callable[[], bool] | None = None) -> None:
+        job, scenario = job_of(planning.setup.id), planning.setup.scenario
         served = {PLACE_ROUTE: {"places": job}}
-        super().__init__(setup, terrain, bus, post, worker, groups, served, all_kernels)
-        self._push_ns = int(setup.scenario.planner.push_s * NS_PER_S)
+        super().__init__(planning, readable_groups(scenario, job), served, all_kernels)
+        self._push_ns = int(scenario.planner.push_s * NS_PER_S)
         self._foreign = {
             asker_of("agent", plan.id): plan.group.name
-            for plan in plan_agents(setup.scenario)
-            if place_job(setup.scenario, plan.group.name) != job
+            for plan in plan_agents(scenario)
+            if place_job(scenario, plan.group.name) != job
         }
         """The agents which may not know what this process knows, and their groups. Routers hold an asker's name
         against its certificate."""
@@ -328,8 +328,9 @@ class PlacesService(PlanningProcess):
         self._going_on.discard(id(question))
         trees = self._trees(question.request.vehicle_class)
         self.counters.count("place_cells_grown", done.grown)
-        whole = trees.cost_map.grid.window
-        trees.followers.touch(whole if done.cheaper else Window(0, 0, 0, 0), done.changed)
+        trees.followers.touch(Window(0, 0, 0, 0), done.changed)
+        for vehicle in done.outdone:
+            trees.followers.mark_stale(vehicle)
         if not question.done and (question.event is None or now_ns - question.asked_ns < _HOLD_NS):
             self._going_on.add(id(question))
             self._wait(question)
@@ -364,7 +365,7 @@ class PlacesService(PlanningProcess):
             return
         followers = self._trees(question.request.vehicle_class).followers
         for vehicle in question.request.vehicles:
-            followers.is_stale(vehicle)
+            followers.mark_stale(vehicle)
 
     def _refuse(self, event: Asked, reason: str) -> None:
         self.counters.count("place_questions_refused")
