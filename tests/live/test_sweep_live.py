@@ -14,10 +14,9 @@ from support.process_usage import in_session
 from support.processes import eventually
 from support.small_study import STUDY, dies_of_seed_one, write_study
 
-from launch_scripts.simulation.study import cluster
-from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
+from launch_scripts.simulation.study import sweep
 from launch_scripts.simulation.study.study import load_study, plan
-from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep
+from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep, client_of, local_client, run_trials
 from launch_scripts.simulation.trials import run_trial
 from swarm.errors import BusError
 
@@ -45,8 +44,8 @@ def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     trials = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials
-    monkeypatch.setattr(cluster, "run_trial", dies_of_seed_one)
-    monkeypatch.setitem(cluster._SETTINGS, "distributed.scheduler.allowed-failures", 1)
+    monkeypatch.setattr(sweep, "run_trial", dies_of_seed_one)
+    monkeypatch.setitem(sweep._SETTINGS, "distributed.scheduler.allowed-failures", 1)
     with local_client(1) as client:
         found = {trial.seed: result for trial, result in run_trials(client, trials)}
     assert found.keys() == {0, 1, 2}
@@ -94,6 +93,6 @@ def test_a_scheduler_that_is_there_is_used_and_one_that_is_not_is_named(
         [(_, result)] = run_trials(client, [trial])
         assert result is not None
         assert result.key == trial.key
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(sweep, "_CONNECT_S", 0.5)
     with pytest.raises(BusError, match="no scheduler of Dask answers"), client_of("tcp://127.0.0.1:1"):
         pass

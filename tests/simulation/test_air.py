@@ -8,8 +8,7 @@ import statistics
 
 import numpy as np
 import pytest
-from support.class_world import captures_by_class, made
-from support.simulated import OrderedSimulation, agents, cells, vehicles
+from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node

@@ -8,9 +8,8 @@ import msgspec
 import numpy as np
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
-from support.class_world import captures_by_class, made
 from support.effort import few
-from support.simulated import OrderedSimulation, agents, cells, vehicles
+from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook

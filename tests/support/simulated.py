@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -14,14 +15,18 @@ from launch_scripts.process_table import planner_spec, spec_of
 from launch_scripts.simulation.faults import OBSERVER, FaultPlan
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation, run_to_end
+from launch_scripts.simulation.world.service import TargetsService
+from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AddedAgent
+from swarm.config.agents import AddedAgent, agent_of, plan_agents
+from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.liveness import ranked_id
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.incarnations import MemoryGenerations
 from swarm.runtime.order_book import OrderBook
+from swarm.runtime.stats import CAPTURES_BY
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, SEND_VEHICLE, ZONES
 from vehicle_agent.driving.driven_vehicle import Vehicle
@@ -64,6 +69,24 @@ def vehicles(simulation: Simulation, vehicle_class: str | None = None) -> dict[s
 
 def cells(simulation: Simulation, vehicle_class: str | None = None) -> dict[str, int]:
     return {id: vehicle.cell for id, vehicle in vehicles(simulation, vehicle_class).items()}
+
+
+@cache
+def made(text: str) -> tuple[Scenario, Terrain]:
+    """A scenario of this text, and its terrain."""
+    scenario = parse_scenario(text)
+    return scenario, build_terrain(scenario)
+
+
+def captures_by_class(simulation: Simulation) -> Counter[str]:
+    """Class of vehicles -> how many targets they have captured; 0 of a class that has captured none."""
+    targets = simulation.nodes["targets-0"].service
+    assert isinstance(targets, TargetsService)
+    classes = {plan.id: plan.group.vehicle_class for plan in plan_agents(simulation.scenario)}
+    counts: Counter[str] = Counter(dict.fromkeys(classes.values(), 0))
+    for vehicle, captures in targets.counters.counts_by[CAPTURES_BY].items():
+        counts[classes[agent_of(vehicle)]] += captures
+    return counts
 
 
 class OrderedSimulation(Simulation):

@@ -29,19 +29,6 @@ START_NS = 1_000 * NS_PER_S
 TICK_NS = NS_PER_S // 10
 
 
-class PerfectLinks:
-    """Every message arrives once, after the same short time."""
-
-    def __init__(self, delay_ns: int = 200_000) -> None:
-        self._delays = (delay_ns,)
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
-        return self._delays
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        return True
-
-
 S = TypeVar("S", bound=Service)
 
 
@@ -59,7 +46,8 @@ class SyncService:
 
 
 class LossyLinks:
-    """Links that drop, repeat and delay by chance; a cut keeps apart what lies on its two sides."""
+    """Links that drop, repeat and delay by chance; a cut keeps apart what lies on its two sides. By default every
+    message arrives once, after the same short time."""
 
     def __init__(self, seed: int, dropped: float = 0.0, repeated: float = 0.0, jitter_ms: float = 0.0) -> None:
         self._random = random.Random(seed)
@@ -112,7 +100,7 @@ class SwarmModel:
         self.scheduler = Scheduler(ManualClock(start_ns))
         self.deliveries: list[tuple[int, str, str, str, bytes]] = []
         self.network = CuttableNetwork(
-            self.scheduler, links or PerfectLinks(), lambda *delivery: self.deliveries.append(delivery)
+            self.scheduler, links or LossyLinks(0), lambda *delivery: self.deliveries.append(delivery)
         )
         self.terrain = terrain or terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))
         self.scenario = scenario or Scenario()

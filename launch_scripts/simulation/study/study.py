@@ -117,8 +117,8 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
     try:
         study = msgspec.convert(raw, Study)
     except msgspec.ValidationError as error:
-        fault = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
-        raise ConfigError(f"{source}: {fault}") from error
+        sentence = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
+        raise ConfigError(f"{source}: {sentence}") from error
     seeds = parse_seeds(study.seeds, f"{source}: seeds")
     if wrong := next(_faults(study, len(seeds)), None):
         raise ConfigError(f"{source}: {wrong}")

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.makers import run_info
-from support.swarm_model import PerfectLinks
+from support.swarm_model import LossyLinks
 
 from swarm.bus.bus import AskEnded, Event, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork
@@ -270,7 +270,7 @@ def test_a_process_without_a_manager_goes_on(environment: dict[str, str]) -> Non
 
 def test_a_process_is_ready_once_its_link_is_up_its_run_is_known_and_its_needs_are_met() -> None:
     scheduler = Scheduler(ManualClock(1))
-    network = MemoryNetwork(scheduler, PerfectLinks())
+    network = MemoryNetwork(scheduler, LossyLinks(0))
     bus = network.bus("agent-a0")
     member = Member(run_info(), bus, lambda event: None)
     fed: list[bool] = []
