@@ -20,7 +20,6 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
     QUESTION_BYTES,
     QUESTION_COST_BYTES,
@@ -40,7 +39,7 @@ from swarm.bus.bus import (
     check_subscription,
 )
 from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
-from swarm.bus.zenoh_config import session_config
+from swarm.bus.zenoh_config import patterned, session_config
 from swarm.bus.zenoh_intake import (
     Arrivals,
     Intake,

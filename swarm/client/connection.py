@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.order_calls import Orders
+from swarm.client.reported import Target
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
-from swarm.client.target import Target
 from swarm.client.terrain_frame import Frame, Point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock

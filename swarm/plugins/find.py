@@ -23,7 +23,7 @@ from swarm.config.input_files import quoted
 from swarm.config.plugin_names import NamedPlugin, check_name, installed, plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import Hangs, call_within
+from swarm.plugins.guard import Hangs, call_within, error_text
 
 Factory = Callable[[Any, Any], Any]
 """(world, options) -> the object with the method."""
@@ -159,19 +159,7 @@ def _started(named: NamedPlugin, what: str, call: Callable[[], Any]) -> Any:
     except Hangs:
         raise ConfigError(f"{named.key}: {named.name!r} {what} within {START_S:g} s") from None
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{named.key}: {named.name!r} {what}: {told(error)}") from error
-
-
-def told(error: BaseException) -> str:
-    """An error of a plug-in in words, with the line that raised it."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    where = ""
-    if trace is not None:
-        where = f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})"
-    said = " ".join(str(error).split())
-    return f"{type(error).__name__}{f': {said}' if said else ''}"[:200] + where
+        raise ConfigError(f"{named.key}: {named.name!r} {what}: {error_text(error)}") from error
 
 
 def named_plugin(scenario: Scenario, key: str) -> Plugin:

@@ -25,8 +25,8 @@ from swarm.bus.bus import (
 )
 from swarm.errors import ProtocolError, StoreError
 from swarm.liveness import Peer
-from swarm.recording.external_calls import content_of
 from swarm.recording.records import Handled, LoopFigures
+from swarm.recording.service_boundary import content_of
 from swarm.runtime.stats import Counters, Histogram
 from swarm.wire.codec import decode, decode_either, decode_many
 from swarm.wire.topics import TOPICS

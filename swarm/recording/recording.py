@@ -16,7 +16,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 from swarm.recording.events import JobDone, LoopCounters, record_of
-from swarm.recording.external_calls import content_of, pack
 from swarm.recording.records import (
     FOLDER,
     SUFFIX,
@@ -29,7 +28,7 @@ from swarm.recording.records import (
     Read,
     RecordWriter,
 )
-from swarm.recording.service_boundary import Boundary, Crossing
+from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters

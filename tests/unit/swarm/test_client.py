@@ -28,7 +28,7 @@ from swarm.bus.bus import Heard, LinkChanged
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
 from swarm.client.connection import agreed
 from swarm.client.observer import marked
-from swarm.client.own_marks import OwnMarks
+from swarm.client.vehicle import OwnMarks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages import WIRE_VERSION
@@ -390,9 +390,9 @@ def test_a_keeper_that_took_us_for_dead_is_told_again_under_a_higher_epoch() -> 
         author="all.r.1", group="all", tile=0, epoch=1, seq=mine.seq + 1, cells=b"", kinds=b"", paces=b"",
         stamps_ns=b"",
     )  # fmt: skip
-    [again] = marks.heard(shortened, 200)
+    [again] = marks.overruled(shortened, 200)
     assert (again.epoch, again.cells) == (2, mine.cells)
-    assert marks.heard(mine, 300) == marks.heard(again, 300) == []
+    assert marks.overruled(mine, 300) == marks.overruled(again, 300) == []
 
 
 AUTHORS = ["all.a.1", "all.b.2", "all.c.3", "operator.north", "operator.south"]

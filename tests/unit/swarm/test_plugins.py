@@ -22,9 +22,8 @@ from support.plugin_modules import forgotten_afterwards
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import KILLED_BY, Hangs, call_within
 from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
-from swarm.plugins.guard import Guard, Nonsense
+from swarm.plugins.guard import KILLED_BY, Guard, Hangs, Nonsense, call_within
 
 MODULE = """
 import msgspec, dataclasses
@@ -251,7 +250,7 @@ def test_native_code_that_does_not_come_back_kills_the_process_and_leaves_its_li
     script = tmp_path / "hung_plugin.py"
     script.write_text(
         "import itertools\n"
-        "from swarm.plugins.deadline import call_within\n"
+        "from swarm.plugins.guard import call_within\n"
         "def look():\n"
         "    return sum(itertools.repeat(0))\n"
         "call_within(0.1, look)\n"
@@ -272,7 +271,7 @@ def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
 def test_a_call_that_swallows_the_alarm_ends_its_process_with_the_line_that_it_hangs_in() -> None:
     code = (
         "import time\n"
-        "from swarm.plugins.deadline import call_within\n"
+        "from swarm.plugins.guard import call_within\n"
         "def swallows():\n"
         "    while True:\n"
         "        try:\n"
