@@ -49,7 +49,7 @@ class _Statement(NamedTuple):
 
 
 class OwnMarks:
-    """The mark sets of one author, which belongs to one group: published, served and digested. Pure; needs no NumPy.
+    """The mark sets of one author, which belongs to one group: published, served and digested. Pure; without NumPy.
 
     A process of the swarm keeps a whole replica (`shared_map`); this keeps only what its own author says.
     """

@@ -46,8 +46,8 @@ class JobSlots:
     Ten planners that begin together on 4096 x 4096 cells, on two processors on which others wake up all the time,
     take five times the processor time: whenever one job gives way to the next, its caches are gone.
 
-    The turns are lock files in a folder which all processes of a run on one machine see. The system ends the turn of
-    a process that dies.
+    The turns are lock files in a folder which all processes of a run on one machine see. The system ends the turn
+    of a process that dies.
 
     folder     None, or one that cannot be written: no process queues
     most       turns at once; the processors that this process may use if not given
