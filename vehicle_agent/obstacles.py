@@ -242,9 +242,9 @@ class Obstacles:
 
     def _complain(self, kind: str, id: str, text: str) -> None:
         self.refused += 1
-        told = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
-        if told not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add(told)
+        about = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
+        if about not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(about)
             self.complaints.append(f"obstacle {id} {text}")
 
     # --- time passes ----------------------------------------------------------------------------------------

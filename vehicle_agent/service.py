@@ -242,8 +242,8 @@ class AgentService:
             self.counters.count("routes_pushed")
             self._publish_followed(agent.route_pushed(pushed, now_ns))
         if parts.costs is not None:
-            for told in self._collected(SHARED_COSTS, SharedCosts):
-                parts.costs.receive(told, now_ns)
+            for costs in self._collected(SHARED_COSTS, SharedCosts):
+                parts.costs.receive(costs, now_ns)
         for placed in self._right_of_way.take_granted(now_ns):
             self._place(placed)
         if parts.spawning is not None:
@@ -255,7 +255,7 @@ class AgentService:
         agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
         self._set_planners(now_ns)
-        agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
+        agent.map_changed(self._maps.take_dirty(), now_ns, by_others=True)
         if places:
             self._sync.enter(parts.near_marks.update(places))
         self._take_obstacles(now_ns)
@@ -383,7 +383,7 @@ class AgentService:
         """A tracker says where its target is."""
         if pose.target in self._parts.untracked.targets:
             return
-        counts = self.agent.hear_pose(pose, now_ns)
+        counts = self.agent.take_pose(pose, now_ns)
         if counts is not None:  # for the simulated sensor of targets it is the truth
             self._detector.set_truth(counts, now_ns)
             self._take_target_obstacles(counts, now_ns)
@@ -447,8 +447,8 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._maps.take_dirty(), now_ns)
-        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
-            self._sync.publish(self._replica.write_learned(said, now_ns))
+        if learning is not None and (measured := learning.tick(agent.take_driven(), now_ns)):
+            self._sync.publish(self._replica.write_learned(measured, now_ns))
 
     def _on_planner(self, event: Appeared | Disappeared, now_ns: int) -> None:
         """A planner has come or gone."""
@@ -484,9 +484,9 @@ class AgentService:
             self.agent.assignment.costs_given(request, reply.target, costs_s)
 
     def _on_costs_ended(self, request: int, now_ns: int) -> None:
-        told = self.agent.costs_ended(request, now_ns)
-        if told is not None:
-            self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
+        costs = self.agent.costs_ended(request, now_ns)
+        if costs is not None:
+            self._bus.publish(SHARED_COSTS, costs, group=costs.group, author=costs.author)
 
     def _perform(self, actions: list[AgentAction]) -> None:
         """Asks planners what the core wants to know."""
