@@ -64,7 +64,7 @@ def check_plugin(
     Parameters
     ----------
     kind : name of the kind: sensor, walk, cost_layer, assignment, strategy or dynamics
-    name : as a scenario names it: ``module:Name``, an entry point, or a built-in name
+    name : as a scenario names it: ``module:Name`` or a built-in name
     options : its table of options
     folder : where its module lies, if it is not installed
     seeds : of the worlds in which it is asked

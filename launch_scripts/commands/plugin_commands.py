@@ -10,7 +10,7 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
-from swarm.config.plugin_names import PLUGIN_KINDS, installed
+from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.errors import ConfigError
 
 app = family_app("List plug-ins, and check one of your own.")
@@ -18,17 +18,14 @@ app = family_app("List plug-ins, and check one of your own.")
 
 @command(app, name="ls")
 def list_plugins() -> None:
-    """List plug-ins by kind: built-in ones, and those of installed packages.
+    """List built-in plug-ins by kind.
 
     swarm plugin ls
     """
     for kind in PLUGIN_KINDS.values():
-        typer.echo(f"{kind.name} ({kind.group})")
+        typer.echo(kind.name)
         for name in kind.built_in:
             typer.echo(f"  {name}")
-        for name, points in sorted(installed(kind).items()):
-            for point in points:
-                typer.echo(f"  {name}  {point.value}, of {point.dist.name if point.dist else 'an unknown package'}")
 
 
 @command(app)
@@ -46,7 +43,7 @@ def check(
     swarm plugin check sensor camera:Camera --options '{"misses": 0.5}'
 
     kind     sensor, walk, cost_layer, assignment, strategy or dynamics.
-    name     Name as in a scenario: module:Name, or that of an installed plug-in.
+    name     Name as in a scenario: module:Name, or a built-in name.
     options  Its options, as a JSON object.
     folder   Folder of its module, if it is not installed.
     seeds    Number of sets of test worlds.

@@ -380,7 +380,7 @@ class Vehicle(Reported):
     ) -> int:
         """State something about cells, for all vehicles and planners. Returns how many cells were stated.
 
-        cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)` or `swarm.frame.cells_in(polygon_m)`
+        cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)`
         lethal        no vehicle may enter them
         pace_s_per_m  they take so long to drive
         clear         they are as the map had them before

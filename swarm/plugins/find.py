@@ -20,7 +20,7 @@ import msgspec
 
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import quoted
-from swarm.config.plugin_names import NamedPlugin, check_name, installed, plugins_of
+from swarm.config.plugin_names import NamedPlugin, check_name, plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.plugins.guard import Hangs, call_within, error_text
@@ -81,13 +81,9 @@ def check_plugins(scenario: Scenario, roles: Collection[str]) -> None:
 
 def source_of(named: NamedPlugin, folder: str) -> bytes:
     """The text of the module that a name stands for, without running it; empty where there is none to be found."""
-    name = named.name
-    if ":" not in name:
-        points = installed(named.kind).get(name)
-        name = points[0].value if points else name
     try:
         _reach(folder)
-        spec = importlib.util.find_spec(name.partition(":")[0])
+        spec = importlib.util.find_spec(named.name.partition(":")[0])
         return Path(spec.origin).read_bytes() if spec is not None and spec.origin is not None else b""
     except (ImportError, ValueError, AttributeError, OSError):
         return b""
@@ -103,25 +99,15 @@ def _reach(folder: str) -> None:
 def _imported(named: NamedPlugin, folder: str) -> Factory:
     kind, name = named.kind, named.name
     check_name(named, "scenario")
-    found: object
-    if ":" in name:
-        module, _, attribute = name.partition(":")
-        _reach(folder)
-        found = _started(named, "could not be imported", lambda: importlib.import_module(module))
-        for part in attribute.split("."):
-            if not hasattr(found, part):
-                known = [each for each in vars(found) if not each.startswith("_")]
-                where = getattr(found, "__file__", None) or module
-                raise ConfigError(f"{named.key}: {name!r}: no {part!r} in {where}{nearest(part, known)}")
-            found = getattr(found, part)
-    else:
-        points = installed(kind)[name]
-        if len(points) > 1:
-            packages = ", ".join(sorted(point.dist.name if point.dist else "?" for point in points))
-            raise ConfigError(
-                f"{named.key}: {name!r} is offered by several packages, {packages}; use 'module:Name'"
-            )
-        found = _started(named, "could not be imported", points[0].load)
+    module, _, attribute = name.partition(":")
+    _reach(folder)
+    found: object = _started(named, "could not be imported", lambda: importlib.import_module(module))
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            known = [each for each in vars(found) if not each.startswith("_")]
+            where = getattr(found, "__file__", None) or module
+            raise ConfigError(f"{named.key}: {name!r}: no {part!r} in {where}{nearest(part, known)}")
+        found = getattr(found, part)
     if not isinstance(found, type) and callable(getattr(found, kind.method, None)):
         return lambda world, options: found  # it is made already
     if not callable(found):

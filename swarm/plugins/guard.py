@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import faulthandler
 import functools
-import logging
 import signal
 import threading
 import time
@@ -22,13 +21,10 @@ from swarm.errors import SwarmError
 if TYPE_CHECKING:
     from swarm.plugins.find import Plugin
 
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
 """Takes a fault in one sentence."""
-_SLOW_SHARE = 0.1
-"""A call that takes more than this share of what it may is said to be slow, once."""
 
 
 KILLED_BY = signal.SIGVTALRM
@@ -116,7 +112,6 @@ class Guard:
         self.works = True
         self._plugin = plugin
         self._tell = tell
-        self._slow = False
 
     def ask(self, call: Callable[[], object], check: Callable[[object], T], otherwise: Callable[[], T]) -> T:
         """Returns the result of `call` after `check`, or of `otherwise` if the plug-in fails or has failed.
@@ -126,30 +121,17 @@ class Guard:
         if not self.works:
             return otherwise()
         kind = self._plugin.named.kind
-        began_s = time.monotonic()
         try:
-            value = check(call_within(kind.call_s, call))
+            return check(call_within(kind.call_s, call))
         except Nonsense as nonsense:
             self._fail(f"returned {nonsense}")
         except Hangs:
             self._fail(f"took more than {kind.call_s:g} s")
         except (Exception, SystemExit) as error:
             self._fail(f"raised {error_text(error)}")
-        else:
-            self._watch(time.monotonic() - began_s)
-            return value
         return otherwise()
 
     def _fail(self, what: str) -> None:
         self.works = False
         kind = self._plugin.named.kind
         self._tell(f"{self._plugin} of {self._plugin.named.key}: {kind.method} {what}; {kind.failing}")
-
-    def _watch(self, took_s: float) -> None:
-        # In the log only: what a clock says may not change what a simulation sends.
-        kind = self._plugin.named.kind
-        if not self._slow and took_s > _SLOW_SHARE * kind.call_s:
-            self._slow = True
-            log.warning(
-                "%s: %s took %.2f s; its process does nothing else meanwhile", self._plugin, kind.method, took_s
-            )
