@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -492,54 +492,44 @@ class AgentService:
         """Asks planners what the core wants to know."""
         for action in actions:
             match action:
-                case AskRoutes(request, target, vehicles, cells) if (to := goal_of(target)) is not None:
-                    place = PlaceRouteRequest(
-                        to=to,
-                        cells=list(cells),
-                        vehicles=list(vehicles),
-                        max_cells=self._setup.scenario.vehicles.route_cells,
-                        vehicle_class=self._class,
-                    )
-                    self._member.ask_by_name(
-                        PLACE_ROUTE,
-                        place,
-                        tag=f"{_ROUTES}{request}",
-                        timeout_s=self._answer_s,
-                        places=self._places_job,
-                    )
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
+                    tag, timeout_s, goal = f"{_ROUTES}{request}", self._answer_s, goal_of(target)
+                    from_here: dict[str, Any] = {
+                        "cells": list(cells),
+                        "vehicles": list(vehicles),
+                        "max_cells": self._setup.scenario.vehicles.route_cells,
+                        "vehicle_class": self._class,
+                    }
+                    if goal is not None:
+                        place, job = PlaceRouteRequest(to=goal, **from_here), self._places_job
+                        self._member.ask_by_name(PLACE_ROUTE, place, tag=tag, timeout_s=timeout_s, places=job)
+                        continue
                     self.counters.count("reroute_requests", reroutes)
-                    asking = RouteRequest(
-                        cells=list(cells),
-                        vehicles=list(vehicles),
-                        max_cells=self._setup.scenario.vehicles.route_cells,
-                        force=force,
-                        vehicle_class=self._class,
-                    )
-                    tag = f"{_ROUTES}{request}"
-                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=self._answer_s, target=target)
+                    asking = RouteRequest(force=force, **from_here)
+                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=timeout_s, target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
                     self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
+            is_place = goal_of(route.target) is not None
             if route.searching:
                 self.counters.count("followed_searching")  # nothing is to be proven of these
             elif 0 < route.lower_bound_s < math.inf:
                 excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
                 self.counters.observe("followed_gap_excess", excess)
-                if goal_of(route.target) is None:
+                if not is_place:
                     self.counters.observe_by(GAPS_TO, route.target, excess)
                 self.counters.observe_by(GAPS_OF, route.vehicle, excess)
             else:
                 self.counters.count("followed_unproven")
-                if goal_of(route.target) is None:
+                if not is_place:
                     self.counters.count_by(UNPROVEN_TO, route.target)
                 self.counters.count_by(UNPROVEN_OF, route.vehicle)
             followed = Followed(
                 vehicle=route.vehicle,
-                target=_PLACE if goal_of(route.target) is not None else route.target,
+                target=_PLACE if is_place else route.target,
                 start=route.cells[0],
                 directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from swarm.bus.bus import Event, Heard, LinkChanged, Replied
@@ -81,7 +81,6 @@ class Observer:
     def __init__(self, session: Session, every_s: float = EVERY_S) -> None:
         self._session = session
         self.notes: Stream[Note] = Stream()
-        self._on_note: list[Callable[[Note], None]] = []
         self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
         """(author, region) -> its newest message, and when it came."""
         self._obstacles: dict[str, tuple[Obstacle, int]] = {}
@@ -171,10 +170,6 @@ class Observer:
             sets = [each for (tile, _), each in self._sets.items() if grid.class_of_tile(tile)[0] == 0]
             return marked(sets, grid, self._session.swarm_now_ns())
 
-    def on_note(self, callback: Callable[[Note], None]) -> None:
-        """Calls with every note, on the connection's thread."""
-        self._on_note.append(callback)
-
     def on_event(self, event: Event, now_ns: int) -> None:
         match event:
             case Heard(message=Fleet() as fleet):
@@ -188,8 +183,6 @@ class Observer:
                 self._on_followed(followed)
             case Heard(message=Note() as note):
                 self.notes.put(note)
-                for callback in self._on_note:
-                    self._session.call(lambda callback=callback, note=note: callback(note))  # type: ignore[misc]
             case Heard(message=MarkSet() as marks):
                 self._on_marks(marks)
             case Replied(tag=tag, message=MarkSet() as marks) if tag == _MARKS_TAG:
