@@ -2,7 +2,7 @@
 
 A plug-in is called with its world and its options, and returns an object with the method of its kind's `Protocol`:
 usually it is a class. An object that has the method already is used as it is. If the plug-in has an attribute
-`Options`, a msgspec Struct or a dataclass, the table of the scenario becomes one of these. A key, type or value
+`Options`, a msgspec Struct, the table of the scenario becomes one of these. A key, type or value
 that does not fit is refused. Otherwise the plug-in gets the table as it is.
 """
 
@@ -119,17 +119,13 @@ def _options(named: NamedPlugin, wanted: Any) -> Any:
     if wanted is None:
         return dict(named.options)
     key = f"{named.key.rpartition('.')[0]}.options" if named.kind.name == "cost_layer" else f"{named.key}_options"
-    is_struct = isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)
-    if not is_struct and not (isinstance(wanted, type) and dataclasses.is_dataclass(wanted)):
-        raise ConfigError(f"{named.key}: Options of {named.name!r} is neither a Struct nor a dataclass")
+    if not (isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)):
+        raise ConfigError(f"{named.key}: Options of {named.name!r} is no msgspec Struct")
     try:
         options = msgspec.convert(dict(named.options), wanted)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{key} of {named.name}: {explain(str(error), dict(named.options), wanted)}") from error
-    if dataclasses.is_dataclass(wanted):
-        allowed = [field.name for field in dataclasses.fields(wanted)]
-    else:
-        allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
+    allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
     for unknown in named.options.keys() - set(allowed):  # a struct that does not forbid them
         hint = nearest(unknown, allowed)
         raise ConfigError(f"{key} of {named.name}: unknown key {unknown}{hint}; allowed here: {', '.join(allowed)}")

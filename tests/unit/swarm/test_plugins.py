@@ -24,15 +24,14 @@ from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
 from swarm.plugins.guard import KILLED_BY, Guard, Hangs, Nonsense, call_within
 
 MODULE = """
-import msgspec, dataclasses
+import msgspec
 class Wide:
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         reach_cells: int = 4
     def __init__(self, world, options): self.world, self.options = world, options
     def look(self, cells): return self.options.reach_cells
 class Loose(Wide):
-    @dataclasses.dataclass
-    class Options:
+    class Options(msgspec.Struct):
         share: float = 0.5
 class Free:
     def __init__(self, world, options): self.options = options
@@ -70,7 +69,7 @@ def test_a_module_beside_the_scenario_is_found_and_its_options_become_its_struct
     assert (made.world, made.look([])) == ("world", 9)
 
 
-def test_options_become_a_dataclass_or_stay_a_table_and_what_is_made_already_is_taken(folder: Path) -> None:
+def test_options_become_a_struct_or_stay_a_table_and_what_is_made_already_is_taken(folder: Path) -> None:
     assert find_plugin(sensor("eyes:Loose", share=1), str(folder)).options.share == 1.0
     assert find_plugin(sensor("eyes:Free", any=[1, {}]), str(folder)).make(None).look([]) == {"any": [1, {}]}
     assert find_plugin(sensor("eyes:MADE"), str(folder)).make(None).look([5]) == [5]
@@ -84,7 +83,7 @@ def test_options_become_a_dataclass_or_stay_a_table_and_what_is_made_already_is_
         ("leaving_eyes:Eye", {}, "could not be imported: SystemExit: 3 (leaving_eyes.py:1)"),
         ("eyes:Wid", {}, "no 'Wid' in {folder}/eyes.py; did you mean 'Wide'?"),
         ("eyes:NUMBER", {}, "'eyes:NUMBER' is 7; expected a class or a function"),
-        ("eyes:Odd", {}, "Options of 'eyes:Odd' is neither a Struct nor a dataclass"),
+        ("eyes:Odd", {}, "Options of 'eyes:Odd' is no msgspec Struct"),
         ("eyes:Wide", {"reach": 3}, "unknown key reach; did you mean 'reach_cells'?; allowed here: reach_cells"),
         (
             "eyes:Wide",
