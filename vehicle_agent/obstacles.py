@@ -35,8 +35,10 @@ _STRAIGHT_CELLS = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """A disc that moves along a straight line: all points within `radius_m` of a line from (x_m, y_m), of this length
-    to the east and to the north."""
+    """A disc that moves along a straight line: all points within `radius_m` of a line from (x_m, y_m).
+
+    east_m, north_m  length of the line
+    """
 
     x_m: float
     y_m: float
