@@ -22,8 +22,7 @@ from swarm.liveness import job_of
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.job_slots import JobSlots
-from swarm.runtime.process import Service, ThreadWorker, tick_phase
+from swarm.runtime.process import JobSlots, Service, ThreadWorker, tick_phase
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)

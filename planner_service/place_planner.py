@@ -40,7 +40,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.liveness import job_of
-from swarm.runtime.fair_queue import FairQueue
+from swarm.runtime.inbox import FairQueue
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers

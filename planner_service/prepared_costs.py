@@ -23,7 +23,7 @@ from shared_map.array_files import Floats, open_array, private_copy, save_array,
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import StoreError
-from swarm.recording.external_calls import ExternalCalls
+from swarm.recording.service_boundary import ExternalCalls
 
 log = logging.getLogger(__name__)
 

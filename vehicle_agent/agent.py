@@ -302,11 +302,11 @@ class Agent:
         driven, self._driver.driven = self._driver.driven, []
         return driven
 
-    def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
+    def map_changed(self, changed: Sequence[Window], now_ns: int, *, by_others: bool = False) -> None:
         """Ends routes before cells that are lethal now, and paths also before corners that are.
 
-        changed  the windows with all cells that have changed
-        look     another agent changed the map: compare the view with it again
+        changed    the windows with all cells that have changed
+        by_others  others may have changed the map: compare the view with it again
         """
         self._wishes.ground_changed(changed)
         if not changed or not self.vehicles:
@@ -326,7 +326,7 @@ class Agent:
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
                 vehicle.cut_route(now_ns)
             self._driver.end_path(vehicle)
-            if look:
+            if by_others:
                 self._driver.entered[vehicle.cell] = None
 
     def obstacles_moved(self) -> None:
@@ -443,7 +443,7 @@ class Agent:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+    def take_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
         """Takes a tracker's pose of a target; returns it, with its cell, if it counts."""
         counts = self._trackings.counted(pose, now_ns)
         if counts is not None:

@@ -149,9 +149,9 @@ class PluginAssigner:
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
         others = table.others and replace(table.others, costs_s=table.others.costs_s.copy())
-        told = replace(table, costs_s=table.costs_s.copy(), others=others)
+        copied = replace(table, costs_s=table.costs_s.copy(), others=others)
         return self._guard.ask(
-            lambda: self._assigner.assign(told),
+            lambda: self._assigner.assign(copied),
             lambda chosen: _checked(chosen, table.costs_s),
             lambda: spread(table.costs_s, table.current),
         )

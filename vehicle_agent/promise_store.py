@@ -11,7 +11,7 @@ import msgspec
 from swarm.config.input_files import FileKind
 from swarm.errors import DamagedError
 from swarm.journal import Journal
-from swarm.recording.external_calls import ExternalCalls
+from swarm.recording.service_boundary import ExternalCalls
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way_core import OwnRecord
 

@@ -49,8 +49,8 @@ class ChasersReport:
                 goal = goal_of(target)
                 chasers.setdefault(target if goal is None else None, {})[id] = path, goal
         for target, paths in chasers.items():
-            told = self._told.get(target)
-            if told is not None and now_ns - told[1] < HEARTBEAT_NS and _holds(told[0], paths):
+            last = self._told.get(target)
+            if last is not None and now_ns - last[1] < HEARTBEAT_NS and _holds(last[0], paths):
                 continue
             cells = {id: (path[-1], goal) for id, (path, goal) in paths.items()}
             if cells:
@@ -68,12 +68,12 @@ class ChasersReport:
             )
 
 
-def _holds(told: dict[str, tuple[int, int | None]], paths: dict[str, tuple[Sequence[int], int | None]]) -> bool:
+def _holds(last: dict[str, tuple[int, int | None]], paths: dict[str, tuple[Sequence[int], int | None]]) -> bool:
     """Returns True if the last message is still true: the same vehicles and goals, and each may still reach its
     cell."""
-    if told.keys() != paths.keys():
+    if last.keys() != paths.keys():
         return False
-    return all(cell in paths[id][0] and goal == paths[id][1] for id, (cell, goal) in told.items())
+    return all(cell in paths[id][0] and goal == paths[id][1] for id, (cell, goal) in last.items())
 
 
 class FleetReport:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -242,8 +242,8 @@ class AgentService:
             self.counters.count("routes_pushed")
             self._publish_followed(agent.route_pushed(pushed, now_ns))
         if parts.costs is not None:
-            for told in self._collected(SHARED_COSTS, SharedCosts):
-                parts.costs.receive(told, now_ns)
+            for costs in self._collected(SHARED_COSTS, SharedCosts):
+                parts.costs.receive(costs, now_ns)
         for placed in self._right_of_way.take_granted(now_ns):
             self._place(placed)
         if parts.spawning is not None:
@@ -255,7 +255,7 @@ class AgentService:
         agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
         self._set_planners(now_ns)
-        agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
+        agent.map_changed(self._maps.take_dirty(), now_ns, by_others=True)
         if places:
             self._sync.enter(parts.near_marks.update(places))
         self._take_obstacles(now_ns)
@@ -383,7 +383,7 @@ class AgentService:
         """A tracker says where its target is."""
         if pose.target in self._parts.untracked.targets:
             return
-        counts = self.agent.hear_pose(pose, now_ns)
+        counts = self.agent.take_pose(pose, now_ns)
         if counts is not None:  # for the simulated sensor of targets it is the truth
             self._detector.set_truth(counts, now_ns)
             self._take_target_obstacles(counts, now_ns)
@@ -447,8 +447,8 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._maps.take_dirty(), now_ns)
-        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
-            self._sync.publish(self._replica.write_learned(said, now_ns))
+        if learning is not None and (measured := learning.tick(agent.take_driven(), now_ns)):
+            self._sync.publish(self._replica.write_learned(measured, now_ns))
 
     def _on_planner(self, event: Appeared | Disappeared, now_ns: int) -> None:
         """A planner has come or gone."""
@@ -484,62 +484,52 @@ class AgentService:
             self.agent.assignment.costs_given(request, reply.target, costs_s)
 
     def _on_costs_ended(self, request: int, now_ns: int) -> None:
-        told = self.agent.costs_ended(request, now_ns)
-        if told is not None:
-            self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
+        costs = self.agent.costs_ended(request, now_ns)
+        if costs is not None:
+            self._bus.publish(SHARED_COSTS, costs, group=costs.group, author=costs.author)
 
     def _perform(self, actions: list[AgentAction]) -> None:
         """Asks planners what the core wants to know."""
         for action in actions:
             match action:
-                case AskRoutes(request, target, vehicles, cells) if (to := goal_of(target)) is not None:
-                    place = PlaceRouteRequest(
-                        to=to,
-                        cells=list(cells),
-                        vehicles=list(vehicles),
-                        max_cells=self._setup.scenario.vehicles.route_cells,
-                        vehicle_class=self._class,
-                    )
-                    self._member.ask_by_name(
-                        PLACE_ROUTE,
-                        place,
-                        tag=f"{_ROUTES}{request}",
-                        timeout_s=self._answer_s,
-                        places=self._places_job,
-                    )
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
+                    tag, timeout_s, goal = f"{_ROUTES}{request}", self._answer_s, goal_of(target)
+                    from_here: dict[str, Any] = {
+                        "cells": list(cells),
+                        "vehicles": list(vehicles),
+                        "max_cells": self._setup.scenario.vehicles.route_cells,
+                        "vehicle_class": self._class,
+                    }
+                    if goal is not None:
+                        place, job = PlaceRouteRequest(to=goal, **from_here), self._places_job
+                        self._member.ask_by_name(PLACE_ROUTE, place, tag=tag, timeout_s=timeout_s, places=job)
+                        continue
                     self.counters.count("reroute_requests", reroutes)
-                    asking = RouteRequest(
-                        cells=list(cells),
-                        vehicles=list(vehicles),
-                        max_cells=self._setup.scenario.vehicles.route_cells,
-                        force=force,
-                        vehicle_class=self._class,
-                    )
-                    tag = f"{_ROUTES}{request}"
-                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=self._answer_s, target=target)
+                    asking = RouteRequest(force=force, **from_here)
+                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=timeout_s, target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
                     self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
+            is_place = goal_of(route.target) is not None
             if route.searching:
                 self.counters.count("followed_searching")  # nothing is to be proven of these
             elif 0 < route.lower_bound_s < math.inf:
                 excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
                 self.counters.observe("followed_gap_excess", excess)
-                if goal_of(route.target) is None:
+                if not is_place:
                     self.counters.observe_by(GAPS_TO, route.target, excess)
                 self.counters.observe_by(GAPS_OF, route.vehicle, excess)
             else:
                 self.counters.count("followed_unproven")
-                if goal_of(route.target) is None:
+                if not is_place:
                     self.counters.count_by(UNPROVEN_TO, route.target)
                 self.counters.count_by(UNPROVEN_OF, route.vehicle)
             followed = Followed(
                 vehicle=route.vehicle,
-                target=_PLACE if goal_of(route.target) is not None else route.target,
+                target=_PLACE if is_place else route.target,
                 start=route.cells[0],
                 directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,

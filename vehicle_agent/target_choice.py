@@ -85,7 +85,7 @@ class GroupCosts:
 
     def expire(self, since_ns: int) -> None:
         """Forgets agents that were not heard since then: they are gone."""
-        self._heard = {agent: heard for agent, heard in self._heard.items() if heard[1] >= since_ns}
+        self._heard = {agent: word for agent, word in self._heard.items() if word[1] >= since_ns}
 
     @property
     def targets(self) -> set[str]:
@@ -99,12 +99,12 @@ class GroupCosts:
         parts: list[NDArray[np.float64]] = []
         chased: list[int] = []
         for message, _ in self._heard.values():
-            told = column(message.costs_s, "<f4").reshape(len(message.ids), len(message.target_ids))
+            costs_s = column(message.costs_s, "<f4").reshape(len(message.ids), len(message.target_ids))
             part = np.full((len(targets), len(message.ids)), np.inf)
             at = {target: n for n, target in enumerate(targets)}
             for n, target in enumerate(message.target_ids):
                 if target in at:
-                    part[at[target]] = told[:, n]
+                    part[at[target]] = costs_s[:, n]
             ids += message.ids
             parts.append(part)
             names = (None if each == NO_TARGET else message.target_ids[each] for each in message.targets)

@@ -36,7 +36,7 @@ from launch_scripts.deploy.service_files import compose_files, systemd_files, ze
 from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
-from swarm.bus.access_control import ROUTER, bearer, common_name
+from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config.input_files import quoted
 from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario

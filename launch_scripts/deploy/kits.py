@@ -17,7 +17,7 @@ from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.process_table import OPERATOR
-from swarm.bus.access_control import common_name
+from swarm.bus.zenoh_config import common_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.load import with_files
 from swarm.config.plugin_names import plugins_of

@@ -24,8 +24,7 @@ import msgspec
 from launch_scripts.deploy.kits import GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.machine_plan import ROUTER, Plan, PlannedHost, PlannedProcess, router_name
 from launch_scripts.process_table import TABLE
-from swarm.bus.access_control import access_control, low_pass_filter
-from swarm.bus.zenoh_config import tls_settings
+from swarm.bus.zenoh_config import access_control, low_pass_filter, tls_settings
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.config.write import scenario_text
 from swarm.liveness import split_rank

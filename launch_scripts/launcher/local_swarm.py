@@ -23,7 +23,7 @@ from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
-from swarm.plugins.deadline import KILLED_BY
+from swarm.plugins.guard import KILLED_BY
 from swarm.runtime.health import BOARD_BYTES, Board, Phase
 from swarm.runtime.role import RoleSetup
 

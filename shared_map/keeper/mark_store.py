@@ -15,7 +15,7 @@ from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
-from swarm.recording.external_calls import ExternalCalls
+from swarm.recording.service_boundary import ExternalCalls
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order, VehicleGoals

@@ -244,16 +244,16 @@ def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
 S = TypeVar("S")
 
 
-def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], hear: Callable[[S], Heard | None]) -> list[Heard]:
+def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], event_of: Callable[[S], Heard | None]) -> list[Heard]:
     """The events of samples that waited, given with their keys: of a topic of which only the newest value counts,
     that of each key. A sample that is rejected hides none that came before it.
 
-    hear  makes the event of a sample; None if it is rejected
+    event_of  makes the event of a sample; None if it is rejected
     """
     by_key: dict[str | int, list[S]] = {}
     for number, (key, sample) in enumerate(waiting):
         by_key.setdefault(key if topic.newest else number, []).append(sample)
-    newest = (next(filter(None, map(hear, reversed(samples))), None) for samples in by_key.values())
+    newest = (next(filter(None, map(event_of, reversed(samples))), None) for samples in by_key.values())
     return [event for event in newest if event is not None]
 
 

@@ -59,13 +59,13 @@ def wait_for_router(endpoints: Sequence[str]) -> None:
 
     A signal whose handler raises ends it, as Ctrl-C does.
     """
-    said = False
+    warned = False
     while not any(map(listening, endpoints)):
-        if not said:
-            said = True
+        if not warned:
+            warned = True
             log.warning("no router at %s yet: waiting for one (Ctrl-C ends this)", ", ".join(endpoints))
         time.sleep(_PAUSE_S)
-    if said:
+    if warned:
         log.info("a router is there")
 
 

@@ -486,11 +486,11 @@ class MemoryBus:
 
     def collected(self, topic: Topic) -> list[Heard]:
         kept = self._gathered.pop(topic.name, ())
-        return newest_of(topic, [(sample.key, sample) for sample in kept], self._heard)
+        return newest_of(topic, [(sample.key, sample) for sample in kept], self._event_of)
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
         kept = self._gathered.pop(topic.name, ())
-        return [(sample.key, heard.message) for sample in kept if (heard := self._heard(sample, together=True))]
+        return [(sample.key, event.message) for sample in kept if (event := self._event_of(sample, together=True))]
 
     def arrived(self, sample: _Sample, subscription: Declaration) -> None:
         """Posts the event of a sample that has come, or keeps it for `collected`."""
@@ -498,19 +498,19 @@ class MemoryBus:
         topic, post = sample.topic, subscription.post
         if post is None:
             self._kept.setdefault(topic.name, deque(maxlen=topic.buffer)).append(sample)
-        elif (heard := self._heard(sample, subscription.together)) is not None:
-            post(HeardMany(topic, [(sample.key, heard.message)]) if subscription.together else heard)
+        elif (event := self._event_of(sample, subscription.together)) is not None:
+            post(HeardMany(topic, [(sample.key, event.message)]) if subscription.together else event)
 
-    def _heard(self, sample: _Sample, together: bool = False) -> Heard | None:
+    def _event_of(self, sample: _Sample, together: bool = False) -> Heard | None:
         """The event of a sample. One that is rejected is counted and dropped.
 
         together  the reader compares key and message
         """
-        heard = sample.heard(self, together)
-        if isinstance(heard, ProtocolError):
-            self.counts[counter_of(heard)] += 1
+        event = sample.event_for(self, together)
+        if isinstance(event, ProtocolError):
+            self.counts[counter_of(event)] += 1
             return None
-        return heard
+        return event
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         self.network.subscriptions[self.namespace, topic.name].remove(self, narrowed(topic, fields))
@@ -693,7 +693,7 @@ class _Sample:
     parses: Heard | ProtocolError = _UNPARSED
     fits: Heard | ProtocolError = _UNPARSED
 
-    def heard(self, bus: MemoryBus, together: bool) -> Heard | ProtocolError:
+    def event_for(self, bus: MemoryBus, together: bool) -> Heard | ProtocolError:
         """The event, as a bus takes it, or why it is rejected.
 
         together  the reader compares the message with its key
@@ -717,12 +717,12 @@ class _Sample:
             if in_json:
                 payload = packed_json(payload, kind, self.fields)
             check_meant(self.key, payload, must=in_json and kind in SHARED)
-            heard = Heard(self.topic, self.fields, decode(payload, kind))
+            event = Heard(self.topic, self.fields, decode(payload, kind))
         except ProtocolError as error:
             self.parses = self.fits = error
             return
-        self.parses = self.fits = heard
+        self.parses = self.fits = event
         try:
-            self.topic.check_key(self.fields, heard.message)
+            self.topic.check_key(self.fields, event.message)
         except ProtocolError as error:
             self.fits = error

@@ -20,7 +20,6 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.access_control import patterned
 from swarm.bus.bus import (
     QUESTION_BYTES,
     QUESTION_COST_BYTES,
@@ -40,12 +39,12 @@ from swarm.bus.bus import (
     check_subscription,
 )
 from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
-from swarm.bus.zenoh_config import session_config
+from swarm.bus.zenoh_config import patterned, session_config
 from swarm.bus.zenoh_intake import (
     Arrivals,
     Intake,
     guarded,
-    says_json,
+    is_json,
     taken_after,
     taken_from,
     timeout_of,
@@ -74,7 +73,7 @@ class ZenohAnswerer:
         self._arrived_s = time.monotonic()
         self._asked = b"" if query.payload is None else query.payload.to_bytes()
         self._parameters = dict(list(query.parameters))  # type: ignore[call-overload]
-        self._as_json = says_json(query, self._asked) or self._parameters.get("format") == "json"
+        self._as_json = is_json(query, self._asked) or self._parameters.get("format") == "json"
         self._fault: ProtocolError | None = None
         self.timeout_s = USUAL_TIMEOUT_S
         try:
@@ -165,7 +164,7 @@ def open_bus(
     authenticator  signs messages on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
-    said = False
+    warned = False
     while True:
         if patient:
             wait_for_router(endpoints)
@@ -176,9 +175,9 @@ def open_bus(
         except zenoh.ZError as error:
             if not patient or any(map(keeps_open, endpoints)):
                 raise _why_not(error, network, mode) from error
-            if not said:
+            if not warned:
                 log.warning("no router behind %s yet: waiting for one (Ctrl-C ends this)", ", ".join(endpoints))
-            said = True
+            warned = True
 
 
 def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError:

@@ -145,22 +145,22 @@ def attached(carrier: Any) -> bytes | None:
     return attachment
 
 
-def says_json(carrier: Any, payload: bytes) -> bool:
+def is_json(carrier: Any, payload: bytes) -> bool:
     """Returns True if the encoding of a sample or query is JSON. The lookup costs more than reading the first
     byte."""
     return may_be_json(payload) and str(carrier.encoding).partition(";")[0] == JSON_ENCODING
 
 
-def timeout_of(said: str) -> float:
+def timeout_of(stated: str) -> float:
     """The timeout that a query states, within bounds. Raises ProtocolError if it is not a positive number."""
-    if not said:
+    if not stated:
         return USUAL_TIMEOUT_S
     try:
-        timeout_s = float(said)
+        timeout_s = float(stated)
     except ValueError:
         timeout_s = 0.0
     if not timeout_s > 0:  # neither is NaN
-        raise ProtocolError(f"{TIMEOUT_PARAMETER} {said[:40]!r} is not a positive number of seconds")
+        raise ProtocolError(f"{TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
     return min(timeout_s, LONGEST_TIMEOUT_S)
 
 
@@ -188,7 +188,7 @@ class Intake:
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
 
-    def _heard(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
+    def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         try:
             named = self.fields(topic, key)
@@ -205,18 +205,18 @@ class Intake:
         keyed = list(self._packed(topic, samples))
         keys = [key for key, _ in keyed]
         decoded = decode_many([payload for _, payload in keyed], topic.message)
-        heard: list[tuple[str, Message]] = []
+        accepted: list[tuple[str, Message]] = []
         for key, message in zip(keys, decoded, strict=True):
             if isinstance(message, ProtocolError):
                 self.drop(key, message)
             else:
-                heard.append((self.below(key), message))
-        return heard
+                accepted.append((self.below(key), message))
+        return accepted
 
     def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
         """The events of the newest sample under each key, without those that are rejected."""
         keyed = ((each[0], each) for each in self._own(samples))
-        return newest_of(topic, keyed, lambda waited: self._heard(topic, *waited))
+        return newest_of(topic, keyed, lambda waited: self._event_of(topic, *waited))
 
     def _own(self, samples: list[zenoh.Sample]) -> list[tuple[str, zenoh.Sample, bytes]]:
         """Keys, samples and payloads of those in our namespace: `patterned` hears others, too."""
@@ -250,7 +250,7 @@ class Intake:
             check_named(self.below(key), parameters.pop(KEY_FIELD, None))
             self.check(topic, key, query, asked)
             return decode_parameters(parameters, wanted)
-        packed = packed_json(asked, wanted) if says_json(query, asked) else asked
+        packed = packed_json(asked, wanted) if is_json(query, asked) else asked
         check_meant(self.below(key), packed)
         self.check(topic, key, query, asked)
         return decode(packed, wanted)
@@ -259,7 +259,7 @@ class Intake:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
         check_size(payload, topic.put_bytes)
-        in_json = says_json(sample, payload)
+        in_json = is_json(sample, payload)
         packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
         self.check(topic, key, sample, payload)

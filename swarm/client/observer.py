@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from swarm.bus.bus import Event, Heard, LinkChanged, Replied
@@ -16,7 +16,6 @@ from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, Obstacle, VehicleState
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, OBSTACLE, POSE
 
-CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
 """A fleet that was silent for so long is shown no more. Agents tell at each tick, and at once when they leave."""
 EVERY_S = 0.2
@@ -82,7 +81,6 @@ class Observer:
     def __init__(self, session: Session, every_s: float = EVERY_S) -> None:
         self._session = session
         self.notes: Stream[Note] = Stream()
-        self._on_note: list[Callable[[Note], None]] = []
         self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
         """(author, region) -> its newest message, and when it came."""
         self._obstacles: dict[str, tuple[Obstacle, int]] = {}
@@ -167,26 +165,10 @@ class Observer:
     @property
     def marks(self) -> Mapping[int, Mark]:
         """Current marks for all vehicles, by cell: the newest of several marks of a cell."""
-        return self._marks_of(0)
-
-    def marks_for(self, vehicle_class: str) -> Mapping[int, Mark]:
-        """Current marks for one class of vehicles alone, as `marks`. Raises ConfigError if there is no such
-        class."""
-        return self._marks_of(self._session.class_number(vehicle_class, "vehicle_class"))
-
-    def _marks_of(self, class_number: int) -> Mapping[int, Mark]:
         with self._session.lock:
             grid = self._session.frame.grid
-            sets = [each for (tile, _), each in self._sets.items() if grid.class_of_tile(tile)[0] == class_number]
+            sets = [each for (tile, _), each in self._sets.items() if grid.class_of_tile(tile)[0] == 0]
             return marked(sets, grid, self._session.swarm_now_ns())
-
-    def on_note(self, callback: Callable[[Note], None]) -> None:
-        """Calls with every note, on the connection's thread."""
-        self._on_note.append(callback)
-
-    def on_capture(self, callback: Callable[[Note], None]) -> None:
-        """Calls with the note of every capture, on the connection's thread."""
-        self.on_note(lambda note: callback(note) if note.kind == CAPTURE else None)
 
     def on_event(self, event: Event, now_ns: int) -> None:
         match event:
@@ -201,8 +183,6 @@ class Observer:
                 self._on_followed(followed)
             case Heard(message=Note() as note):
                 self.notes.put(note)
-                for callback in self._on_note:
-                    self._session.call(lambda callback=callback, note=note: callback(note))  # type: ignore[misc]
             case Heard(message=MarkSet() as marks):
                 self._on_marks(marks)
             case Replied(tag=tag, message=MarkSet() as marks) if tag == _MARKS_TAG:
@@ -288,9 +268,9 @@ def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Ma
             if not grid.inside(row, col):
                 continue  # in a tile that the border cuts
             at = grid.cell(row, col)
-            said = (zone, stamp_ns, each.author, kind, pace)
-            if at not in won or said[:3] > won[at][:3]:
-                won[at] = said
+            statement = (zone, stamp_ns, each.author, kind, pace)
+            if at not in won or statement[:3] > won[at][:3]:
+                won[at] = statement
     return {
         cell: Mark(kind == MarkKind.LETHAL, pace if kind == MarkKind.PACE else None)
         for cell, (*_, kind, pace) in sorted(won.items())

@@ -97,11 +97,6 @@ class Route:
         turns = (self.cells[turn] for turn in self.turns) if self.turns else self.cells
         return tuple(map(self.frame.centre_m, turns))
 
-    @cached_property
-    def points_wgs84(self) -> tuple[Point, ...]:
-        """(lat_deg, lon_deg) of `points_m`. Raises as `Frame.to_wgs84`."""
-        return tuple(self.frame.to_wgs84(*point) for point in self.points_m)
-
     @property
     def length_m(self) -> float:
         """Length of its polyline (m)."""

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
 import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
 from swarm.client.route import Route
@@ -25,9 +24,6 @@ from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import NAMELESS_ROUTE, ROUTE, RUN, Topic, asker_of
 
-if TYPE_CHECKING:
-    import asyncio
-
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
@@ -36,11 +32,11 @@ _RUN_TIMEOUT_S = 2.0
 """Longest wait for the answer to which run is in the namespace."""
 _COMPARE_AGAIN_NS = 2 * NS_PER_S
 """Time until that query is repeated if no process has replied."""
-_SAY_AGAIN_NS = 60 * NS_PER_S
+_REPORT_AGAIN_NS = 60 * NS_PER_S
 """Time until the same problem is reported again: once a minute, as in logs of the bus."""
 _SAME_CLOCK_NS = NS_PER_S
 """Clocks that differ by less are not corrected: an answer is as old as a tick."""
-_MOST_SAID = 1024
+_MOST_REPORTED = 1024
 """Sentences that are remembered for it. Beyond this number all are forgotten, and reported again at most."""
 
 
@@ -85,7 +81,7 @@ class Session:
         """Time of the next query for the namespace's run, if no process has replied since the link is back."""
         self._later: list[Callable[[], None]] = []
         """Callbacks to call once the lock is free."""
-        self._said_ns: dict[str, int] = {}
+        self._reported_ns: dict[str, int] = {}
         """Problem -> time of its last report."""
         self._on_problem: list[Callable[[str], None]] = []
         self._owner: int | None = None
@@ -233,11 +229,11 @@ class Session:
         """Counts a problem, and reports it in the log and to callbacks, once a minute."""
         self.counts[kind] += 1
         now_ns = self.now_ns()
-        if now_ns - self._said_ns.get(sentence, -_SAY_AGAIN_NS) < _SAY_AGAIN_NS:
+        if now_ns - self._reported_ns.get(sentence, -_REPORT_AGAIN_NS) < _REPORT_AGAIN_NS:
             return
-        if len(self._said_ns) >= _MOST_SAID:
-            self._said_ns.clear()
-        self._said_ns[sentence] = now_ns
+        if len(self._reported_ns) >= _MOST_REPORTED:
+            self._reported_ns.clear()
+        self._reported_ns[sentence] = now_ns
         log.warning("%s", sentence)
         for callback in self._on_problem:
             self.call(lambda callback=callback: callback(sentence))  # type: ignore[misc]
@@ -364,8 +360,6 @@ class Stream(Generic[T]):
     def __init__(self, most: int = MOST_WAITING) -> None:
         self._waiting: deque[T] = deque(maxlen=most)
         self._changed = threading.Condition()
-        self._sleepers: list[tuple[asyncio.AbstractEventLoop, asyncio.Future[None]]] = []
-        """Readers in asyncio that wait for a value; each is woken once."""
         self.closed = False
         self.newest: T | None = None
         """The value that came last, whether it was read or not; None before the first."""
@@ -376,13 +370,13 @@ class Stream(Generic[T]):
             if not self.closed:
                 self._waiting.append(value)
                 self.newest = value
-            self._wake()
+            self._changed.notify_all()
 
     def close(self) -> None:
         """Ends it: readers receive the remaining items, and then stop."""
         with self._changed:
             self.closed = True
-            self._wake()
+            self._changed.notify_all()
 
     def next(self, timeout_s: float | None = None) -> T | None:
         """The next value; None if there is none within the timeout, or it has ended."""
@@ -393,36 +387,3 @@ class Stream(Generic[T]):
     def __iter__(self) -> Iterator[T]:
         while (value := self.next()) is not None:
             yield value
-
-    async def __aiter__(self) -> AsyncIterator[T]:
-        from asyncio import get_running_loop  # whose import takes as long as all of ours
-
-        loop = get_running_loop()
-        while True:
-            with self._changed:
-                value = self._waiting.popleft() if self._waiting else None
-                if value is None and self.closed:
-                    return
-                if value is None:
-                    sleeper = loop.create_future()
-                    self._sleepers.append((loop, sleeper))
-            if value is not None:
-                yield value
-                continue
-            try:
-                await sleeper
-            finally:
-                with self._changed, contextlib.suppress(ValueError):
-                    self._sleepers.remove((loop, sleeper))
-
-    def _wake(self) -> None:
-        self._changed.notify_all()
-        for loop, sleeper in self._sleepers:
-            with contextlib.suppress(RuntimeError):  # its loop was closed meanwhile
-                loop.call_soon_threadsafe(_release, sleeper)
-        self._sleepers.clear()
-
-
-def _release(sleeper: asyncio.Future[None]) -> None:
-    if not sleeper.done():
-        sleeper.set_result(None)

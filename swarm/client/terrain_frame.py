@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import bisect
 import contextlib
 import math
 import operator
 import reprlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
@@ -94,31 +93,6 @@ class Frame:
             for col in range(window.col0, window.col1)
         )
         return [each for each in cells if each == at or math.dist(self.centre_m(each), (x_m, y_m)) <= radius_m]
-
-    def cells_in(self, polygon_m: Sequence[Point]) -> list[int]:
-        """The cells whose middle is inside a polygon, given by its corners; edges that cross leave holes
-        (even-odd). Raises ConfigError on fewer than three corners and on a value that is not a number."""
-        try:
-            corners = [(number("x_m", x_m), number("y_m", y_m)) for x_m, y_m in polygon_m]
-        except (TypeError, ValueError):
-            raise ConfigError("polygon_m is no list of corners, each with x_m and y_m") from None
-        if len(corners) < 3 or not all(math.isfinite(value) for corner in corners for value in corner):
-            raise ConfigError(f"a polygon of {len(corners)} corners: expected three or more, all finite numbers")
-        grid, cells = self.grid, []
-        middles = [grid.north_m - (row + 0.5) * grid.resolution_m for row in reversed(range(grid.rows))]
-        crossed: dict[int, list[float]] = {}
-        for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
-            # Only the rows that an edge crosses are looked at, so that many corners take no more than their length.
-            south, north = sorted((bisect.bisect_left(middles, ay), bisect.bisect_left(middles, by)))
-            for at in range(south, north):
-                crossed.setdefault(grid.rows - 1 - at, []).append(ax + (middles[at] - ay) / (by - ay) * (bx - ax))
-        for row, crossings in sorted(crossed.items()):
-            crossings.sort()
-            for left_m, right_m in zip(crossings[::2], crossings[1::2], strict=True):
-                first = math.ceil((left_m - grid.west_m) / grid.resolution_m - 0.5)
-                last = math.ceil((right_m - grid.west_m) / grid.resolution_m - 0.5)
-                cells += [row * grid.cols + col for col in range(max(first, 0), min(last, grid.cols))]
-        return cells
 
     def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
         """Returns (x_m, y_m) of a latitude and longitude in degrees. Raises ConfigError if they are out of range,

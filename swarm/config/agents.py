@@ -90,12 +90,12 @@ def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
     None if that is all groups."""
     groups = {each.name: each for each in scenario.groups}
     mine = groups[group]
-    heard = {
+    readable = {
         other.name
         for other in scenario.groups
         if other.name == group or (_names(mine.reads, other.name) and _names(other.writes, group))
     }
-    return None if heard == groups.keys() else frozenset(heard)
+    return None if readable == groups.keys() else frozenset(readable)
 
 
 def _names(listed: Sequence[str], group: str) -> bool:

@@ -61,7 +61,7 @@ def read_scenario(
     """
     try:
         raw = with_settings(parse_toml(text, source, ConfigError), settings or {}, source)
-        raw = with_class_costs(with_preset(_renamed(raw)))
+        raw = with_class_costs(with_preset(raw))
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []
@@ -93,22 +93,6 @@ def read_scenario(
         return None, [str(error)]
     faults += islice(_faults(scenario, source), most)
     return scenario if base is None else anchored(scenario, base), faults
-
-
-_RENAMED = {"map": {"plot_regions": "shard_regions"}, "targets": {"body_radius_m": "obstacle_radius_m"}}
-"""Section -> keys of the version before -> their names since. They are accepted for one version."""
-
-
-def _renamed(raw: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a scenario under their names of today."""
-    for section, names in _RENAMED.items():
-        found = raw.get(section)
-        for table in found if isinstance(found, list) else [found]:
-            if isinstance(table, dict):
-                table.update(
-                    {new: table.pop(old) for old, new in names.items() if old in table and new not in table}
-                )
-    return raw
 
 
 def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:

@@ -1,14 +1,14 @@
 """The kinds of plug-ins, and the names under which a scenario may call one.
 
-A name is one of the kind's own table, the name of an entry point that an installed package offers in the kind's
-group, or `module:Name`. Only a scenario names a plug-in: it is the user's own file, and what it names is run.
+A name is one of the kind's own table, or `module:Name`. Only a scenario names a plug-in: it is the user's own file,
+and what it names is run.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
@@ -16,15 +16,12 @@ from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.config.setting_types import Assigner, Dynamics, Sensor, Strategy, Walk
 from swarm.errors import ConfigError
 
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
 
 @dataclass(frozen=True, slots=True)
 class PluginKind:
     """Kind of a plug-in: its name, and the consequence for a process whose plug-in fails.
 
-    name      as in the group of its entry points
+    name      as `swarm plugin` takes it
     role      the role that calls it; every role builds the map, if it is not prepared
     built_in  names of the kind's own table
     method    what a plug-in is asked for, as its `Protocol` names it
@@ -38,11 +35,6 @@ class PluginKind:
     method: str
     failing: str
     call_s: float = 2.0
-
-    @property
-    def group(self) -> str:
-        """Group of the entry points that offer such plug-ins."""
-        return f"terrain_swarm.{self.name}"
 
 
 _KINDS = (
@@ -116,25 +108,10 @@ def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
     ]
 
 
-def installed(kind: PluginKind) -> dict[str, list[EntryPoint]]:
-    """The plug-ins that installed packages offer, by name: more than one where two packages use the same."""
-    # Imported here: the import is slow, and few scenarios name a plug-in that is not built in.
-    from importlib.metadata import entry_points
-
-    found: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=kind.group):
-        found.setdefault(point.name, []).append(point)
-    return found
-
-
 def check_name(plugin: NamedPlugin, source: str) -> None:
-    """Raises ConfigError where a name is neither built in, nor installed, nor `module:Name`. Imports nothing."""
-    kind, name = plugin.kind, plugin.name
-    if name in kind.built_in or ":" in name:
+    """Raises ConfigError where a name is neither built in nor `module:Name`. Imports nothing."""
+    name, allowed = plugin.name, plugin.kind.built_in
+    if name in allowed or ":" in name:
         return
-    known = installed(kind)
-    if name in known:
-        return
-    allowed = [*kind.built_in, *known]
     choices = ", ".join([*map(repr, allowed), "or a plug-in as 'module:Name'"])
     raise ConfigError(f"{source}: {plugin.key}: found {quoted(name)}{nearest(name, allowed)}; allowed: {choices}")

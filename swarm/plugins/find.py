@@ -2,7 +2,7 @@
 
 A plug-in is called with its world and its options, and returns an object with the method of its kind's `Protocol`:
 usually it is a class. An object that has the method already is used as it is. If the plug-in has an attribute
-`Options`, a msgspec Struct or a dataclass, the table of the scenario becomes one of these. A key, type or value
+`Options`, a msgspec Struct, the table of the scenario becomes one of these. A key, type or value
 that does not fit is refused. Otherwise the plug-in gets the table as it is.
 """
 
@@ -20,10 +20,10 @@ import msgspec
 
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import quoted
-from swarm.config.plugin_names import NamedPlugin, check_name, installed, plugins_of
+from swarm.config.plugin_names import NamedPlugin, check_name, plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import Hangs, call_within
+from swarm.plugins.guard import Hangs, call_within, error_text
 
 Factory = Callable[[Any, Any], Any]
 """(world, options) -> the object with the method."""
@@ -81,13 +81,9 @@ def check_plugins(scenario: Scenario, roles: Collection[str]) -> None:
 
 def source_of(named: NamedPlugin, folder: str) -> bytes:
     """The text of the module that a name stands for, without running it; empty where there is none to be found."""
-    name = named.name
-    if ":" not in name:
-        points = installed(named.kind).get(name)
-        name = points[0].value if points else name
     try:
         _reach(folder)
-        spec = importlib.util.find_spec(name.partition(":")[0])
+        spec = importlib.util.find_spec(named.name.partition(":")[0])
         return Path(spec.origin).read_bytes() if spec is not None and spec.origin is not None else b""
     except (ImportError, ValueError, AttributeError, OSError):
         return b""
@@ -103,25 +99,15 @@ def _reach(folder: str) -> None:
 def _imported(named: NamedPlugin, folder: str) -> Factory:
     kind, name = named.kind, named.name
     check_name(named, "scenario")
-    found: object
-    if ":" in name:
-        module, _, attribute = name.partition(":")
-        _reach(folder)
-        found = _started(named, "could not be imported", lambda: importlib.import_module(module))
-        for part in attribute.split("."):
-            if not hasattr(found, part):
-                known = [each for each in vars(found) if not each.startswith("_")]
-                where = getattr(found, "__file__", None) or module
-                raise ConfigError(f"{named.key}: {name!r}: no {part!r} in {where}{nearest(part, known)}")
-            found = getattr(found, part)
-    else:
-        points = installed(kind)[name]
-        if len(points) > 1:
-            packages = ", ".join(sorted(point.dist.name if point.dist else "?" for point in points))
-            raise ConfigError(
-                f"{named.key}: {name!r} is offered by several packages, {packages}; use 'module:Name'"
-            )
-        found = _started(named, "could not be imported", points[0].load)
+    module, _, attribute = name.partition(":")
+    _reach(folder)
+    found: object = _started(named, "could not be imported", lambda: importlib.import_module(module))
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            known = [each for each in vars(found) if not each.startswith("_")]
+            where = getattr(found, "__file__", None) or module
+            raise ConfigError(f"{named.key}: {name!r}: no {part!r} in {where}{nearest(part, known)}")
+        found = getattr(found, part)
     if not isinstance(found, type) and callable(getattr(found, kind.method, None)):
         return lambda world, options: found  # it is made already
     if not callable(found):
@@ -133,17 +119,13 @@ def _options(named: NamedPlugin, wanted: Any) -> Any:
     if wanted is None:
         return dict(named.options)
     key = f"{named.key.rpartition('.')[0]}.options" if named.kind.name == "cost_layer" else f"{named.key}_options"
-    is_struct = isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)
-    if not is_struct and not (isinstance(wanted, type) and dataclasses.is_dataclass(wanted)):
-        raise ConfigError(f"{named.key}: Options of {named.name!r} is neither a Struct nor a dataclass")
+    if not (isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)):
+        raise ConfigError(f"{named.key}: Options of {named.name!r} is no msgspec Struct")
     try:
         options = msgspec.convert(dict(named.options), wanted)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{key} of {named.name}: {explain(str(error), dict(named.options), wanted)}") from error
-    if dataclasses.is_dataclass(wanted):
-        allowed = [field.name for field in dataclasses.fields(wanted)]
-    else:
-        allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
+    allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
     for unknown in named.options.keys() - set(allowed):  # a struct that does not forbid them
         hint = nearest(unknown, allowed)
         raise ConfigError(f"{key} of {named.name}: unknown key {unknown}{hint}; allowed here: {', '.join(allowed)}")
@@ -159,19 +141,7 @@ def _started(named: NamedPlugin, what: str, call: Callable[[], Any]) -> Any:
     except Hangs:
         raise ConfigError(f"{named.key}: {named.name!r} {what} within {START_S:g} s") from None
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{named.key}: {named.name!r} {what}: {told(error)}") from error
-
-
-def told(error: BaseException) -> str:
-    """An error of a plug-in in words, with the line that raised it."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    where = ""
-    if trace is not None:
-        where = f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})"
-    said = " ".join(str(error).split())
-    return f"{type(error).__name__}{f': {said}' if said else ''}"[:200] + where
+        raise ConfigError(f"{named.key}: {named.name!r} {what}: {error_text(error)}") from error
 
 
 def named_plugin(scenario: Scenario, key: str) -> Plugin:

@@ -15,8 +15,6 @@ from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
-from swarm.recording.events import JobDone, LoopCounters, record_of
-from swarm.recording.external_calls import content_of, pack
 from swarm.recording.records import (
     FOLDER,
     SUFFIX,
@@ -24,12 +22,15 @@ from swarm.recording.records import (
     Called,
     Ended,
     Head,
+    JobDone,
+    LoopCounters,
     Output,
     Outputs,
     Read,
     RecordWriter,
+    record_of,
 )
-from swarm.recording.service_boundary import Boundary, Crossing
+from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters

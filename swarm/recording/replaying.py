@@ -11,11 +11,22 @@ from typing import Any, TypeVar, cast
 from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
-from swarm.recording.events import event_of, rest_of, set_figures
-from swarm.recording.external_calls import unpack
 from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as
-from swarm.recording.records import Call, Called, Cut, Ended, Handled, Output, Outputs, Read, RecordReader
-from swarm.recording.service_boundary import Crossing
+from swarm.recording.records import (
+    Call,
+    Called,
+    Cut,
+    Ended,
+    Handled,
+    Output,
+    Outputs,
+    Read,
+    RecordReader,
+    event_of,
+    rest_of,
+    set_figures,
+)
+from swarm.recording.service_boundary import Crossing, unpack
 from swarm.runtime.process import Service, collected_rarely
 
 T = TypeVar("T")

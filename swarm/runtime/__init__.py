@@ -10,5 +10,4 @@ and answers in time under overload. Mechanisms of every role:
 `tracking`       Decides which of several trackers owns a target.
 `health`         Tells whether the loop turns, to other threads and processes and to systemd.
 `role`           The setup that a process is started with. `run_secret` is what processes of one user share.
-`job_slots`      Lets long jobs of one machine run as many at once as it has processors.
 """

@@ -68,10 +68,10 @@ class Supervisor:
         """Returns True if it has arrived."""
         if self._socket is None or self._address is None:
             return True
-        told = [*words, *([] if self._status is None else [f"STATUS={self._status}"])]
+        lines = [*words, *([] if self._status is None else [f"STATUS={self._status}"])]
         address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
         try:
-            self._socket.sendto("\n".join(told).encode(), address)
+            self._socket.sendto("\n".join(lines).encode(), address)
         except OSError as error:
             log.debug("NOTIFY_SOCKET %s: %s", self._address, error)
             return False

@@ -1,10 +1,12 @@
-"""The loop of a process: an inbox, ticks, signals, a worker, and the collection of garbage.
+"""The loop of a process: an inbox, ticks, signals, a worker whose long jobs take turns, and the collection of
+garbage.
 
 One thread owns a service's state; all others post to the inbox.
 """
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import logging
 import math
@@ -15,7 +17,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 from zlib import crc32
 
@@ -24,11 +27,63 @@ from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.first_use import in_loop
 from swarm.runtime.health import Health
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.job_slots import JobSlots
 from swarm.runtime.stats import CPU_S, ENDED, FIRST_USES, RSS_BYTES, Counters
 
 if TYPE_CHECKING:
     import psutil
+
+LONG_NS = 200_000_000
+"""Jobs that are expected to take less do not queue."""
+_RETRY_S = 0.02
+"""Time between two attempts to get a free slot: a tenth of the shortest job that queues."""
+_LONGEST_S = 20.0
+"""Longest wait (s): the process whose turn it is may be stopped for ever. Turns make jobs quick, not right."""
+
+
+class JobSlots:
+    """Long jobs of a machine's processes in turn: as many at once as it has processors.
+
+    Ten planners that begin together on 4096 x 4096 cells, on two processors on which others wake up all the time,
+    take five times the processor time: whenever one job gives way to the next, its caches are gone.
+
+    The turns are lock files in a folder which all processes of a run on one machine see. The system ends the turn
+    of a process that dies.
+
+    folder     None, or one that cannot be written: no process queues
+    most       turns at once; the processors that this process may use if not given
+    longest_s  the longest wait
+    """
+
+    def __init__(self, folder: Path | None, most: int | None = None, longest_s: float = _LONGEST_S) -> None:
+        most = most or len(os.sched_getaffinity(0))
+        self._paths = [] if folder is None else [folder / f"turn-{index}.lock" for index in range(most)]
+        self._longest_s = longest_s
+
+    @contextmanager
+    def one(self, expected_ns: int = LONG_NS) -> Iterator[None]:
+        """Have a turn, for a job that is expected to take so long."""
+        with ExitStack() as held:
+            if expected_ns >= LONG_NS:
+                try:
+                    self._queue(held)
+                except OSError as error:
+                    log.warning("cannot take turns with others on this machine: %s", error.strerror or error)
+            yield
+
+    def _queue(self, held: ExitStack) -> None:
+        until_s = time.monotonic() + self._longest_s
+        while self._paths and time.monotonic() < until_s:
+            for path in self._paths:
+                file = path.open("ab")
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    file.close()
+                else:
+                    held.enter_context(file)
+                    return
+            time.sleep(_RETRY_S)
+
 
 _OBJECTS = 50_000
 """New containers until a collection. At Python's 700 a message of a few hundred vehicles sets one off by itself; a

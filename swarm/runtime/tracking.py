@@ -209,8 +209,8 @@ def _oldest(living: list[_Generation]) -> _Generation | None:
             speakers[name] = generation
     if len(speakers) < 2:
         return next(iter(speakers.values()), None)
-    told = [generation.began_ns for generation in speakers.values() if generation.began_ns is not None]
-    first_ns = min(told, default=None)
+    begins_ns = [generation.began_ns for generation in speakers.values() if generation.began_ns is not None]
+    first_ns = min(begins_ns, default=None)
     elders = [generation for generation in speakers.values() if _is_elder(generation, first_ns)]
     return min(elders, key=lambda generation: generation.order)
 

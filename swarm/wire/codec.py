@@ -422,6 +422,3 @@ def _cells_row_col(route: Route, cols: int) -> list[list[int]]:
         row, col = row + STEP_ROW[code], col + STEP_COL[code]
         cells.append([row, col])
     return cells
-
-
-# --- JSON and parameters ------------------------------------------------------------------------------------------

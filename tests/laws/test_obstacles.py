@@ -23,9 +23,8 @@ from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.cells_of_discs import Capsule
 from vehicle_agent.driving.driver import Driver
-from vehicle_agent.obstacles import REACTION_S, Obstacles
+from vehicle_agent.obstacles import REACTION_S, Capsule, Obstacles
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.steering import Steering
 

@@ -25,9 +25,9 @@ from swarm.grid import GridSpec, walk
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.route_columns import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
+from vehicle_agent.driving.driven_vehicle import Follower
 from vehicle_agent.driving.dynamics import PluginDynamics, Stretch
 from vehicle_agent.driving.motion import Motion
-from vehicle_agent.driving.route_follower import Follower
 
 
 def twin_cost_s(pace: NDArray[np.float32], start: Cell, end: Cell, corner_cutting: bool) -> float:

@@ -28,9 +28,9 @@ from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, walk
 from swarm.wire.route_columns import RouteStatus
+from vehicle_agent.driving.driven_vehicle import Follower
 from vehicle_agent.driving.driver import climbing_of
 from vehicle_agent.driving.motion import Motion
-from vehicle_agent.driving.route_follower import Follower
 
 METRES = 30.0
 SPEED_MPS = 12.0

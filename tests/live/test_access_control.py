@@ -24,9 +24,8 @@ from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher.router import Admission
 from launch_scripts.launcher.router_door import FREE_TRIES
 from launch_scripts.ports import free_ports
-from swarm.bus.access_control import ROUTER, Bearer, bearer, common_name, patterned
 from swarm.bus.endpoints import host_port
-from swarm.bus.zenoh_config import session_config
+from swarm.bus.zenoh_config import ROUTER, Bearer, bearer, common_name, patterned, session_config
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.wire.access import MEMBERS, ROLES
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic

@@ -26,10 +26,10 @@ from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.recording import records
-from swarm.recording.external_calls import ExternalCalls
 from swarm.recording.recording import Recording
 from swarm.recording.records import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
 from swarm.recording.replaying import Outcome
+from swarm.recording.service_boundary import ExternalCalls
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from swarm.bus.bus import Event
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import call_within
+from swarm.plugins.guard import call_within
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup

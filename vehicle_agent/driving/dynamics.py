@@ -205,7 +205,7 @@ def _turn(before_rad: float, after_rad: float) -> float:
 def _checked(speed: object) -> float:
     if isinstance(speed, bool) or not isinstance(speed, (int, float, np.integer, np.floating)):
         raise Nonsense(f"{type(speed).__name__}, expected a speed in m/s")
-    told = float(speed)
-    if not 0.0 <= told < math.inf:
-        raise Nonsense(f"{told:g} m/s, expected a finite speed of at least 0")
-    return told
+    value = float(speed)
+    if not 0.0 <= value < math.inf:
+        raise Nonsense(f"{value:g} m/s, expected a finite speed of at least 0")
+    return value

@@ -134,14 +134,15 @@ class PluginSensor:
         least, most = int(cells.min()), int(cells.max())
         if least < 0 or most >= self._cells:
             raise Nonsense(f"cell {least if least < 0 else most}, expected cells 0 to {self._cells - 1}")
-        told = paces.astype(np.float64)
-        wrong = ~(((told >= PACE_LEAST) & (told <= PACE_MOST)) | (told == np.inf))
+        seen_paces = paces.astype(np.float64)
+        wrong = ~(((seen_paces >= PACE_LEAST) & (seen_paces <= PACE_MOST)) | (seen_paces == np.inf))
         if wrong.any():
-            found = f"pace {told[wrong][0]:g} at cell {cells[wrong][0]}"
+            found = f"pace {seen_paces[wrong][0]:g} at cell {cells[wrong][0]}"
             raise Nonsense(f"{found}, expected {PACE_LEAST:.3g} to {PACE_MOST:g} s/m, or inf where lethal")
         far = ~np.isin(cells, near.cells)
-        seen, told = cells[far].astype(np.int64), told[far]
-        return Sight(np.concatenate((near.cells, seen)), np.concatenate((near.paces, told.astype(np.float32))))
+        seen, seen_paces = cells[far].astype(np.int64), seen_paces[far]
+        both = np.concatenate((near.paces, seen_paces.astype(np.float32)))
+        return Sight(np.concatenate((near.cells, seen)), both)
 
 
 def compare(sight: Sight, ground: NDArray[np.float32], prior: NDArray[np.float32]) -> Findings:

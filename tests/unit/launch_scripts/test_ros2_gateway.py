@@ -38,7 +38,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
 from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client.observer import SeenTarget, SeenVehicle
-from swarm.client.own_marks import OwnMarks
+from swarm.client.vehicle import OwnMarks
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec

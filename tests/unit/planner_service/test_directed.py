@@ -151,7 +151,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     grant(1, [start])
     agent.set_planners({"t": 1}, 0)
     x_m, y_m = grid.centre_m(target)
-    agent.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
+    agent.take_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
     motion = agent.vehicles["a0-00"].motion
     set_out_s = None
     for tick in range(2000):

@@ -27,8 +27,7 @@ from swarm.bus.bus import (
     WorkDone,
 )
 from swarm.liveness import Peer
-from swarm.runtime.fair_queue import FairQueue
-from swarm.runtime.inbox import CAPACITY, PER_ASKER_BYTES, Inbox
+from swarm.runtime.inbox import CAPACITY, PER_ASKER_BYTES, FairQueue, Inbox
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from swarm.runtime.job_slots import LONG_NS, JobSlots
+from swarm.runtime.process import LONG_NS, JobSlots
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from swarm.runtime.job_slots import JobSlots
+from swarm.runtime.process import JobSlots
 with JobSlots(Path(sys.argv[1]), most=1).one():
     print("mine", flush=True)
     time.sleep(60)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -22,20 +20,18 @@ from support.plugin_modules import forgotten_afterwards
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import KILLED_BY, Hangs, call_within
 from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
-from swarm.plugins.guard import Guard, Nonsense
+from swarm.plugins.guard import KILLED_BY, Guard, Hangs, Nonsense, call_within
 
 MODULE = """
-import msgspec, dataclasses
+import msgspec
 class Wide:
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         reach_cells: int = 4
     def __init__(self, world, options): self.world, self.options = world, options
     def look(self, cells): return self.options.reach_cells
 class Loose(Wide):
-    @dataclasses.dataclass
-    class Options:
+    class Options(msgspec.Struct):
         share: float = 0.5
 class Free:
     def __init__(self, world, options): self.options = options
@@ -73,7 +69,7 @@ def test_a_module_beside_the_scenario_is_found_and_its_options_become_its_struct
     assert (made.world, made.look([])) == ("world", 9)
 
 
-def test_options_become_a_dataclass_or_stay_a_table_and_what_is_made_already_is_taken(folder: Path) -> None:
+def test_options_become_a_struct_or_stay_a_table_and_what_is_made_already_is_taken(folder: Path) -> None:
     assert find_plugin(sensor("eyes:Loose", share=1), str(folder)).options.share == 1.0
     assert find_plugin(sensor("eyes:Free", any=[1, {}]), str(folder)).make(None).look([]) == {"any": [1, {}]}
     assert find_plugin(sensor("eyes:MADE"), str(folder)).make(None).look([5]) == [5]
@@ -87,7 +83,7 @@ def test_options_become_a_dataclass_or_stay_a_table_and_what_is_made_already_is_
         ("leaving_eyes:Eye", {}, "could not be imported: SystemExit: 3 (leaving_eyes.py:1)"),
         ("eyes:Wid", {}, "no 'Wid' in {folder}/eyes.py; did you mean 'Wide'?"),
         ("eyes:NUMBER", {}, "'eyes:NUMBER' is 7; expected a class or a function"),
-        ("eyes:Odd", {}, "Options of 'eyes:Odd' is neither a Struct nor a dataclass"),
+        ("eyes:Odd", {}, "Options of 'eyes:Odd' is no msgspec Struct"),
         ("eyes:Wide", {"reach": 3}, "unknown key reach; did you mean 'reach_cells'?; allowed here: reach_cells"),
         (
             "eyes:Wide",
@@ -136,23 +132,11 @@ def test_a_name_that_nobody_offers_is_refused_when_the_scenario_is_read() -> Non
             parse_scenario(f"[vehicles]\nsensor = '{odd}'")
 
 
-def test_an_installed_packages_name_is_found_and_two_of_one_name_are_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = [EntryPoint("wide", "eyes:Wide", "terrain_swarm.sensor")]
-    monkeypatch.setattr(
-        importlib.metadata, "entry_points", lambda group: points if group == points[0].group else []
-    )
-    monkeypatch.syspath_prepend(str(folder))
-    scenario = parse_scenario("[vehicles]\nsensor = 'wide'\nsensor_options = { reach_cells = 2 }")
-    check_plugins(scenario, ["agent"])
-    assert named_plugin(scenario, "vehicles.sensor").make(None).look([]) == 2
-    with pytest.raises(ConfigError, match=r"walk: found 'wide'.*allowed"):
-        parse_scenario("[[targets]]\nwalk = 'wide'")  # each kind has a group of its own
-    points.append(points[0])
-    with pytest.raises(ConfigError, match="'wide' is offered by several packages"):
+def test_a_plugin_has_to_be_there_for_the_roles_which_call_it_only() -> None:
+    scenario = parse_scenario("[vehicles]\nsensor = 'nowhere_at_all:Eye'")
+    check_plugins(scenario, ["planner", "targets"])
+    with pytest.raises(ConfigError, match="could not be imported"):
         check_plugins(scenario, ["agent"])
-    check_plugins(scenario, ["planner", "targets"])  # others do not need it
 
 
 # --- the guard --------------------------------------------------------------------------------------------------
@@ -251,7 +235,7 @@ def test_native_code_that_does_not_come_back_kills_the_process_and_leaves_its_li
     script = tmp_path / "hung_plugin.py"
     script.write_text(
         "import itertools\n"
-        "from swarm.plugins.deadline import call_within\n"
+        "from swarm.plugins.guard import call_within\n"
         "def look():\n"
         "    return sum(itertools.repeat(0))\n"
         "call_within(0.1, look)\n"
@@ -272,7 +256,7 @@ def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
 def test_a_call_that_swallows_the_alarm_ends_its_process_with_the_line_that_it_hangs_in() -> None:
     code = (
         "import time\n"
-        "from swarm.plugins.deadline import call_within\n"
+        "from swarm.plugins.guard import call_within\n"
         "def swallows():\n"
         "    while True:\n"
         "        try:\n"

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from swarm.grid import GridSpec, walk
 from swarm.wire.route_columns import directions_of
+from vehicle_agent.driving.driven_vehicle import Follower
 from vehicle_agent.driving.motion import Motion
-from vehicle_agent.driving.route_follower import Follower
 
 GRID = GridSpec(10, 10, 10.0)
 
