@@ -96,9 +96,7 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
     whole  True if all processes run on this machine. Otherwise processes of other machines need no certificate
            here.
     """
-    net, view = scenario.network, scenario.monitor
-    if view.live and view.grpc_port == view.web_port != 0:
-        yield failure("monitor.web_port", f"found {view.web_port}, which is monitor.grpc_port too; choose another")
+    net = scenario.network
     if net.tls is not None:
         yield from _certificates(scenario, net.tls, whole)
 

@@ -272,9 +272,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
 class MonitorConfig(Section, frozen=True, kw_only=True):
     """The live view.
 
-    live       whether there is one, beside the recording
-    grpc_port  loopback port of the stream, for native viewers; 0 is any free one
-    web_port   loopback port of the page, for browsers; 0 is any free one
+    live      whether there is one, beside the recording
+    web_port  loopback port of the page for browsers, and of the stream for native viewers; 0 is any free one
 
     show_target    the target of whose cost-to-go there is a picture; the first if empty
     height_factor  how many times as high as they are heights are drawn; chosen by the relief if absent
@@ -282,7 +281,6 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
     """
 
     live: bool = True
-    grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
     show_target: str = ""
     height_factor: Annotated[float, Meta(gt=0, le=100)] | None = None
