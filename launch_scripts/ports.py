@@ -31,12 +31,11 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
     if "router" in roles:
         wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
     if "monitor" in roles and scenario.monitor.live:
-        wanted += [("the live view", "127.0.0.1", scenario.monitor.grpc_port)]
         wanted += [("the live view", "127.0.0.1", scenario.monitor.web_port)]
     for who, host, port in wanted:
         if port and _taken(host, port):
             raise BusError(
-                f"port {port}, which {who} needs, is taken; choose others with --port N (N, N+1 and N+2 are used), "
+                f"port {port}, which {who} needs, is taken; choose others with --port N (N and N+1 are used), "
                 "or let --port 0 pick free ones"
             )
 

@@ -97,8 +97,6 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
            here.
     """
     net, view = scenario.network, scenario.monitor
-    if view.live and view.grpc_port == view.web_port != 0:
-        yield failure("monitor.web_port", f"found {view.web_port}, which is monitor.grpc_port too; choose another")
     if view.follow is not None:
         known = [*scenario.target_ids, *(id for plan in plan_agents(scenario) for id in plan.vehicle_ids)]
         if view.follow not in known:

@@ -153,13 +153,13 @@ def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
 
 
 def with_port(scenario: Scenario, port: int) -> Scenario:
-    """Router on `port`, live view on the two after it; 0 picks three free ones."""
-    ports = free_ports(3) if port == 0 else [port, port + 1, port + 2]
+    """Router on `port`, live view on the next; 0 picks two free ones."""
+    ports = free_ports(2) if port == 0 else [port, port + 1]
     if ports[-1] > 65535:
-        raise ConfigError(f"--port {port}: the live view takes the two ports after it, so at most 65533")
+        raise ConfigError(f"--port {port}: the live view takes the port after it, so at most 65534")
     endpoint = f"tcp/127.0.0.1:{ports[0]}"
     network = msgspec.structs.replace(scenario.network, listen=(endpoint,), connect=(endpoint,))
-    monitor = msgspec.structs.replace(scenario.monitor, grpc_port=ports[1], web_port=ports[2])
+    monitor = msgspec.structs.replace(scenario.monitor, web_port=ports[1])
     return msgspec.structs.replace(scenario, network=network, monitor=monitor)
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.web import LOOPBACK
 from launch_scripts.web.live_page import LivePage, when_free
-from launch_scripts.web.server import Audience, Server
+from launch_scripts.web.server import Audience
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import StoreError
@@ -215,18 +215,14 @@ class Sinks:
         self.rec = self._stream()
         self.streams = [self.rec]
         """Streams to log to: `rec`, and the file that was begun last, if the first has ended."""
-        self._servers: list[Server] = []
         self.page: LivePage | None = None
-        self.gate: Server | None = None
-        """The known port of the stream for native viewers. rerun lets pages read its answers only if their Origin
-        is on loopback, but looks at no Host. rerun therefore listens on a random loopback address."""
+        """The known door to the stream, for browsers and native viewers. rerun lets pages read its answers only if
+        their Origin is on loopback, but looks at no Host. rerun therefore listens on a random loopback address."""
         live: list[rr.GrpcServerSink] = []
         if config.live:
             host, port = behind = _hidden_address()
-            self.gate = when_free(lambda: Server("grpc_port", config.grpc_port, {}, behind=behind))
             self.page = page or when_free(lambda: LivePage(config.web_port))
             self.page.opens(behind)
-            self._servers = [self.page.server, self.gate]
             live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))
         try:
             self.rec.set_sinks(*_files(path), *live, default_blueprint=blueprint)
@@ -243,9 +239,10 @@ class Sinks:
 
     def audience(self) -> Audience:
         """Viewers of the stream, and one whose page has not come to it yet."""
-        each = [server.audience() for server in self._servers]
-        waits = self.page is not None and self.page.is_open
-        return Audience(sum(one.now for one in each) or int(waits), sum(one.ever for one in each))
+        if self.page is None:
+            return Audience(now=0, ever=0)
+        streams = self.page.server.audience()
+        return Audience(streams.now or int(self.page.is_open), streams.ever)
 
     def begin_file(self, path: Path) -> None:
         """Sends later logs of `streams` to this file, too. On a stream of its own: new sinks for `rec` would close
@@ -266,8 +263,8 @@ class Sinks:
 
     def close(self, within_s: float = 3.0) -> None:
         written = _in_time(lambda: self._flush(within_s), within_s)
-        for server in self._servers:
-            server.close()
+        if self.page is not None:
+            self.page.server.close()
         # Only now, as it would take who still watches back to the beginning.
         if not written or not _in_time(self._let_play, 1.0):
             log.warning("the recording was not written to the end within %.0f s", within_s)

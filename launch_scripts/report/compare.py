@@ -8,7 +8,7 @@ from typing import Any
 
 from launch_scripts.observe.summed_counts import percent
 
-_WHERE_ONLY = ("network.listen", "network.connect", "monitor.grpc_port", "monitor.web_port")
+_WHERE_ONLY = ("network.listen", "network.connect", "monitor.web_port")
 """Keys that say where a run was met, not what ran: free ports differ each time."""
 _SUMMED = {
     "distance_m": "driven by all, m",

@@ -108,7 +108,6 @@ class Server(socketserver.ThreadingTCPServer):
     port     0 is any
     pages    path -> what answers it
     address  one beyond loopback serves visitors from elsewhere, too
-    behind   address of rerun's server, to which requests for the stream are passed
     lasts_s  a connection that does not take the stream is cut after so long
 
     Requests are short: beyond the bound the slowest connection which has not taken the stream is closed for the new
@@ -132,10 +131,11 @@ class Server(socketserver.ThreadingTCPServer):
         pages: Mapping[str, Page],
         address: str = LOOPBACK,
         *,
-        behind: tuple[str, int] | None = None,
         lasts_s: float = 10.0,
     ) -> None:
-        self.pages, self.behind, self.lasts_s = pages, behind, lasts_s
+        self.pages, self.lasts_s = pages, lasts_s
+        self.behind: tuple[str, int] | None = None
+        """Address of rerun's server, to which requests for the stream are passed."""
         self.guarded = is_loopback(address)
         self.address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
         self._lock = threading.Lock()

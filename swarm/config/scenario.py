@@ -270,15 +270,13 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
     """The live view.
 
     live           true: serve the view, beside the recording
-    grpc_port      loopback port of the stream, for native viewers; 0 is any free one
-    web_port       loopback port of the page, for browsers; 0 is any free one
+    web_port       loopback port of the page for browsers and of the stream for native viewers; 0 is any free one
     show_target    target whose cost-to-go is shown; empty: the first
     height_factor  vertical exaggeration; default: chosen by the relief
     follow         vehicle or target which the camera follows
     """
 
     live: bool = True
-    grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
     show_target: str = ""
     height_factor: Annotated[float, Meta(gt=0, le=100)] | None = None

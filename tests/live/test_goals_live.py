@@ -50,7 +50,6 @@ listen = ["tcp/127.0.0.1:{port}"]
 connect = ["tcp/127.0.0.1:{port}"]
 
 [monitor]
-grpc_port = 0
 web_port = 0
 """
 

@@ -104,7 +104,6 @@ vehicles = 12
 listen = ["tcp/127.0.0.1:{port}"]
 connect = ["tcp/127.0.0.1:{port}"]
 [monitor]
-grpc_port = 0
 web_port = 0
 """
 

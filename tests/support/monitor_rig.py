@@ -37,7 +37,7 @@ _TOPICS = (
     *(topics.POSE, topics.SIGHTED, topics.STATS, topics.STATUS),
 )
 SILENT = MonitorConfig(live=False)
-LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
+LIVE = MonitorConfig(live=True, web_port=0)
 NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
 
 

@@ -52,13 +52,13 @@ def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     assert own == TlsConfig(ca=ca, certificate=str(tmp_path), key=str(tmp_path))
 
 
-def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> None:
+def test_a_port_gives_the_live_view_the_next_and_0_picks_free_ones() -> None:
     scenario = options.with_port(Scenario(), 8000)
     assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)
-    assert (scenario.monitor.grpc_port, scenario.monitor.web_port) == (8001, 8002)
+    assert scenario.monitor.web_port == 8001
     free = options.with_port(Scenario(), 0)
-    found = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
-    assert len(found) == 3
+    found = {free.network.listen[0].rpartition(":")[2], str(free.monitor.web_port)}
+    assert len(found) == 2
     ports.check_ports(free, ("router", "monitor"))
 
 

@@ -32,16 +32,10 @@ GRPC_WEB = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
 @pytest.fixture(scope="module")
 def sinks() -> Iterator[Sinks]:
     mesh = TerrainMesh(terrain_of_pace(np.ones((8, 8), np.float32)))
-    opened = Sinks("r", None, MonitorConfig(grpc_port=0, web_port=0), make_blueprint(mesh))
+    opened = Sinks("r", None, MonitorConfig(web_port=0), make_blueprint(mesh))
     opened.rec.log("secret", rr.TextLog("where everybody is"))
     yield opened
     opened.close()
-
-
-def ports(sinks: Sinks) -> tuple[int, int]:
-    """Ports of the page and of the stream."""
-    assert sinks.gate is not None
-    return sinks.web_port, sinks.gate.port
 
 
 def ask(port: int, method: str, path: str, headers: dict[str, str], body: bytes = b"") -> tuple[int, bytes]:
@@ -77,38 +71,30 @@ OWN = [
 
 
 @pytest.mark.parametrize("headers", FOREIGN, ids=str)
-def test_pages_of_other_sites_are_refused_by_both_servers(sinks: Sinks, headers: dict[str, str]) -> None:
-    page, stream = ports(sinks)
+def test_pages_of_other_sites_are_refused(sinks: Sinks, headers: dict[str, str]) -> None:
+    page = sinks.web_port
     filled = {name: value.format(port=page) for name, value in headers.items()}
     assert ask(page, "GET", "/", filled)[0] == 403
     assert ask(page, "GET", "/run.json", filled)[0] == 403
-    status, body = ask(page, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
-    assert status == 403
-    assert b"where everybody is" not in body
-    filled = {name: value.format(port=stream) for name, value in headers.items()}
     for method in ("POST", "OPTIONS", "GET"):
-        status, body = ask(stream, method, READ, {**GRPC_WEB, **filled}, bytes(5))
+        status, body = ask(page, method, READ, {**GRPC_WEB, **filled}, bytes(5))
         assert status == 403
         assert b"where everybody is" not in body
 
 
 @pytest.mark.parametrize("headers", OWN, ids=str)
 def test_pages_of_this_machine_come_in_through_tunnels_too(sinks: Sinks, headers: dict[str, str]) -> None:
-    page, stream = ports(sinks)
+    page = sinks.web_port
     filled = {name: value.format(port=page) for name, value in headers.items()}
     assert ask(page, "GET", "/", filled)[0] == 200
     status, body = ask(page, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
-    assert (status, len(body) > 50) == (200, True), "the stream comes through the page's port, too"
-    status, body = ask(stream, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
-    assert (status, len(body) > 50) == (200, True)
+    assert (status, len(body) > 50) == (200, True), "the stream comes through the page's port"
 
 
-@pytest.mark.parametrize("server", [0, 1], ids=["page", "stream"])
-def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks, server: int) -> None:
-    port = ports(sinks)[server]
+def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks) -> None:
     own = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\n".encode() + bytes(5)
     foreign = f"POST {READ} HTTP/1.1\r\nHost: evil.example\r\nContent-Type: application/grpc-web+proto\r\n"
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as both:
+    with socket.create_connection(("127.0.0.1", sinks.web_port), timeout=10) as both:
         both.sendall(own + foreign.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
         told = b""
         with contextlib.suppress(ConnectionError):
@@ -117,7 +103,6 @@ def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sink
     assert told.count(b"HTTP/1.1 ") == 1, told
 
 
-@pytest.mark.parametrize("server", [0, 1], ids=["page", "stream"])
 @pytest.mark.parametrize(
     "headers",
     [
@@ -128,23 +113,19 @@ def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sink
         "Host: localhost\r\nX: a\r\n Host: evil.example",
     ],
 )
-def test_two_hosts_none_or_one_that_can_be_read_in_two_ways_are_no_host(
-    sinks: Sinks, server: int, headers: str
-) -> None:
-    with socket.create_connection(("127.0.0.1", ports(sinks)[server]), timeout=10) as visitor:
+def test_two_hosts_none_or_one_that_can_be_read_in_two_ways_are_no_host(sinks: Sinks, headers: str) -> None:
+    with socket.create_connection(("127.0.0.1", sinks.web_port), timeout=10) as visitor:
         lines = filter(None, [f"POST {READ} HTTP/1.1", headers, "Content-Length: 0", "", ""])
         visitor.sendall("\r\n".join(lines).encode() + b"\r\n\r\n")
         assert b" 403 " in visitor.recv(4096).partition(b"\r\n")[0]
 
 
-@pytest.mark.parametrize("which", [0, 1], ids=["page", "stream"])
 def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
-    sinks: Sinks, which: int, monkeypatch: pytest.MonkeyPatch
+    sinks: Sinks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server = (sinks.page and sinks.page.server, sinks.gate)[which]
-    assert server is not None
-    monkeypatch.setattr(server, "lasts_s", 1.5)
-    port, before = ports(sinks)[which], threading.active_count()
+    assert sinks.page is not None
+    monkeypatch.setattr(sinks.page.server, "lasts_s", 1.5)
+    port, before = sinks.web_port, threading.active_count()
     with contextlib.ExitStack() as stack:
         for _ in range(4 * MOST_CONNECTIONS):
             with contextlib.suppress(OSError):
@@ -165,7 +146,7 @@ def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytes
     head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
     with socket.socket() as slow:
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        slow.connect(("127.0.0.1", ports(sinks)[1]))
+        slow.connect(("127.0.0.1", sinks.web_port))
         slow.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
         for _ in range(60):
             sinks.rec.log("noise", rr.Image(np.random.default_rng(1).integers(0, 255, (400, 400, 3), np.uint8)))
@@ -174,16 +155,16 @@ def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytes
 
 
 def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -> None:
-    page, stream = ports(sinks)
+    page = sinks.web_port
     eventually(lambda: sinks.audience().now == 0, 30, "those of the tests before are gone")
     before = sinks.audience()
-    ask(stream, "POST", READ, {"Host": "evil.example", **GRPC_WEB})
+    ask(page, "POST", READ, {"Host": "evil.example", **GRPC_WEB})
     ask(page, "GET", "/", {})
     assert sinks.audience() == before
     head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
     with contextlib.ExitStack() as stack:
-        for port in (page, stream):
-            viewer = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+        for _ in range(2):
+            viewer = stack.enter_context(socket.create_connection(("127.0.0.1", page), timeout=5))
             viewer.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
             assert viewer.recv(4) == b"HTTP"
         assert sinks.audience() == Audience(now=2, ever=before.ever + 2)
@@ -192,8 +173,8 @@ def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -
 
 
 def test_rerun_itself_listens_where_nobody_looks(sinks: Sinks) -> None:
-    assert sinks.gate is not None
-    assert sinks.gate.behind is not None
-    host, port = sinks.gate.behind
+    assert sinks.page is not None
+    assert sinks.page.server.behind is not None
+    host, port = sinks.page.server.behind
     assert host.startswith("127.")
-    assert (host, port) != ("127.0.0.1", ports(sinks)[1])
+    assert (host, port) != ("127.0.0.1", sinks.web_port)

@@ -401,7 +401,7 @@ def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytes
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        config = MonitorConfig(grpc_port=0, web_port=port)
+        config = MonitorConfig(web_port=port)
         with pytest.raises(
             BusError, match=rf"monitor\.web_port {port} cannot be opened: Address already in use; choose another"
         ):
