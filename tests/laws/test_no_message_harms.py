@@ -345,7 +345,7 @@ def route_reply(payload: bytes) -> RouteReply | None:
 def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state: str) -> None:
     by_listening: dict[bool, int] = {}
     for altered in (False, True):
-        swarm = lied_to(run, state, 1, few(20), altered)
+        swarm = lied_to(run, state, 2, few(20), altered)
         assert swarm.liar.told > 250
         by_listening[altered] = swarm.liar.altered
         swarm.run(3)
