@@ -362,7 +362,7 @@ def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state:
     ],
 )
 def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -> None:
-    swarm = lied_to(run, state, 8, few(40), False)
+    swarm = lied_to(run, state, 9, few(40), False)
     swarm.take_back()
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]
