@@ -61,7 +61,7 @@ def read_scenario(
     """
     try:
         raw = with_settings(parse_toml(text, source, ConfigError), settings or {}, source)
-        raw = with_class_costs(with_preset(raw))
+        raw = with_class_costs(with_preset(_renamed(raw)))
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []
@@ -93,6 +93,27 @@ def read_scenario(
         return None, [str(error)]
     faults += islice(_faults(scenario, source), most)
     return scenario if base is None else anchored(scenario, base), faults
+
+
+_RENAMED: dict[str, dict[str, str | None]] = {
+    "map": {"plot_regions": "shard_regions"},
+    "targets": {"body_radius_m": "obstacle_radius_m"},
+    "monitor": {"grpc_port": None},
+}
+"""Section -> keys of the version before -> their names since, None if they have no effect any more. They are accepted
+for one version."""
+
+
+def _renamed(raw: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a scenario under their names of today."""
+    for section, names in _RENAMED.items():
+        found = raw.get(section)
+        for table in found if isinstance(found, list) else [found]:
+            for old, new in names.items():
+                if isinstance(table, dict) and old in table and new not in table:
+                    value = table.pop(old)
+                    table.update({} if new is None else {new: value})
+    return raw
 
 
 def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:

@@ -45,6 +45,12 @@ def test_an_empty_scenario_is_a_whole_one():
     assert scenario.vehicle_count == 100
 
 
+def test_settings_are_known_by_their_names_of_the_version_before():
+    old, new = "[map]\nplot_regions = 2\n[[targets]]\nbody_radius_m = 3\n", "[map]\nshard_regions = 2\n"
+    assert parse_scenario(old) == parse_scenario(f"{new}[[targets]]\nobstacle_radius_m = 3\n")
+    assert parse_scenario("[monitor]\ngrpc_port = 9876\n") == parse_scenario("")
+
+
 def test_relative_files_lie_beside_the_scenario(tmp_path):
     path = tmp_path / "demo.toml"
     path.write_text("[terrain]\nsource = 'hills.tif'\nphoto = 'hills-photo.tif'")
