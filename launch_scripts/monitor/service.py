@@ -12,8 +12,7 @@ from collections.abc import Callable
 
 from PIL import Image
 
-from launch_scripts.monitor.ground.ground_view import GroundView, Scene, scenario_areas
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.live_layout import (
     FiguresPanel,
     level_of,
@@ -21,7 +20,8 @@ from launch_scripts.monitor.live_layout import (
     shown_layers,
     summary_markdown,
 )
-from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.movers_view import MoversView
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of

@@ -14,19 +14,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import with_follow
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.movers_view import (
+from launch_scripts.monitor.movers_view import (
     OVER_S,
     alarm_marks,
     searched_points,
     target_labels,
 )
-from launch_scripts.monitor.movers.styles import (
+from launch_scripts.monitor.styles import (
     HUES,
     LOST_COLOUR,
     Looks,
 )
-from launch_scripts.monitor.movers.vehicles_view import (
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.vehicles_view import (
     RouteLines,
     RouteNow,
     Trails,
