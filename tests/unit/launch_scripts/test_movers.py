@@ -45,7 +45,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import Believed
-from swarm.wire.messages.processes import Alarm as Told
+from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Followed, VehicleState
 
@@ -354,7 +354,7 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
     kind: str, about: str, text: str
 ) -> None:
     latest = LatestState(RunPlan((), (), 0, 1), GRID)
-    told = Told(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
+    told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
     latest.heard(
         Stats(role="agent", id="a0", incarnation=1, stamp_ns=2, counts={}, gauges={}, histograms={}, alarms=[told]),
         2,
