@@ -60,8 +60,7 @@ def route(
     out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
     """
     from launch_scripts.commands import terrain_routes
-    from launch_scripts.report.exporter import FORMATS, check_target
-    from launch_scripts.report.mission_files import MISSIONS
+    from launch_scripts.report.exporter import FORMATS, MISSIONS, check_target
     from swarm.places import read_place
 
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png")

@@ -118,7 +118,7 @@ def print_status(status: Status, console: Console) -> None:
         say("no run yet: only routers answer")
     else:
         say(f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells")
-        say(facts.fact("elapsed_s").said(state))
+        say(facts.fact("elapsed_s").labelled(state))
         if frame is not None and frame.grid.crs != "local":
             say(f"terrain: {extent_of(frame, 'latlon')}")
         for line in facts.lines(state):

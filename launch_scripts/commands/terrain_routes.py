@@ -18,15 +18,16 @@ from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.palette import said_length
 from launch_scripts.report.exporter import (
     COSTS,
+    MISSIONS,
     Feature,
     FieldKind,
     Layer,
     areas_of,
     turns_of,
     write_layers,
+    write_mission,
     write_raster,
 )
-from launch_scripts.report.mission_files import MISSIONS, write_mission
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass

@@ -63,7 +63,7 @@ def columns(*labels: str) -> Table:
 def plain_line(state: RunState, title: str) -> str:
     """The state in one line."""
     told = ", ".join(
-        facts.fact(name).said(state)
+        facts.fact(name).labelled(state)
         for name in ("captures", "reroute_requests", "marks", "messages_now_per_s", "certified_gap")
     )
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))

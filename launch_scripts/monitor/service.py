@@ -12,8 +12,7 @@ from collections.abc import Callable
 
 from PIL import Image
 
-from launch_scripts.monitor.ground.ground_view import GroundView, Scene, scenario_areas
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.live_layout import (
     FiguresPanel,
     level_of,
@@ -21,7 +20,8 @@ from launch_scripts.monitor.live_layout import (
     shown_layers,
     summary_markdown,
 )
-from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.movers_view import MoversView
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
@@ -92,7 +92,7 @@ class MonitorService:
         self.observed = LatestState(plan_of(scenario, setup.started_ns), terrain.grid)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
-        self.said: list[str] = []
+        self.figures: list[str] = []
         """The newest figures in lines, for the start page. Read by other threads, too."""
         self._setup, self._bus, self._post, self._pen = setup, bus, post, scene.pen
         self._recording, self._audience = recording, audience
@@ -231,7 +231,7 @@ class MonitorService:
             self._movers.summarised(state)
             self._panel.plots(state)
             self._panel.summary(summary_markdown(self._setup, state))
-            self.said = [facts.fact("elapsed_s").said(state), *facts.lines(state)]
+            self.figures = [facts.fact("elapsed_s").labelled(state), *facts.lines(state)]
 
 
 def load_view(
@@ -270,7 +270,7 @@ def load_view(
     )
     give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
     life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
-    told = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
+    known = {"life": life, "recording": command, "name": f"{scenario.name}, run {setup.run_id}"}
     if sinks.page is not None:
-        sinks.page.run = lambda: {**told, "at_s": service.at_s, "over": service.over, "figures": service.said}
+        sinks.page.run = lambda: {**known, "at_s": service.at_s, "over": service.over, "figures": service.figures}
     return service

@@ -25,7 +25,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.web import LOOPBACK
 from launch_scripts.web.live_page import LivePage, when_free
 from launch_scripts.web.server import Audience

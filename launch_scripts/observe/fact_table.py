@@ -50,7 +50,7 @@ class Fact(Generic[Of]):
         """The fact in words, as people see it."""
         return self.text(self.value(state))
 
-    def said(self, state: Of) -> str:
+    def labelled(self, state: Of) -> str:
         """The same after its label."""
         return f"{self.label} {self.shown(state)}"
 
@@ -199,11 +199,11 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles
 
 def lines(state: RunState) -> list[str]:
     """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
-    found = ["  ".join(fact(name).said(state) for name in names) for names in LINES]
+    found = ["  ".join(fact(name).labelled(state) for name in names) for names in LINES]
     if list(state.classes) not in ([], [GROUND]):
-        found.insert(1, fact("classes").said(state))
-    found += [fact(name).said(state) for name in IF_ANY if fact(name).value(state)]
-    if wrong := [fact(name).said(state) for name in MUST_BE_ZERO if fact(name).value(state)]:
+        found.insert(1, fact("classes").labelled(state))
+    found += [fact(name).labelled(state) for name in IF_ANY if fact(name).value(state)]
+    if wrong := [fact(name).labelled(state) for name in MUST_BE_ZERO if fact(name).value(state)]:
         found.append("  ".join(wrong))
     return found
 

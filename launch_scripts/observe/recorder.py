@@ -94,12 +94,12 @@ class Recorder:
                 if message.kind == "capture":
                     self._capture(message, now_ns)
                 self.notes.append((self.seconds(now_ns), message))
-        self._look(now_ns)
+        self._sample_due(now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         self.observed.alive(peer, up, now_ns)
-        self._look(now_ns)
+        self._sample_due(now_ns)
 
     def finish(self, now_ns: int) -> None:
         """The run is over: its last sample is of its end."""
@@ -123,7 +123,7 @@ class Recorder:
         east_m, south_m = x_m - self.grid.west_m, self.grid.north_m - y_m
         self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
-    def _look(self, now_ns: int) -> None:
+    def _sample_due(self, now_ns: int) -> None:
         fleet_ns, driven_ns = self.observed.fleet_ns, self.driven.at_ns
         if fleet_ns is not None and (driven_ns is None or fleet_ns - driven_ns >= _TRACK_NS):
             # By the time of the agents: vehicles without messages, as at the end of a run, are not at rest.

@@ -20,7 +20,7 @@ from launch_scripts.plain_text import Duration, Moment, plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import job_of
-from swarm.wire.messages.processes import Alarm as Told
+from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 SILENT_NS = 4 * NS_PER_S
@@ -140,7 +140,7 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
     first."""
     began_ns, wanted = latest.plan.started_ns or 0, list(targets)
     by_tokens = ((each, now_ns) for each in (*_missing(latest, wanted, now_ns), *_silent(latest, now_ns)))
-    found = (*by_tokens, *_lost(latest, wanted, now_ns), *_told(latest))
+    found = (*by_tokens, *_lost(latest, wanted, now_ns), *_stated_by_processes(latest))
 
     def seconds(stamp_ns: int | None) -> float | None:
         return None if stamp_ns is None else max(stamp_ns - began_ns, 0) / NS_PER_S
@@ -170,7 +170,7 @@ _UNKNOWN_NS = -1
 """Beginning of an alarm whose beginning is unknown. No message can say so."""
 
 
-def _told(latest: LatestState) -> Iterator[tuple[Told, int]]:
+def _stated_by_processes(latest: LatestState) -> Iterator[tuple[WireAlarm, int]]:
     """Returns alarms published by processes, each with the time of its last evidence. Alarms that were open when a
     process ended are left out."""
     for (role, id), stats in latest.newest().items():
@@ -186,7 +186,7 @@ def starts(latest: LatestState, role: str, id: str, now_ns: int) -> bool:
     return began and not latest.knows(role, id)
 
 
-def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Told]:
+def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[WireAlarm]:
     for role, id in latest.plan.crew_now(targets):
         if latest.fills(role, id) or starts(latest, role, id, now_ns):
             continue
@@ -196,7 +196,7 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[T
         yield _of_process("down", role, id, f"{state}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 
-def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
+def _silent(latest: LatestState, now_ns: int) -> Iterator[WireAlarm]:
     for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
         yield _of_process("silent", role, id, "is alive, but silent", _said_ns(latest, role, id, heard_ns))
     for (role, id), (began_ns, over_ns) in sorted(latest.silences.items()):
@@ -209,12 +209,14 @@ def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
     return otherwise_ns if stats is None else stats.stamp_ns
 
 
-def _of_process(kind: str, role: str, id: str, what: str, since_ns: int, over_ns: int | None = None) -> Told:
+def _of_process(kind: str, role: str, id: str, what: str, since_ns: int, over_ns: int | None = None) -> WireAlarm:
     name, target = f"{role}-{id}", job_of(id) if role == "planner" else None
-    return Told(kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, over_ns=over_ns, target=target)
+    return WireAlarm(
+        kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, over_ns=over_ns, target=target
+    )
 
 
-def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[Told, int]]:
+def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[WireAlarm, int]]:
     for id in sorted(latest.lost(now_ns).intersection(targets)):
         status, pose = latest.told_by_planner(id), latest.poses.get(id)
         since_ns, cell, heard_ns = _UNKNOWN_NS, None if pose is None else pose.cell, now_ns
@@ -225,4 +227,7 @@ def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tupl
         elif pose is not None:
             since_ns = pose.stamp_ns
         text = f"no tracker publishes {id}; routes lead to its last place"
-        yield Told(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id), heard_ns
+        yield (
+            WireAlarm(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id),
+            heard_ns,
+        )

@@ -11,7 +11,7 @@ Commands and the ends of runs and studies write it; nothing else imports it. Mat
 | run_plots.py      | plots of a run over time and as distributions, and of the outcomes of a study           |
 | terrain_figure.py | figures of a terrain, of a route on it, of slope rules                                  |
 | compare.py        | what differs between runs                                                               |
-| exporter.py       | the one exporter of layers and rasters: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF     |
+| exporter.py       | the one exporter: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF, missions                 |
 | run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm runs export`              |
 | mcap_export.py    | a run as MCAP with ROS 2 messages, in order of time                                     |
 """

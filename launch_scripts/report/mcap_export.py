@@ -74,13 +74,13 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     (path,) = free_places(folder, [f"{run}.mcap"], out, force)
     types = types_of(Distribution.JAZZY)
     timeline = _Timeline(RosMessages(types, RosMap(tracks.grid)), tracks, ground, _colours(report))
-    counts = _write(path, timeline.told(lines), types, _facts(run, report, tracks.grid))
+    counts = _write(path, timeline.messages_in_order(lines), types, _facts(run, report, tracks.grid))
     topics = ", ".join(f"{count:,} {topic}" for topic, count in sorted(counts.items()))
     without = "" if ground is not None else f"; no /map: there is no {GROUND_PACE_FILE} of it"
     return f"{path}: {topics}{without}"
 
 
-class Told(NamedTuple):
+class TimedMessage(NamedTuple):
     """One message of a recording."""
 
     time_ns: int
@@ -88,7 +88,7 @@ class Told(NamedTuple):
     message: Any
 
 
-def _write(path: Path, timeline: Iterable[Told], types: RosTypes, facts: Mapping[str, str]) -> Counter[str]:
+def _write(path: Path, timeline: Iterable[TimedMessage], types: RosTypes, facts: Mapping[str, str]) -> Counter[str]:
     """Writes messages as they come, in compressed chunks of a megabyte; returns how many each topic has.
     Raises StoreError.
 
@@ -145,7 +145,7 @@ class _Timeline:
         self._frames = frame_names(each.id for each in tracks.vehicles)
         self._first_ns = self._last_ns = 0
 
-    def told(self, lines: Sequence[Line]) -> Iterator[Told]:
+    def messages_in_order(self, lines: Sequence[Line]) -> Iterator[TimedMessage]:
         """All messages in order of time."""
         messages, tracks = self._messages, self._tracks
         moving = (*tracks.vehicles, *tracks.targets, *tracks.captures)
@@ -153,7 +153,7 @@ class _Timeline:
         ends += [route.time_ns for route in tracks.routes] + [line.time_ns for line in lines]
         self._first_ns, self._last_ns = min(ends), max(ends)
         logged = (
-            Told(line.time_ns, "/rosout", messages.log(line.time_ns, line.severity, line.name, line.text))
+            TimedMessage(line.time_ns, "/rosout", messages.log(line.time_ns, line.severity, line.name, line.text))
             for line in lines
         )
         return heapq.merge(
@@ -166,16 +166,16 @@ class _Timeline:
             key=lambda each: each.time_ns,
         )
 
-    def _still(self) -> Iterator[Told]:
+    def _still(self) -> Iterator[TimedMessage]:
         messages, first_ns, map = self._messages, self._first_ns, self._messages.map
         still = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
         still += [messages.transform(first_ns, (map.frame, frames_of(each)[0])) for each in self._frames.values()]
-        yield Told(first_ns, "/tf_static", messages.transforms(still))
+        yield TimedMessage(first_ns, "/tf_static", messages.transforms(still))
         if (ground := self._ground) is not None:
             occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
-            yield Told(first_ns, "/map", occupancy_grid(messages, first_ns, occupancy, ground.side))
+            yield TimedMessage(first_ns, "/map", occupancy_grid(messages, first_ns, occupancy, ground.side))
 
-    def _moving(self, tracks: Sequence[Track], topic: str, *, frames: bool) -> Iterator[Told]:
+    def _moving(self, tracks: Sequence[Track], topic: str, *, frames: bool) -> Iterator[TimedMessage]:
         """The samples of all tracks, time by time. Headings lead from each sample to the next of its track.
 
         frames  whether transforms are written, too
@@ -198,10 +198,10 @@ class _Timeline:
                     )
                     for n in some.tolist()
                 ]
-                yield Told(now_ns, "/tf", messages.transforms(bases))
-            yield Told(now_ns, topic, messages.pose_array(now_ns, xy_m[some], headings[some].tolist()))
+                yield TimedMessage(now_ns, "/tf", messages.transforms(bases))
+            yield TimedMessage(now_ns, topic, messages.pose_array(now_ns, xy_m[some], headings[some].tolist()))
 
-    def _marks(self) -> Iterator[Told]:
+    def _marks(self) -> Iterator[TimedMessage]:
         """Marks at the end, each cell from its newest mark on: -1 without a mark."""
         grid, marks, ground = self._tracks.grid, self._tracks.marks, self._ground
         side = 1 if ground is None else ground.side
@@ -221,9 +221,9 @@ class _Timeline:
             until = int(np.searchsorted(stamps_ns, now_ns, "right"))
             np.maximum.at(occupancy, (rows[done:until], cols[done:until]), values[done:until])
             done = until
-            yield Told(now_ns, "/marks", occupancy_grid(self._messages, now_ns, occupancy.copy(), side))
+            yield TimedMessage(now_ns, "/marks", occupancy_grid(self._messages, now_ns, occupancy.copy(), side))
 
-    def _drawn(self) -> Iterator[Told]:
+    def _drawn(self) -> Iterator[TimedMessage]:
         """The route that each vehicle has begun last, and captures for a while."""
         grid = self._tracks.grid
         routes = sorted(self._tracks.routes, key=lambda route: route.time_ns)
@@ -246,7 +246,7 @@ class _Timeline:
                 if at_ns <= now_ns < at_ns + _SHOWN_NS
             }
             drawings = [*current.values(), *captured.values()]
-            yield Told(now_ns, "/swarm/markers", marker_array(self._messages, now_ns, drawings))
+            yield TimedMessage(now_ns, "/swarm/markers", marker_array(self._messages, now_ns, drawings))
 
     def _instants(self, changes: Iterable[int], room_for: int) -> list[int]:
         return instants_of(changes, self._first_ns, self._last_ns, min(max(room_for, _LEAST), _MOST))

@@ -81,7 +81,7 @@ def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) ->
         _legend_above(axes)
 
 
-def told(report: Report, name: str) -> tuple[Values, Values]:
+def series_of(report: Report, name: str) -> tuple[Values, Values]:
     """Times and values of a series, where there are values."""
     series = report.get("series", {})
     pairs = [(t, v) for t, v in zip(series.get("t_s", []), series.get(name, []), strict=False) if v is not None]
@@ -104,7 +104,7 @@ def _courses(axes: Axes, plot: Plot, report: Report) -> bool:
     """Series over time, the area below the first filled."""
     most = plot.least
     for number, (name, (label, colour)) in enumerate(plot.lines.items()):
-        times, values = told(report, name)
+        times, values = series_of(report, name)
         if not len(values):
             return False
         shown = plot.of(values)

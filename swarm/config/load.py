@@ -100,8 +100,8 @@ _RENAMED: dict[str, dict[str, str | None]] = {
     "targets": {"body_radius_m": "obstacle_radius_m"},
     "monitor": {"grpc_port": None},
 }
-"""Section -> keys of the version before -> their names since, None if they have no effect any more. They are accepted
-for one version."""
+"""Section -> keys of the version before -> their names since, None if they have no effect any more. They are
+accepted for one version."""
 
 
 def _renamed(raw: dict[str, Any]) -> dict[str, Any]:

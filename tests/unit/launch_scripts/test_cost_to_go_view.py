@@ -12,14 +12,14 @@ from skimage.graph import MCP_Geometric
 from support.makers import planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground.ground_colours import (
+from launch_scripts.monitor.ground_colours import (
     CostSamples,
     GroundColours,
     TargetPictures,
     coarse_tree,
     nearest_target,
 )
-from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from launch_scripts.monitor.terrain_mesh import Floats, TerrainMesh
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec

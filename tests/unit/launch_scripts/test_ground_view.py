@@ -15,7 +15,7 @@ from support.makers import planner_status, stats
 from support.map_strategies import set_of
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground.ground_colours import (
+from launch_scripts.monitor.ground_colours import (
     FAST_MARK,
     FOUND,
     LETHAL_MARK,
@@ -26,7 +26,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.ground_view import (
+from launch_scripts.monitor.ground_view import (
     Area,
     GroundView,
     Scene,
@@ -36,11 +36,11 @@ from launch_scripts.monitor.ground.ground_view import (
     scenario_areas,
     title_places,
 )
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.live_layout import (
     COST,
     PHOTO,
 )
+from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.view_outputs import Pen, in_markdown, shown
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.palette import rgb

@@ -30,8 +30,8 @@ from support.processes import eventually
 from support.target_reports import fleet
 
 from launch_scripts import parent_death
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.live_layout import make_blueprint
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
@@ -333,7 +333,7 @@ import pathlib, resource
 import numpy
 import rerun as rr
 from launch_scripts.monitor.live_layout import make_blueprint
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig

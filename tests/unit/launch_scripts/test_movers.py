@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from launch_scripts.check.scenario_check import network
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.movers_view import (
+from launch_scripts.monitor.movers_view import (
     OVER_S,
     alarm_marks,
     searched_points,
     target_labels,
 )
-from launch_scripts.monitor.movers.styles import (
+from launch_scripts.monitor.styles import (
     HUES,
     LOST_COLOUR,
     Looks,
 )
-from launch_scripts.monitor.movers.vehicles_view import (
+from launch_scripts.monitor.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.vehicles_view import (
     RouteLines,
     RouteNow,
     Trails,
@@ -45,7 +45,7 @@ from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import Believed
-from swarm.wire.messages.processes import Alarm as Told
+from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Followed, VehicleState
 
@@ -349,7 +349,7 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
     kind: str, about: str, text: str
 ) -> None:
     latest = LatestState(RunPlan((), (), 0, 1), GRID)
-    told = Told(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
+    told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
     latest.heard(
         Stats(role="agent", id="a0", incarnation=1, stamp_ns=2, counts={}, gauges={}, histograms={}, alarms=[told]),
         2,

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.place_routes import RouteQuestions
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, closed_cells, corners_of
-from launch_scripts.gateways.ros2.incoming.robot import Robot
+from launch_scripts.gateways.ros2.incoming.robot import Robot, RouteQuestions
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
@@ -71,7 +70,7 @@ class Incoming:
         self._publishers: Counter[str] = Counter()
         """Topic of a robot -> how many publish it, as their tokens say."""
         self._news: deque[tuple[Endpoint, bool]] = deque(maxlen=_MOST_NEWS)
-        self._said: set[str] = set()
+        self._refused_robots: set[str] = set()
         """Robots that were said not to be taken in."""
         self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
@@ -121,7 +120,7 @@ class Incoming:
             if self._settings.orders:
                 self._take_goals_of(taken)
         for _ in range(len(self._news)):
-            self._hear(*self._news.popleft())
+            self._on_endpoint(*self._news.popleft())
         for robot in self._robots.values():
             robot.tick(now_ns)
         for each in self._inputs:
@@ -139,7 +138,7 @@ class Incoming:
 
     # --- robots ---------------------------------------------------------------------------------------------------
 
-    def _hear(self, seen: Endpoint, there: bool) -> None:
+    def _on_endpoint(self, seen: Endpoint, there: bool) -> None:
         """Handles an endpoint that has appeared or disappeared."""
         if seen.kind is not Kind.PUBLISHER or seen.node.name == self._node.name.name:
             return  # a gateway like this one tells of vehicles that the swarm has already
@@ -172,8 +171,8 @@ class Incoming:
         )
 
     def _warn(self, robot: str, why: str) -> None:
-        if robot not in self._said and len(self._said) < MOST_ROBOTS:
-            self._said.add(robot)
+        if robot not in self._refused_robots and len(self._refused_robots) < MOST_ROBOTS:
+            self._refused_robots.add(robot)
             log.warning("robot %s is not taken in: %s", robot, why)
 
     # --- targets and areas ----------------------------------------------------------------------------------------

@@ -11,9 +11,8 @@ from contextlib import suppress
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.place_routes import PATIENCE_S, RouteQuestions
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, Place, Track
-from launch_scripts.gateways.ros2.incoming.work_queue import Input
+from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher
@@ -23,16 +22,48 @@ from swarm.clock import NS_PER_S
 
 log = logging.getLogger(__name__)
 
+_PATIENCE_S = 5.0
+"""A planner that starts, or grows the tree of a new goal, answers within this time on the demo's terrain."""
+_MOST_ASKED = 64
+_THREADS = 16
+"""A route takes milliseconds; only one whose planner is busy or missing takes as long as `_PATIENCE_S`."""
+Answer = Callable[[Route | str], None]
+"""Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 _GOAL_HZ = 10.0
 """A robot is given no more goals; of several the newest counts."""
 _ROUTE_AGAIN_NS = 2 * NS_PER_S
 """A route to a goal is asked for again this long after the question before: marks may have closed it since."""
 _MOST_POSTED = 64
-_UNANSWERED_NS = int((PATIENCE_S + 2.0) * NS_PER_S)
+_UNANSWERED_NS = int((_PATIENCE_S + 2.0) * NS_PER_S)
 """An answer that did not come by then was lost."""
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
+
+
+class RouteQuestions:
+    """Questions for routes, to a target or to any place: asked on threads of their own, answered once."""
+
+    def __init__(self, swarm: Swarm) -> None:
+        self._swarm = swarm
+        self._queue = WorkQueue("ros2-routes", _THREADS, _MOST_ASKED)
+        self.close = self._queue.close
+
+    def ask(self, goal: Place | str, start: Place, vehicle_class: str, answer: Answer) -> None:
+        """Finds the route to a target, wherever it is, or to a place."""
+
+        def find() -> None:
+            if isinstance(goal, str):
+                asked = self._swarm.route_soon(
+                    goal, start.x_m, start.y_m, vehicle_class=vehicle_class, timeout_s=_PATIENCE_S
+                )
+                answer(asked.result())
+            else:
+                ends = (start.x_m, start.y_m), (goal.x_m, goal.y_m)
+                answer(self._swarm.route(*ends, vehicle_class=vehicle_class, timeout_s=_PATIENCE_S))
+
+        if not self._queue.give("a question for a route", find, answer):
+            answer(f"{_MOST_ASKED} questions wait already")
 
 
 class Robot:

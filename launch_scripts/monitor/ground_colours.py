@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.movers.styles import HUES
+from launch_scripts.monitor.styles import HUES
+from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import palette
 from launch_scripts.observe.palette import hillshade, rgb
 from shared_map.array_files import Bools

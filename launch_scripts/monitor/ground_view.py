@@ -16,7 +16,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground.ground_colours import (
+from launch_scripts.monitor.ground_colours import (
     COST_COLOURS,
     COST_TO_GO_COLOURS,
     LEARNED_COLOURS,
@@ -25,7 +25,6 @@ from launch_scripts.monitor.ground.ground_colours import (
     GroundColours,
     TargetPictures,
 )
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
 from launch_scripts.monitor.live_layout import (
     COST,
     KNOWN,
@@ -37,7 +36,8 @@ from launch_scripts.monitor.live_layout import (
     Scale,
     legend_picture,
 )
-from launch_scripts.monitor.movers.styles import Look
+from launch_scripts.monitor.styles import Look
+from launch_scripts.monitor.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
 from launch_scripts.monitor.view_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap

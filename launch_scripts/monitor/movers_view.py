@@ -12,10 +12,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.movers import styles
-from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
-from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
+from launch_scripts.monitor import styles
+from launch_scripts.monitor.styles import ALARM_COLOUR, FOLLOWED_ENTITY
+from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.view_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm
