@@ -9,9 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.run_state import RunState, TargetLine
-from launch_scripts.observe.summed_counts import sum_of
+from launch_scripts.observe.summed_counts import ProcessLoad, sum_of
 from launch_scripts.process_table import ROLES
 
 SHOWN_ALARMS = 5

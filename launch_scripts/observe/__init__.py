@@ -7,11 +7,10 @@
 |--------------------|------------------------------------------------------------------------------------------|
 | run_observer.py    | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands   |
 | latest_messages.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be         |
-| summed_counts.py   | `Counts`: what all processes counted, summed; the certified gap is made of it            |
+| summed_counts.py   | `Counts`: sums of all processes, with the certified gap; `ProcessLoads`: CPU and memory  |
 | run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
 | fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                |
 | run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
-| process_load.py    | what each process takes up, and how well it keeps time                                   |
 | recorder.py        | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report |
 | history.py         | what a recorder keeps over time, in bounded memory                                       |
 | run_results.py     | results per target, group and vehicle                                                    |

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.process_load import ProcessLoads
-from launch_scripts.observe.summed_counts import Counts, sum_of
+from launch_scripts.observe.summed_counts import Counts, ProcessLoads, sum_of
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, crew_of

@@ -1,4 +1,5 @@
-"""The counts of all processes of a run, summed; and the certified gap, which is made of them. Pure.
+"""The counts of all processes of a run, summed; the certified gap, which is made of them; and CPU, memory and late
+ticks of each process. Pure.
 
 This is the one place which makes the certified gap from what agents count, for the live table, the report, the view
 and `swarm status`.
@@ -7,13 +8,24 @@ and `swarm status`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import job_of
-from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO, Histogram, merged
+from swarm.runtime.stats import (
+    CPU_S,
+    GAPS_OF,
+    GAPS_TO,
+    MESSAGES_PER_S,
+    RESTARTS,
+    RSS_BYTES,
+    UNPROVEN_OF,
+    UNPROVEN_TO,
+    Histogram,
+    merged,
+)
 from swarm.wire.messages.processes import Stats
 
 LONG_SILENCE_NS = 10 * NS_PER_S
@@ -180,3 +192,80 @@ def of_excess(histogram: Histogram) -> dict[str, float | None]:
 def percent(gap: float | None) -> str:
     """The excess of a gap over 1, for people."""
     return "-" if gap is None else f"{max(gap - 1, 0):.2%}"
+
+
+_MOST_LOADS = 1 << 13
+"""Processes whose load is kept, as many as are counted: names may be made up by strangers."""
+_LEAST_NS = NS_PER_S // 2
+"""Over a shorter time no rate is measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessLoad:
+    """Load of one process, over the last second or so; None where it is unknown.
+
+    cpu_percent  100 is one core
+    late_per_s   ticks that came later than half a period, or not at all
+    pid          of a process on this machine
+    """
+
+    role: str
+    cpu_percent: float | None
+    rss_bytes: float | None
+    late_per_s: float | None
+    messages_per_s: float | None
+    restarts: int
+    id: str
+    alive: bool
+    up_s: float
+    pid: int | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.role}-{self.id}"
+
+
+class ProcessLoads:
+    """The last two loads of every process."""
+
+    def __init__(self) -> None:
+        self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
+
+    def on_stats(self, stats: Stats) -> None:
+        """Takes in what a process says; of an earlier generation, or older, nothing."""
+        key = (stats.role, stats.id)
+        _, last = self._told.get(key, (None, None))
+        if last is None or stats.incarnation > last.incarnation:
+            if last is not None or len(self._told) < _MOST_LOADS:
+                self._told[key] = (None, stats)
+        elif stats.incarnation == last.incarnation and stats.stamp_ns - last.stamp_ns >= _LEAST_NS:
+            self._told[key] = (last, stats)
+
+    def lines(self, up: Collection[tuple[str, str]]) -> list[ProcessLoad]:
+        """Returns every process with a known load, in order.
+
+        up  (role, id) of those that are alive
+        """
+        return [
+            ProcessLoad(
+                role=role,
+                id=id,
+                alive=(role, id) in up,
+                up_s=max(now.stamp_ns - now.incarnation, 0) / NS_PER_S,
+                cpu_percent=_rate(before, now, "gauges", CPU_S, 100.0),
+                rss_bytes=now.gauges.get(RSS_BYTES),
+                late_per_s=_rate(before, now, "counts", "ticks_late"),
+                messages_per_s=now.gauges.get(MESSAGES_PER_S),
+                restarts=round(now.gauges.get(RESTARTS, 0.0)),
+            )
+            for (role, id), (before, now) in sorted(self._told.items())
+        ]
+
+
+def _rate(before: Stats | None, now: Stats, where: str, name: str, times: float = 1.0) -> float | None:
+    """By how much it grew a second."""
+    earlier = None if before is None else getattr(before, where).get(name)
+    later = getattr(now, where).get(name)
+    if before is None or earlier is None or later is None:
+        return None
+    return float(max(later - earlier, 0) * times * NS_PER_S / (now.stamp_ns - before.stamp_ns))

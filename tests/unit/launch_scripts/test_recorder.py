@@ -173,7 +173,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
 ) -> None:
     observe = "launch_scripts.observe"
     for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_GENERATIONS",
-                  "process_load._MOST"):  # fmt: skip
+                  "summed_counts._MOST_LOADS"):  # fmt: skip
         monkeypatch.setattr(f"{observe}.{limit}", 10)
     latest = LatestState(plan_of(scenario(), 0), GRID)
 
