@@ -109,12 +109,12 @@ class Thief(Process):
         return replace(table, grants={**table.grants, one: early})
 
     def replayed(self, table: Table) -> Table:
-        """What it said once, under a new number."""
+        """An earlier table of its own, under a new number."""
         old = self.chance.choice([*self.past, table])
         return table if old.shard != table.shard else replace(old, epoch=table.epoch, seq=table.seq)
 
     def misstated(self, standing: HostState) -> HostState:
-        """As a host: another start of it, of which others have ended; or vehicles that hold what others do."""
+        """Another start of it, of which others have ended; or vehicles that hold what others do."""
         if self.chance.random() < 0.3:
             return replace(standing, generation=standing.generation + self.chance.choice((-1, 1, 1 << 32)))
         if self.chance.random() < 0.3:
@@ -216,7 +216,7 @@ class ThiefWorld(TrafficWorld):
             self.at(self.chance.randrange(2 * NS_PER_S), lambda to=process: self.tell_revoked(to))
 
     def carry(self, source: Process, to: Process, deliver: Callable[[], None]) -> None:
-        """What a revoked name has said is not carried any more."""
+        """Carries nothing more that a revoked name has said."""
         is_denied = source.agent == self.stolen
         super().carry(source, to, lambda: None if is_denied and self.revoked else deliver())
 
