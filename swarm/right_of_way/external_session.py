@@ -18,7 +18,7 @@ from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal, SaveGenerations
+from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.incarnations import MemoryGenerations
@@ -75,6 +75,7 @@ class ExternalService:
         self._warn = warn
         self._warned: set[str] = set()
         self._tag = f"known-{name}"
+        self._answers = Answers(proven=bus.proves_names)
         self._asking = False
         self._ask_due_ns = 0
         self._tokens: set[Peer] = set()
@@ -122,8 +123,9 @@ class ExternalService:
                 if self.external is not None:
                     self.external.hear_left(left)
             case Replied(tag=self._tag, message=Known() as known):
-                self._hear_known(known)
+                self._take_answers(self._answers.hear(known))
             case AskEnded(tag=self._tag):
+                self._take_answers(self._answers.end_query())
                 self._asking = False
                 self._ask_due_ns = now_ns + _ASK_AGAIN_NS
                 if self.external is not None:
@@ -155,8 +157,9 @@ class ExternalService:
         if self.external is not None:
             self._perform(self.external.tick(now_ns), now_ns)
 
-    def _hear_known(self, known: Known) -> None:
-        if known.agents and (self.external is None or _tells_of_larger(known, self.external)):
+    def _take_answers(self, agreed: Sequence[Known]) -> None:
+        known = agreed[0] if agreed else None
+        if known is not None and (self.external is None or _tells_of_larger(known, self.external)):
             if self.name in known.agents:
                 self._warn_once(
                     (f"{self.name} is an agent of this run's scenario: an external vehicle needs another name",)
@@ -168,8 +171,9 @@ class ExternalService:
                 self.external.hear_token(peer, up=True)
             if self._cell is not None:
                 self.external.enter(self._cell)
-        if self.external is not None and known.shard_cells == self.external.shards.side:
-            self.external.hear_known(known)
+        for known in agreed:
+            if self.external is not None and known.shard_cells == self.external.shards.side:
+                self.external.hear_known(known)
 
     def _hear_token(self, peer: Peer, *, up: bool) -> None:
         (self._tokens.add if up else self._tokens.discard)(peer)
@@ -402,6 +406,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     """
     inbox = Inbox()
     clock = MonotonicClock()
+    answers = Answers(proven=bus.proves_names)
     bus.watch_alive(inbox.post)
     bus.subscribe(GRANTED, inbox.post, host=name)
     bus.subscribe(WORD, inbox.post, host=name)
@@ -413,22 +418,24 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
         match inbox.take(_TICK_S):
             case Appeared(peer) if peer.id == name:
                 raise ConfigError(f"{name} is alive: end its program, or use `swarm order vehicle remove`")
-            case Replied(message=Known() as known) if known.agents:
-                if name in known.agents:
-                    raise ConfigError(
-                        f"{name} is an agent of the scenario, not an external vehicle: start it again instead"
-                    )
-                if removal is None or (not begun and known.shard_cells > removal.shards.side):
-                    shards = Shards(grid, known.agents, known.shard_cells, proven=bus.proves_names)
-                    removal = Removal(shards, name)
-                if known.shard_cells == removal.shards.side:
-                    removal.hear_known(known)
+            case Replied(message=Known() as heard):
+                for known in answers.hear(heard):
+                    if name in known.agents:
+                        raise ConfigError(
+                            f"{name} is an agent of the scenario, not an external vehicle: start it again instead"
+                        )
+                    if removal is None or (not begun and known.shard_cells > removal.shards.side):
+                        shards = Shards(grid, known.agents, known.shard_cells, proven=bus.proves_names)
+                        removal = Removal(shards, name)
+                    if known.shard_cells == removal.shards.side:
+                        removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
                 if not removal.known:
                     raise ConfigError(f"no agent knows an external vehicle {name!r}")
                 removal.begin(secrets.randbits(32))
                 begun = True
             case AskEnded() if not begun:
+                answers.end_query()
                 bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
             case Heard(message=(Granted() | Word()) as granted) if removal is not None:
                 removal.hear_granted(granted, now_ns)

@@ -3,6 +3,7 @@ removes it (docs/design/external-vehicles.md)."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,8 +13,11 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.lock_regions import Shards
+from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Known, Left, Word
 
+_QUERIES_ALONE = 5
+"""Queries that only one agent answers before it is believed: another that runs answers one within seconds."""
 _PATIENCE_NS = 3 * NS_PER_S
 """For so long it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
@@ -25,6 +29,45 @@ class SaveGenerations:
     """Put these on file before what follows is said."""
 
     generations: list[int]
+
+
+class Answers:
+    """Agents' answers about a run which an external vehicle does not know: they name the agents and the side of
+    shards.
+
+    proven  certificates prove names: then one may lie, and counts only with a second that says the same, or if no
+            other has answered several queries
+    """
+
+    def __init__(self, *, proven: bool) -> None:
+        self._proven = proven
+        self._known: dict[str, Known] = {}
+        self._queries = 0
+
+    def hear(self, known: Known) -> list[Known]:
+        """Takes an answer. Returns those that count now: they agree, by the largest shards of which enough tell, as
+        an agent does so only if this is so for the whole run."""
+        if known.agent in known.agents and (known.agent in self._known or len(self._known) < MOST_IDS):
+            self._known[known.agent] = known
+        return self.agreed
+
+    def end_query(self) -> list[Known]:
+        """All that answered one query have done so. Returns the answers that count."""
+        self._queries += 1
+        return self.agreed
+
+    @property
+    def agreed(self) -> list[Known]:
+        by_run = defaultdict[tuple[int, tuple[str, ...]], list[Known]](list)
+        for known in self._known.values():
+            by_run[known.shard_cells, tuple(known.agents)].append(known)
+        is_alone = len(self._known) == 1 and self._queries >= _QUERIES_ALONE
+        enough = 2 if self._proven and not is_alone else 1
+        return max((of for of in by_run.values() if len(of) >= enough), key=_side_of, default=[])
+
+
+def _side_of(agreed: Sequence[Known]) -> int:
+    return agreed[0].shard_cells
 
 
 ExternalAction = AskKnown | SaveGenerations | Tell | Left

@@ -143,7 +143,8 @@ def test_an_external_vehicle_goes_by_the_largest_shards_that_it_is_told_of(order
     external.start(0)
     agents = ["a0", "a1", "a2", "a3"]
     for agent, cells in zip(agents, order, strict=True):
-        external._hear_known(Known(agent=agent, disk=0, generation=0, shards=[], agents=agents, shard_cells=cells))
+        known = Known(agent=agent, disk=0, generation=0, shards=[], agents=agents, shard_cells=cells)
+        external._take_answers(external._answers.hear(known))
     assert external.external is not None
     assert external.external.shards.side == LARGE
 
