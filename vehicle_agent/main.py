@@ -31,7 +31,9 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     store: PromiseStore = (
         PromiseStore(secrets.randbits(60))
         if setup.run_dir is None
-        else FilePromiseStore(setup.run_dir / f"promises-{setup.id}", waits=setup.takes_over)
+        else FilePromiseStore(
+            setup.run_dir / f"promises-{setup.id}", waits=setup.takes_over, network=setup.scenario.network
+        )
     )
     inbox = Inbox()
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
 from swarm.config.input_files import FileKind
-from swarm.errors import DamagedError
+from swarm.config.revocations import with_revocations
+from swarm.config.scenario import NetworkConfig
+from swarm.errors import ConfigError, DamagedError
 from swarm.journal import Journal
 from swarm.recording.service_boundary import ExternalCalls
 from swarm.wire.messages.traffic import Table
@@ -31,7 +34,7 @@ _decode = msgspec.msgpack.Decoder(_Record).decode
 
 PROMISE_STORE = ExternalCalls(
     "store",
-    calls={"reserve": str | None, "save_own": None, "save": None, "sync": None},
+    calls={"reserve": str | None, "revoked": list[str], "save_own": None, "save": None, "sync": None},
     facts={"own": OwnRecord, "saved": dict[int, tuple[int, Table]], "ready": bool},
 )
 """Calls of its store that an agent uses."""
@@ -57,6 +60,10 @@ class PromiseStore:
         """Tries to get the space that is missing. Returns why it cannot."""
         return None
 
+    def revoked(self) -> list[str]:
+        """Returns the revoked names in certificates that are known on this machine."""
+        return []
+
     def save_own(self, own: OwnRecord) -> None:
         self.own = own
 
@@ -70,13 +77,15 @@ class PromiseStore:
 class FilePromiseStore(PromiseStore):
     """A journal of promises. Records before a `sync` survive a kill and a loss of power.
 
-    waits  for the end of a process that has locked it
+    waits    for the end of a process that has locked it
+    network  with the certificate beside which revoked names are listed
 
     Raises StoreError if the file is in use, is damaged or cannot be written.
     """
 
-    def __init__(self, path: Path, *, waits: bool = False) -> None:
+    def __init__(self, path: Path, *, waits: bool = False, network: NetworkConfig | None = None) -> None:
         super().__init__(secrets.randbits(60))
+        self._network = network or NetworkConfig()
         self._encode = msgspec.msgpack.Encoder().encode
         in_use = "by the same agent, which runs here already: end it first"
         self._journal = Journal(
@@ -100,6 +109,11 @@ class FilePromiseStore(PromiseStore):
 
     def reserve(self) -> str | None:
         return self._journal.reserve()
+
+    def revoked(self) -> list[str]:
+        with suppress(ConfigError):  # the router says so, and keeps the names from before
+            self._network = with_revocations(self._network)
+        return list(self._network.revoked)
 
     def save_own(self, own: OwnRecord) -> None:
         super().save_own(own)

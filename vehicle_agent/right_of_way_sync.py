@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
+from swarm.config.agents import plan_agents
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
@@ -119,6 +120,9 @@ class RightOfWaySync:
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._unasked = False
         """True if an agent has appeared that has not received our recovery query."""
+        self._names = {f"agent.{plan.group.name}.{plan.id}": plan.id for plan in plan_agents(setup.scenario)}
+        """Name in its certificate -> agent."""
+        self._revoked: set[str] = set()
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Shard without a leader -> when that is said again."""
@@ -250,6 +254,7 @@ class RightOfWaySync:
         """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
         if now_ns >= self._reserve_due_ns:
             self._reserve_due_ns = now_ns + _RESERVE_NS
+            self._take_revoked(now_ns)
             why = self._store.reserve()
             told = self._told_silent_ns
             if self._store.ready:
@@ -260,6 +265,13 @@ class RightOfWaySync:
                 self._told_silent_ns = now_ns
                 self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
         self.core.silent = not self._store.ready
+
+    def _take_revoked(self, now_ns: int) -> None:
+        """Tells the members of agents whose certificates were revoked since the last look."""
+        new = {*self._store.revoked()} - self._revoked
+        self._revoked |= new
+        known = [self._names.get(name.partition("~")[0]) for name in sorted(new)]  # a0~2 is the next one of a0
+        self.core.revoke([agent for agent in known if agent is not None], self._own_time.at(now_ns))
 
     def _ask_known(self, now_ns: int) -> None:
         """Asks all agents what they know of us, and schedules the next query: each after twice the delay, up to a

@@ -18,7 +18,7 @@ from rich.text import Text
 from launch_scripts.check.scenario_check import check_start
 from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
-from launch_scripts.deploy import certificates, revocations
+from launch_scripts.deploy import certificates
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
@@ -37,6 +37,7 @@ from launch_scripts.launcher.options import common_run_id, find_scenario, own_ce
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
+from swarm.config import revocations
 from swarm.config.input_files import quoted
 from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario

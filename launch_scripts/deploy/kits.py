@@ -14,13 +14,13 @@ import msgspec
 
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
-from launch_scripts.deploy.revocations import FILE as REVOKED
-from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.zenoh_config import common_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.load import with_files
 from swarm.config.plugin_names import plugins_of
+from swarm.config.revocations import FILE as REVOKED
+from swarm.config.revocations import revoked_in
 from swarm.config.scenario import UNTIL_STOPPED_S, Scenario, TlsConfig
 from swarm.config.write import scenario_text
 from swarm.errors import ConfigError, StoreError

@@ -14,7 +14,6 @@ from collections.abc import Callable
 
 import msgspec
 
-from launch_scripts.deploy.revocations import with_revocations
 from launch_scripts.launcher.router_door import HANDSHAKE_S, Door
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import admitting_all
@@ -23,6 +22,7 @@ from swarm.bus.bus import Bus, Event, Post
 from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
+from swarm.config.revocations import with_revocations
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, SwarmError
 from swarm.liveness import Peer

@@ -198,7 +198,7 @@ class RightOfWay:
 
     def revoke(self, names: Collection[str], now_ns: int) -> None:
         """The certificates of these agents are revoked: what they said as members may be false."""
-        for name in {*names} - self._revoked:
+        for name in names:
             self._revoked.add(name)
             for member in self._members.values():
                 member.revoke(name, now_ns)

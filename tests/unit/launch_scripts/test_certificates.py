@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from launch_scripts.deploy.certificates import authority, issue, may_stay
-from launch_scripts.deploy.revocations import FILE, revoke, revoked_in, with_revocations
+from swarm.config.revocations import FILE, revoke, revoked_in, with_revocations
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import ConfigError, StoreError
 

@@ -14,12 +14,17 @@ from random import Random
 import pytest
 from msgspec.msgpack import encode
 from support.effort import few
+from support.simulated import agents
 
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import SMALL, seeded
+from swarm.config.revocations import revoke
+from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import DamagedError, StoreError
 from swarm.wire.messages.traffic import Held, Table
 from vehicle_agent import promise_store
-from vehicle_agent.promise_store import FilePromiseStore
-from vehicle_agent.traffic.right_of_way_core import OwnRecord
+from vehicle_agent.promise_store import FilePromiseStore, PromiseStore
+from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 
 def table(shard: int, seq: int) -> Table:
@@ -226,3 +231,28 @@ def test_on_a_full_disk_promises_are_kept_until_the_space_is_used_up_and_again_w
         again.save(3, table(0, later))
     assert again.ready
     again.close()
+
+
+def test_an_agent_knows_the_names_which_are_revoked_beside_its_certificate(tmp_path: Path) -> None:
+    tls = TlsConfig(ca="ca.pem", certificate=str(tmp_path / "agent.all.a1.pem"), key="a1.key")
+    store = FilePromiseStore(tmp_path / "promises-a1", network=NetworkConfig(tls=tls, revoked=("tracker.t",)))
+    assert store.revoked() == ["tracker.t"]
+    revoke(tmp_path, ["agent.all.a0"])
+    assert store.revoked() == ["tracker.t", "agent.all.a0"]
+    (tmp_path / "revoked").write_text("no name\n")
+    assert store.revoked() == ["tracker.t", "agent.all.a0"]
+
+
+def test_members_are_told_of_an_agent_whose_certificate_is_revoked_and_of_its_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names: list[str] = ["planner.t0"]
+    told: list[str] = []
+    monkeypatch.setattr(PromiseStore, "revoked", lambda self: list(names))
+    monkeypatch.setattr(RightOfWay, "revoke", lambda self, agents, now_ns: told.extend(agents))
+    simulation = Simulation(seeded(1, SMALL))
+    group = simulation.scenario.groups[0].name
+    for looks, new in enumerate((f"agent.{group}.a0", f"agent.{group}.a0~2", "monitor.0")):
+        simulation.run_until(4.0 * (looks + 1))
+        assert told == ["a0"] * looks * len(agents(simulation))
+        names.append(new)

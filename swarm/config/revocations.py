@@ -1,4 +1,4 @@
-"""The file of revoked names beside a router's certificate. A router of ours reads it again and again."""
+"""The file of revoked names beside a certificate. Routers and agents read it again and again."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def revoked_in(folder: Path) -> tuple[str, ...]:
 
 
 def with_revocations(network: NetworkConfig) -> NetworkConfig:
-    """The network of a router which denies, beside the names that its scenario revokes, those in the file beside
-    its certificate."""
+    """The network of a process with the names that its scenario revokes, and those in the file beside its
+    certificate."""
     if network.tls is None:
         return network
     found = revoked_in(Path(network.tls.certificate).parent)
