@@ -349,7 +349,7 @@ class Holdings:
         }
         other = {id for id in seen.keys() | view.seen if seen.get(id) != view.seen.get(id)}
         other |= {id for id in waits.keys() | view.waits if waits.get(id) != view.waits.get(id)}
-        listed = {id: entries_of(view.seen.get(id, ()), view.waits.get(id, ())) for id in other}
+        listed = {id: entries_of(view.seen.get(id, ()), view.waits.get(id, ())) for id in sorted(other)}
         changed = self._entries.hear_granted(shard, granted.stamp, granted.generation, listed)
         self._seen_anew |= other
         for vehicle in changed & self._paths.keys():

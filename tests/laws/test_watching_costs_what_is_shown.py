@@ -29,14 +29,14 @@ BURSTS = st.lists(st.integers(1, 9), min_size=12, max_size=12)
 def decoded() -> Any:
     """Node and topic -> how many payloads it has decoded."""
     counts: Counter[tuple[str, str]] = Counter()
-    before = MemoryBus._heard
+    before = MemoryBus._event_of
 
     def heard(self: MemoryBus, sample: Any, together: bool = False) -> Any:
         counts[self.node, sample.topic.name] += 1
         return before(self, sample, together)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MemoryBus, "_heard", heard)
+        patch.setattr(MemoryBus, "_event_of", heard)
         yield counts
 
 

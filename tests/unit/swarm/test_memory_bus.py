@@ -9,7 +9,7 @@ from support.bus_behaviour import *  # noqa: F403
 from support.bus_world import Box, answering, asked, note, pose
 from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
-from support.swarm_model import START_NS, PerfectLinks, SwarmModel
+from support.swarm_model import START_NS, LossyLinks, SwarmModel
 from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus import memory_bus
@@ -27,10 +27,11 @@ def world() -> SwarmModel:
     return SwarmModel()
 
 
-class Links(PerfectLinks):
+class Links(LossyLinks):
     """Acts as it is set."""
 
     def __init__(self, *delays_ms: float) -> None:
+        super().__init__(0)
         self.delays = [int(delay * 1e6) for delay in delays_ms]
 
     def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
