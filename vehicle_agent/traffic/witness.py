@@ -52,8 +52,9 @@ def agreed(tables: Collection[Table]) -> Table:
     for number, vehicle in (each for each, count in votes.items() if count > 1):
         host = agent_of(vehicle)
         of = [each[number][1] for each in lists if each.get(number, ("", 0))[0] == vehicle]
-        # The earliest that may use it. Before a table counts one, the next that does takes the run's first entries.
-        generation = min(filter(None, of), default=hosts.get(host, BEFORE_ALL)[0])
+        # The latest has it by an honest member's word that those before have ended: to fence it for an earlier one
+        # would free the cell under the vehicle. Generation 0 is the run's start.
+        generation = max(of) or hosts.get(host, BEFORE_ALL)[0]
         entries.setdefault((host, generation), {}).setdefault(vehicle, []).append(number)
     grants: dict[str, list[Number]] = {}
     fences: list[Fence] = []
