@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 
 from msgspec.structs import replace
 
@@ -40,16 +41,25 @@ def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
 
 
 def agreed(tables: Collection[Table]) -> Table:
-    """Returns what at least two of three tables list, where their members are all that can be honest: what a
-    majority with a liar had on file is on two of them, or over by its host's word. The newest statements count."""
+    """Returns what at least two of three tables list, where no member with one is a liar. The newest statements
+    count. An entry that a majority had on file is on two of them, or over by its host's word, or its vehicle began
+    in the cell again by a later one."""
     newest_first = sorted(tables, key=lambda table: table.stamp, reverse=True)
     lists = [_listed(table) or {} for table in newest_first]
-    votes = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    listed = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    in_cell = Counter(chain.from_iterable({(number[0], each[0]) for number, each in of.items()} for of in lists))
+    kept: dict[Number, str] = {}
+    cells: set[tuple[int, str]] = set()
+    for number, vehicle in sorted(listed, key=lambda each: (listed[each] > 1, each[0][1:]), reverse=True):
+        place = number[0], vehicle
+        if listed[number, vehicle] > 1 or (in_cell[place] > 1 and place not in cells and number not in kept):
+            kept[number] = vehicle
+            cells.add(place)
     hosts: dict[str, tuple[int, int]] = {}
     for table in newest_first:
         hosts.update((name, max(said, hosts.get(name, said))) for name, said in table.hosts.items())
     entries: dict[tuple[str, int], dict[str, list[Number]]] = {}
-    for number, vehicle in (each for each, count in votes.items() if count > 1):
+    for number, vehicle in (each for each in listed if kept.get(each[0]) == each[1]):
         host = agent_of(vehicle)
         of = [each[number][1] for each in lists if each.get(number, ("", 0))[0] == vehicle]
         # The latest has it by an honest member's word that those before have ended: to fence it for an earlier one
