@@ -1,7 +1,8 @@
 """A member's witness, where certificates prove names: it tells hosts what its file grants them, and stores no table
-that takes an entry from a host which did not give it back.
+that takes an entry from a host which did not give it back, or adds one which its host did not request.
 
-With both, one liar among four members makes no two vehicles of others meet (docs/design/right-of-way.md).
+With both, one liar among four members makes no two vehicles of others meet. Members which it left with different
+tables agree again once its name is revoked (docs/design/right-of-way.md).
 """
 
 from __future__ import annotations
