@@ -96,8 +96,7 @@ def two_of_four_are_enough(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Shards, "__init__", smaller)
 
 
-def members_store_what_no_host_requested(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(_Host, "mentions", lambda self, number, vehicle: True)
+def members_store_entries_of_hosts_that_never_spoke(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Witness, "hear_host_state", heard_of_all)
 
 
@@ -110,8 +109,8 @@ def members_hear_of_no_revoked_name(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Member, "revoke", lambda self, name, now_ns: None)
 
 
-def agreed_tables_are_the_newest(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(member, "agreed", lambda tables: max(tables, key=lambda table: table.stamp))
+def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(member, "agreed", lambda tables: tables[0])
 
 
 def entries_of_bodies_are_disclaimed(patch: pytest.MonkeyPatch) -> None:
@@ -131,9 +130,9 @@ def entries_of_bodies_are_disclaimed(patch: pytest.MonkeyPatch) -> None:
         (hosts_believe_one_leader, 0),
         (members_store_whatever_a_leader_says, 0),
         (two_of_four_are_enough, 0),
-        (members_store_what_no_host_requested, 0),
+        (members_store_entries_of_hosts_that_never_spoke, 0),
         (members_hear_of_no_revoked_name, 0),
-        (agreed_tables_are_the_newest, 0),
+        (a_leader_begins_with_its_own_table, 0),
         (entries_of_bodies_are_disclaimed, 150),
     ],
     ids=lambda rule: getattr(rule, "__name__", ""),
