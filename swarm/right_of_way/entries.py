@@ -186,16 +186,18 @@ class HostEntries:
 
     def disclaim(self, shard: int, member: str, newest: Stamp, numbers: Iterable[Number]) -> None:
         """Takes none of these numbers that we do not hold. The entries of the run's start are ours until a table
-        says otherwise.
+        says otherwise, and so are those of a cell on which a body is: a thief may ask for them before a table has
+        passed them to this generation.
 
         newest  the table on the member's file: it lacks no later entry
         """
         knows = self.knows.get(shard, BEFORE_ALL)
         held = {entry.number for path in self.paths.values() for entry in path}
+        bodies = self.bodies.values()
         by_member = self.disclaimed.setdefault(shard, {})
         kept = {number for number in by_member.get(member, ()) if number[1:] > knows}
         asked = [number for number in numbers if number not in held and self.shard_of(number[0]) == shard]
-        new = [number for number in asked if number[1] and knows < number[1:] <= newest]
+        new = [each for each in asked if each[1] and knows < each[1:] <= newest and each[0] not in bodies]
         by_member[member] = kept.union(new[: max(_MOST_DISCLAIMED - len(kept), 0)])
 
     def never(self, shard: int) -> set[Number]:

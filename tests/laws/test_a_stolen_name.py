@@ -1,5 +1,5 @@
 """One agent's name is stolen, and certificates prove names: however it lies, as a member, a leader and a host, no
-two vehicles of others meet; and with each rule taken out, they do.
+two vehicles of others meet, and once it is revoked members agree again; each rule is needed.
 
 More histories: `pytest tests/laws/test_a_stolen_name.py -m seeds --seeds 0:2000`.
 """
@@ -14,9 +14,13 @@ import pytest
 from support.thief import ThiefWorld
 from support.traffic_world import Faults, TrafficWorld, random_faults
 
+from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Shards
-from vehicle_agent.traffic.witness import Witness
+from swarm.wire.messages.traffic import HostState
+from vehicle_agent.traffic import member
+from vehicle_agent.traffic.member import Member
+from vehicle_agent.traffic.witness import Witness, _Host
 
 LIES_S = 8.0
 SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))
@@ -30,17 +34,9 @@ def world_of(seed: int) -> ThiefWorld:
     return ThiefWorld(seed, *chance.choice(SHAPES), replace(faults, twins=0))
 
 
-@pytest.mark.seeds(20)
-def test_no_two_vehicles_of_others_meet(seed: int) -> None:
-    world = world_of(seed)
-    world.run(LIES_S)
-    world.revoke()
-    world.run(8.0)
-    assert world.collisions == []
-
-
-@pytest.mark.seeds(12)
-def test_once_the_name_is_revoked_members_agree_and_answer_whatever_it_said(seed: int) -> None:
+def harm_done(seed: int) -> list[str]:
+    """Harm that remains of a history: vehicles of others met, members of a shard do not agree some time after the
+    name is revoked, or cells are closed for a vehicle that does not exist."""
     world = world_of(seed)
     world.run(LIES_S)
     world.revoke()
@@ -49,10 +45,13 @@ def test_once_the_name_is_revoked_members_agree_and_answer_whatever_it_said(seed
     for _ in range(60):  # a table is on its way to some in most moments
         at_odds = {shard for shard in at_odds if not world.is_of_one_mind(shard)}
         world.run(0.07)
-    assert at_odds == set()
-    assert world.collisions == []
     ghosts = [id for each in world.files() for id in each.grants if id not in world.goals]
-    assert ghosts == []
+    return [*map(str, world.collisions), *(f"shard {shard} does not agree" for shard in at_odds), *ghosts]
+
+
+@pytest.mark.seeds(30)
+def test_others_do_not_meet_and_members_agree_once_the_name_is_revoked(seed: int) -> None:
+    assert harm_done(seed) == []
 
 
 @pytest.mark.seeds(6)
@@ -97,16 +96,49 @@ def two_of_four_are_enough(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Shards, "__init__", smaller)
 
 
+def members_store_entries_of_hosts_that_never_spoke(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Witness, "hear_host_state", heard_of_all)
+
+
+def heard_of_all(self: Witness, standing: HostState, now_ns: int) -> None:
+    for name in (standing.agent, "ghost"):
+        self._hosts.setdefault(name, _Host(now_ns)).hear(standing, now_ns)
+
+
+def members_hear_of_no_revoked_name(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Member, "revoke", lambda self, name, now_ns: None)
+
+
+def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(member, "agreed", lambda tables: tables[0])
+
+
+def entries_of_bodies_are_disclaimed(patch: pytest.MonkeyPatch) -> None:
+    disclaim = HostEntries.disclaim
+
+    def at_once(self, *asked):  # type: ignore[no-untyped-def]
+        bodies, self.bodies = self.bodies, {}
+        disclaim(self, *asked)
+        self.bodies = bodies
+
+    patch.setattr(HostEntries, "disclaim", at_once)
+
+
 @pytest.mark.parametrize(
-    "broken",
-    [hosts_believe_one_leader, members_store_whatever_a_leader_says, two_of_four_are_enough],
-    ids=lambda rule: rule.__name__,
+    ("broken", "first"),
+    [
+        (hosts_believe_one_leader, 0),
+        (members_store_whatever_a_leader_says, 0),
+        (two_of_four_are_enough, 0),
+        (members_store_entries_of_hosts_that_never_spoke, 0),
+        (members_hear_of_no_revoked_name, 0),
+        (a_leader_begins_with_its_own_table, 0),
+        (entries_of_bodies_are_disclaimed, 150),
+    ],
+    ids=lambda rule: getattr(rule, "__name__", ""),
 )
-def test_each_rule_is_needed(broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_rule_is_needed(
+    broken: Callable[[pytest.MonkeyPatch], None], first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     broken(monkeypatch)
-    for seed in range(100):
-        world = world_of(seed)
-        world.run(LIES_S)
-        if world.collisions:
-            return
-    raise AssertionError("100 histories without a collision: the law would not notice")
+    assert any(harm_done(seed) for seed in range(first, first + 100))

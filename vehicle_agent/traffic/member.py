@@ -373,12 +373,16 @@ class Member:
             return
         known = sorted(promises, key=lambda table: table.stamp, reverse=True)
         without = min(self._distrusted, default=None)
+        found: Table | None = known[0]
         if without is not None:
-            known = [agreed(promises)]
-        while self._witness is not None and not without and known and self._witness.contradicts(known[0]):
-            del known[0]  # stored by a member which a thief told another table
-        if known and (without is not None or self._accepts(known[0])):
-            self.leader = Leader(self._shards, self._me, self._claimed, known[0], self._fleets, without)
+            found = agreed(promises)
+        elif self._witness is not None:
+            # A table that a thief told one member comes last, but a host that lies must not rule out all. If none
+            # is accepted, hosts are asked for what the first lacks.
+            known.sort(key=self._witness.contradicts)
+            found = next(filter(self._accepts, [*known, known[0]]), None)
+        if found is not None:
+            self.leader = Leader(self._shards, self._me, self._claimed, found, self._fleets, without)
             self._told = []
             self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.

@@ -1,14 +1,16 @@
 """A member's witness, where certificates prove names: it tells hosts what its file grants them, and stores no table
-that takes an entry from a host which did not give it back.
+that takes an entry from a host which did not give it back, or adds one for a host which has not spoken.
 
-With both, one liar among four members makes no two vehicles of others meet (docs/design/right-of-way.md).
+With both, one liar among four members makes no two vehicles of others meet. Members which it left with different
+tables agree again once its name is revoked (docs/design/right-of-way.md).
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 
 from msgspec.structs import replace
 
@@ -23,9 +25,6 @@ from vehicle_agent.traffic.shard_leader import MOST_CELLS, SILENT_NS, exceeds_ex
 
 _MOST_LACKED = 64
 """Entries that one word asks for; the next asks for more."""
-_REMEMBERED = 16
-"""Statements of a host in which a new entry may be requested: those of more than a second, in which a table
-comes."""
 
 
 def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
@@ -40,20 +39,30 @@ def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
 
 
 def agreed(tables: Collection[Table]) -> Table:
-    """Returns what at least two of three tables list, where their members are all that can be honest: what a
-    majority with a liar had on file is on two of them, or over by its host's word. The newest statements count."""
+    """Returns what at least two of three tables list, where no member with one is a liar. The newest statements
+    count. An entry that a majority had on file is on two of them, or over by its host's word, or its vehicle began
+    in the cell again by a later one."""
     newest_first = sorted(tables, key=lambda table: table.stamp, reverse=True)
     lists = [_listed(table) or {} for table in newest_first]
-    votes = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    listed = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    in_cell = Counter(chain.from_iterable({(number[0], each[0]) for number, each in of.items()} for of in lists))
+    kept: dict[Number, str] = {}
+    cells: set[tuple[int, str]] = set()
+    for number, vehicle in sorted(listed, key=lambda each: (listed[each] > 1, each[0][1:]), reverse=True):
+        place = number[0], vehicle
+        if listed[number, vehicle] > 1 or (in_cell[place] > 1 and place not in cells and number not in kept):
+            kept[number] = vehicle
+            cells.add(place)
     hosts: dict[str, tuple[int, int]] = {}
     for table in newest_first:
         hosts.update((name, max(said, hosts.get(name, said))) for name, said in table.hosts.items())
     entries: dict[tuple[str, int], dict[str, list[Number]]] = {}
-    for number, vehicle in (each for each, count in votes.items() if count > 1):
+    for number, vehicle in (each for each in listed if kept.get(each[0]) == each[1]):
         host = agent_of(vehicle)
         of = [each[number][1] for each in lists if each.get(number, ("", 0))[0] == vehicle]
-        # The earliest that may use it. Before a table counts one, the next that does takes the run's first entries.
-        generation = min(filter(None, of), default=hosts.get(host, BEFORE_ALL)[0])
+        # The latest has it by an honest member's word that those before have ended: to fence it for an earlier one
+        # would free the cell under the vehicle. Generation 0 is the run's start.
+        generation = max(of) or hosts.get(host, BEFORE_ALL)[0]
         entries.setdefault((host, generation), {}).setdefault(vehicle, []).append(number)
     grants: dict[str, Held] = {}
     fences: list[Fence] = []
@@ -79,7 +88,6 @@ class _Host:
                  takes
     there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on
     ended        generations that have ended
-    recent       its last statements, the oldest first
     told         the last word to it, and its time
     """
 
@@ -88,13 +96,11 @@ class _Host:
     generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     there: set[tuple[str, int]] = field(default_factory=set)
     ended: set[int] = field(default_factory=set)
-    recent: deque[HostState] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     told: object = None
     told_ns: int = 0
 
     def hear(self, standing: HostState, now_ns: int) -> None:
         self.spoke_ns = now_ns
-        self.recent.append(standing)
         self.ended.update(standing.dead)
         if standing.ended:
             self.ended.add(standing.generation)
@@ -125,20 +131,6 @@ class _Host:
             (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
         )
 
-    def mentions(self, number: Number, vehicle: str) -> bool:
-        """Returns True if this host requested the cell of an entry lately, or said of the entry that a vehicle
-        holds it, or that none ever takes it."""
-        cell = number[0]
-        return any(
-            number in said.never
-            or any(
-                stand.vehicle == vehicle
-                and (cell in stand.ahead or cell in stand.wants or cell == stand.cell or number in stand.holds)
-                for stand in said.vehicles
-            )
-            for said in reversed(self.recent)
-        )
-
 
 class Witness:
     """Knowledge of one member about a shard.
@@ -160,7 +152,7 @@ class Witness:
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
-        what it adds was requested by its host and comes after all that remains in its cell, and it counts no
+        what it adds is for a host that has spoken and comes after all that remains in its cell, and it counts no
         statement that was not made. Hosts of which a statement is missed are asked for it by the next words."""
         was, lists = _listed(old), _listed(new)
         if was is None or lists is None:
@@ -184,15 +176,12 @@ class Witness:
             elif not self._hosts[host].is_over(number, generation):
                 self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
-        held = {(number[0], vehicle) for number, (vehicle, _) in was.items()} if added else set()
-        for number, (vehicle, _) in added:
+        for _, (vehicle, _) in added:
             host = agent_of(vehicle)
             if vehicle not in self._fleets.get(host, (vehicle,)):
                 return False
-            if (number[0], vehicle) not in held and not (
-                host in self._hosts and self._hosts[host].mentions(number, vehicle)
-            ):
-                self._lacks.setdefault(host, []).append(number)
+            if host not in self._hosts or self._hosts[host].newest == BEFORE_ALL:
+                self._lacks.setdefault(host, [])  # not which cells it requested: it gives others back by itself
         if added and exceeds_externals(new, self._fleets):
             return False
         ordered = all(
@@ -226,7 +215,9 @@ class Witness:
         they are new or a heartbeat old."""
         if self._of is not stored or self._orders is None:
             self._of, self._orders = stored, Orders(stored)
-        for name in [name for name, host in self._hosts.items() if not host.recent and name not in self._lacks]:
+        for name in [
+            name for name, host in self._hosts.items() if host.newest == BEFORE_ALL and name not in self._lacks
+        ]:
             del self._hosts[name]  # a liar may name as many as it likes
         for name in self._lacks:
             self._hosts.setdefault(name, _Host(now_ns - SILENT_NS - 1))
