@@ -12,9 +12,6 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-from rich.console import Console
-from rich.text import Text
-
 from swarm.errors import require
 
 require(__name__, "numpy")
@@ -57,6 +54,9 @@ def counted(findings: Sequence[Finding], level: Level) -> str:
 def answer(found: Sequence[Finding], as_json: bool, facts: dict[str, Any], summary: str = "") -> int:
     """Prints a line for each finding, and a last one: how many are wrong, or `summary` where none is a failure.
     As JSON it has the facts, too. Returns the exit code."""
+    from rich.console import Console  # a bare install has none
+    from rich.text import Text
+
     failed = any(finding.level == "failure" for finding in found)
     if as_json:
         told = {**facts, "ok": not failed, "findings": [finding._asdict() for finding in found]}
