@@ -12,7 +12,7 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.holdings import Tell, part_of
-from swarm.wire.messages.traffic import Granted, HostState, Left, Number, Stored, Table, Word
+from swarm.wire.messages.traffic import Granted, Held, HostState, Left, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import AskPromises
 from vehicle_agent.traffic.right_of_way_core import Action
@@ -91,7 +91,7 @@ class Thief(Process):
         vehicle = self.chance.choice((f"{self.agent}-00", f"{self.agent}-77", "ghost-00", *table.grants))
         more = self.chance.sample(free, min(self.chance.choice((1, 2, 20)), len(free)))
         path = [*table.grants.get(vehicle, ()), *((cell, table.epoch, table.seq) for cell in more)]
-        return replace(table, grants={**table.grants, vehicle: path}) if path else table
+        return replace(table, grants={**table.grants, vehicle: Held.of(path)}) if path else table
 
     def dropped_from(self, table: Table) -> Table:
         """Some vehicles have no entry."""
@@ -106,7 +106,7 @@ class Thief(Process):
         if self.chance.random() < 0.5:
             return replace(table, grants={**table.grants, one: table.grants[other], other: table.grants[one]})
         early = [(cell, epoch, max(seq - 1, 0)) for cell, epoch, seq in table.grants[one]]
-        return replace(table, grants={**table.grants, one: early})
+        return replace(table, grants={**table.grants, one: Held.of(early)})
 
     def replayed(self, table: Table) -> Table:
         """An earlier table of its own, under a new number."""
@@ -120,7 +120,7 @@ class Thief(Process):
         if self.chance.random() < 0.3:
             return replace(standing, dead=[standing.generation, 1], ended=self.chance.random() < 0.5)
         stolen = [number for number in self.world.entries() if self.world.shards.of(number[0]) == standing.shard]
-        stands = [replace(stand, holds=[*stand.holds, *stolen][:16]) for stand in standing.vehicles]
+        stands = [replace(stand, holds=Held.of([*stand.holds, *stolen][:16])) for stand in standing.vehicles]
         return replace(standing, vehicles=stands, never=stolen[:8], knows=(1 << 20, 1))
 
     def stolen_from(self, table: Table) -> Table:
@@ -128,7 +128,7 @@ class Thief(Process):
         shards, free = self.world.shards, Orders(table)
         thefts: list[tuple[str, Number]] = []
         for vehicle, path in table.grants.items():
-            for cell in self.world.next_to(path[-1][0]):
+            for cell in self.world.next_to([*path.cells][-1]):
                 order = list(free.order(cell).items())
                 thefts += [
                     (vehicle, number)
@@ -149,12 +149,12 @@ class Thief(Process):
         first = (stolen[0], 0, 0) if how == 0 else (stolen[0], table.epoch, table.seq)  # before it, or after it
         grants[vehicle] = [*grants[vehicle], first]
         assert shards.of(stolen[0]) == table.shard
-        return replace(table, grants={id: path for id, path in grants.items() if path}, hosts=hosts)
+        return replace(table, grants={id: Held.of(path) for id, path in grants.items() if path}, hosts=hosts)
 
     def any_of(self, word: Word) -> list[Number]:
         """Entries of a host that it may not have heard of yet."""
         grants = self.rights._members[word.shard].stored.grants.items()
-        return [path[-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
+        return [[*path][-1] for vehicle, path in grants if agent_of(vehicle) == word.host]
 
     def tell(self, table: Table) -> None:
         """Different members and hosts are told different tables of one number, each with the words that go with
@@ -173,9 +173,9 @@ class Thief(Process):
 
     def words(self, table: Table, host: str) -> Iterator[Granted | Word]:
         """A grant by a table, sometimes without those before; and the word for it."""
-        grants, generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
+        (grants, waits), generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
         if self.chance.random() < 0.2:
-            grants = {id: [replace(entry, after=[]) for entry in entries] for id, entries in grants.items()}
+            waits = {}
         stamp = {"epoch": table.epoch, "seq": table.seq}
         yield Granted(
             shard=table.shard,
@@ -184,9 +184,10 @@ class Thief(Process):
             generation=generation,
             heard=1 << 30,
             grants=grants,
+            waits=waits,
             **stamp,
         )
-        part = part_of(generation, grants)
+        part = part_of(generation, grants, waits)
         yield Word(shard=table.shard, host=host, agent=self.agent, part=part, **stamp)
 
 
@@ -226,7 +227,7 @@ class ThiefWorld(TrafficWorld):
     def entries(self) -> list[Number]:
         """Some entries that members have on file."""
         paths = [path for table in self.files() for path in table.grants.values()]
-        return [self.chance.choice(path) for path in self.chance.sample(paths, min(4, len(paths)))]
+        return [self.chance.choice([*path]) for path in self.chance.sample(paths, min(4, len(paths)))]
 
     def files(self) -> list[Table]:
         """The tables on files of members."""
