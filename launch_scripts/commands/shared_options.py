@@ -59,8 +59,8 @@ PortOption = Annotated[
     int | None,
     typer.Option(
         min=0,
-        max=HIGHEST_PORT - 2,
-        help="Router on this port, live view on the next two; 0 picks free ones.",
+        max=HIGHEST_PORT - 1,
+        help="Router on this port, live view on the next; 0 picks free ones.",
     ),
 ]
 PresetOption = Annotated[

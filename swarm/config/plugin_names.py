@@ -21,7 +21,7 @@ from swarm.errors import ConfigError
 class PluginKind:
     """Kind of a plug-in: its name, and the consequence for a process whose plug-in fails.
 
-    name      as `swarm plugin` takes it
+    name      in messages
     role      the role that calls it; every role builds the map, if it is not prepared
     built_in  names of the kind's own table
     method    what a plug-in is asked for, as its `Protocol` names it
