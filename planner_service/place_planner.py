@@ -107,7 +107,7 @@ class _Slice(NamedTuple):
     """Work done on a question.
 
     changed   windows of the map that have changed
-    outdone   vehicles whose routes may cost more than another, as some cell costs less than before
+    outdone   vehicles which may have a cheaper route now, because some cell became cheaper
     """
 
     grown: int

@@ -1,4 +1,4 @@
-"""Right of way on the bus: messages to calls of its core, and what that decides to the bus and to the file."""
+"""Connects the core of right of way to the bus and the file: messages become calls, decisions become messages."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWa
 
 
 class OwnTime:
-    """A clock that counts of the time between two ticks one period at most.
+    """A clock that counts at most one period between two ticks.
 
     A process that comes late to its ticks has not heard the others meanwhile, so it cannot say that they were
     silent; and where one is late, for want of processors, the others are. By wall time, on a machine on which ticks
     come seconds apart, every lease had expired at each tick: leaders were replaced before they could grant, for
-    ever. On time it is the time of the wall. Nothing that is safe hangs on it.
+    ever. With punctual ticks it equals wall time. Safety does not depend on it.
 
     period_ns  of ticks
     """
@@ -313,7 +313,7 @@ class RightOfWaySync:
                     self._perform([action])
 
     def _tell_members(self, topic: Topic, message: Table | Stored) -> None:
-        """Reports the other members of a shard, each by itself."""
+        """Sends a message to each other member of the shard."""
         for member in self.core.shards.members(message.shard):
             if member != self._id:
                 self._bus.publish(topic, message, shard=message.shard, member=member, agent=self._id)

@@ -115,7 +115,7 @@ class Recorder:
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
 
     def _capture(self, note: Note, now_ns: int) -> None:
-        """Also of untracked targets: the process that moves them publishes each capture."""
+        """Records captures, even of untracked targets: the process that moves them publishes each."""
         cell = note.cell
         if note.target is None or cell is None or cell >= self.grid.cells:
             return
@@ -174,8 +174,8 @@ class Recorder:
         startup_s: float | None = None,
         failures: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """The numbers of the run, None where not measured, and the verdict in a sentence. The caller gives what it
-        knows better, such as failures of processes."""
+        """The numbers of the run, None where not measured, and the verdict in a sentence. The caller passes what
+        only it knows, such as failures of processes."""
         observed = self.observed
         if seconds is None and observed.first_ns is not None and observed.last_ns is not None:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S

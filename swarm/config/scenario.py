@@ -208,7 +208,7 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         each shard at each tick: few agents on a large map need larger shards. Equal for all
                         processes of a run
     digest_s            interval at which each replica publishes which sets it holds
-    author_marks_per_s  a process which changes more cells for ten seconds is named, and its sets are delayed
+    author_marks_per_s  a process above this for ten seconds raises an alarm, and its sets are delayed
     total_marks_per_s   the same for all processes together: the sets of those above an equal share are delayed
     learning            true: vehicles measure their speed on each kind of ground, and all processes correct its
                         prior pace
@@ -247,8 +247,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     connect            endpoints of the routers to which other processes connect
     peers              endpoints of other routers to which a router connects
     lease_s            a peer which is silent for this time counts as dead
-    connect_timeout_s  time without a router after which a tool ends, or a process whose router listens but does not
-                       answer; while no router listens, processes wait
+    connect_timeout_s  a command without a router ends after this time; so does a process whose router does not
+                       answer. If none listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates which a router admits, beside those of the scenario's processes:
                        router.north, keeper.east, operator.anna, rover.all.r1

@@ -41,7 +41,7 @@ class AirConfig(Section, frozen=True, kw_only=True):
 
     speed_m_per_s    speed in level flight through the air; the wind changes it over the ground
     clearance_m      least height over the highest ground of a cell and its eight neighbours
-    climb_m_per_s    each metre of climb takes 1 / climb_m_per_s longer
+    climb_m_per_s    each metre of climb adds 1 / climb_m_per_s seconds
     descent_m_per_s  the same for a metre of descent
     grade            steepest rise and fall of the surface, metres per metre; default: by the relief
     no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and hidden hazards have no

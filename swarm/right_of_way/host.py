@@ -64,8 +64,8 @@ class Host:
         return all(len(self._told_by.intersection(of)) > len(of) + enough for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
-        """Begins a new generation, once those who could be asked have answered. Returns those to keep on file;
-        nothing may be said before they are.
+        """Begins a new generation, once those who could be asked have answered. Returns the generations to keep
+        on file; nothing may be said before they are there.
 
         dead    our generations that are on the file which this process has locked: they have ended
         chance  a random number

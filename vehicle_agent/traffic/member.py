@@ -234,7 +234,8 @@ class Member:
         return self.on_file
 
     def _accepts(self, table: Table) -> bool:
-        """Returns True if a leader's table may replace ours. One liar is borne: once it is known, no other lies."""
+        """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are
+        trusted."""
         if table.without in self._distrusted and table.agent not in self._distrusted:
             return True
         return self._witness is None or self._witness.accepts(self.stored, table)

@@ -39,7 +39,7 @@ def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
 
 
 def agreed(tables: Collection[Table]) -> Table:
-    """Returns what at least two of three tables list, where no member with one is a liar. The newest statements
+    """Returns the entries on at least two of three honest members' tables. The newest statements
     count. An entry that a majority had on file is on two of them, or over by its host's word, or its vehicle began
     in the cell again by a later one."""
     newest_first = sorted(tables, key=lambda table: table.stamp, reverse=True)

@@ -211,7 +211,7 @@ EXAMPLE = IncomingSettings(
 
 
 class Settings(Section, frozen=True, kw_only=True):
-    """Settings of `swarm gateway ros2`. Each key has a default, so an empty file is valid.
+    """Settings of `swarm gateway ros2`. An empty file is valid.
 
     vehicles  ids of vehicles which ROS receives, with * and ?
     forward   names of forwarded topics of the table; empty: all

@@ -133,7 +133,7 @@ def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
 
 
 def _started_ns(author: str) -> int:
-    """Start of the process which an author's name states, ns; 0 of a name without it.
+    """Start time (ns) in an author's name; 0 if it has none.
 
     The simulated vehicle of a process which has ended stays where it is until the next process of its name starts,
     and is nowhere until that one has a place for it. Others may drive over the cell meanwhile.
@@ -341,7 +341,7 @@ class ObstacleReferee:
 
     @property
     def covered(self) -> Container[int]:
-        """The cells on which an obstacle was lately; goes on being them."""
+        """The cells on which an obstacle was lately: a live view."""
         return self._covers
 
     def check(self, stay: Stay) -> Iterator[ObstacleHit]:

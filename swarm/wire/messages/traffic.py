@@ -33,8 +33,8 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
     """Entries of one vehicle in driving order, in few bytes: along a route neighbouring ones differ little.
 
     first   cell of the first entry; 0 if there is none
-    turns   the steps from cell to cell, the first as it is and each other one less the step before it: a straight
-            way is zeros
+    turns   differences between successive steps from cell to cell, after the first step itself: zeros on a
+            straight path
     stamps  (epoch, seq, count): the tables which added the entries, each with the number of entries in turn
     """
 
@@ -199,7 +199,7 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     waits              vehicle of the host -> those of its entries that wait for others
     followed           host -> entries of this one behind which its vehicles wait
     pushed             vehicle of the host -> the age with which it is to make way into another shard
-    occupied           of the cells around where vehicles of the host end, those that others hold
+    occupied           cells held by others near the ends of this host's paths
     """
 
     shard: Shard
