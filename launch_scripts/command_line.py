@@ -236,39 +236,38 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         finally:
             sys.stdout.flush()
     except TyperException as error:
-        if said := _sentence(error):
-            print(f"swarm: {said}", file=sys.stderr)
-        return ConfigError.exit_code
+        said = _sentence(error)
+        return _refused(said, ConfigError.exit_code) if said else ConfigError.exit_code
     except typer.Abort:
-        print("swarm: stopped; nothing is written", file=sys.stderr)
-        return 1
+        return _refused("stopped; nothing is written", 1)
     except SwarmError as error:
-        said = "\n".join(map(plain, str(error).split("\n")))
-        print(f"swarm: {said}", file=sys.stderr)
-        return error.exit_code
+        return _refused("\n".join(map(plain, str(error).split("\n"))), error.exit_code)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRAS:
             raise  # a fault of ours
-        print(f"swarm: this needs {missing(package)}", file=sys.stderr)
-        return ConfigError.exit_code
+        return _refused(f"this needs {missing(package)}", ConfigError.exit_code)
     except BrokenPipeError:
         discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
         return 0
     except OSError as error:
         if error.errno in _NO_PATHS and error.filename is not None:
-            print(f"swarm: {quoted(str(error.filename))}: {error.strerror}", file=sys.stderr)
-            return ConfigError.exit_code
+            return _refused(f"{quoted(str(error.filename))}: {error.strerror}", ConfigError.exit_code)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
             raise
         discard_output(1)
-        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
-        return StoreError.exit_code
+        return _refused(f"cannot write the output: {error.strerror}", StoreError.exit_code)
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
         print("swarm: stopped", file=sys.stderr)
     return code if isinstance(code, int) else 0
+
+
+def _refused(sentence: str, code: int) -> int:
+    """Prints a sentence to standard error, and returns the exit code."""
+    print(f"swarm: {sentence}", file=sys.stderr)
+    return code
 
 
 def _sentence(error: TyperException) -> str:

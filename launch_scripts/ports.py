@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+from itertools import combinations
 
 from swarm.bus.endpoints import host_port
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError
+from swarm.errors import BusError, ConfigError
 
 
 def free_ports(count: int) -> list[int]:
@@ -25,19 +26,32 @@ def page_of(port: int) -> str:
     return f"http://127.0.0.1:{port}/"
 
 
-def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
-    """Raises BusError if a port that this machine needs is taken."""
-    wanted: list[tuple[str, str, int]] = []
-    if "router" in roles:
-        wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
+def check_ports(scenario: Scenario, roles: tuple[str, ...], metrics: tuple[str, int] = ("", 0)) -> None:
+    """Compares the ports of all services which a run opens on this machine. Raises ConfigError if two of them have
+    one port, and BusError if a port is taken.
+
+    metrics  address and port of the metrics; 0: none, or any free one
+    """
+    listen = scenario.network.listen if "router" in roles else ()
+    wanted = [("the router (network.listen)", *host_port(endpoint)) for endpoint in listen]
     if "monitor" in roles and scenario.monitor.live:
-        wanted += [("the live view", "127.0.0.1", scenario.monitor.web_port)]
+        wanted.append(("the live view (monitor.web_port)", "127.0.0.1", scenario.monitor.web_port))
+    wanted.append(("the metrics (--metrics-port)", *metrics))
+    for (who, host, port), (other, its_host, its_port) in combinations(wanted, 2):
+        if port and port == its_port and _overlap(host, its_host):
+            raise ConfigError(f"port {port} is that of {who} and of {other}; expected another for one of them")
     for who, host, port in wanted:
         if port and _taken(host, port):
             raise BusError(
                 f"port {port}, which {who} needs, is taken; choose others with --port N (N and N+1 are used), "
                 "or let --port 0 pick free ones"
             )
+
+
+def _overlap(*hosts: str) -> bool:
+    """Returns True if two services cannot have the same port at these two hosts."""
+    one, other = ("127.0.0.1" if host == "localhost" else host for host in hosts)
+    return one == other or "::" in hosts or ("0.0.0.0" in hosts and ":" not in one + other)
 
 
 def _taken(host: str, port: int) -> bool:

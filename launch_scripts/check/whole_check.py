@@ -55,8 +55,8 @@ def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator
     yield from scenario_check.plugins(scenario)
     try:
         check_ports(scenario, ROLES)
-    except BusError as error:  # it may be free when the run starts
-        yield warning("", str(error))
+    except SwarmError as error:  # a port which is taken may be free when the run starts
+        yield (warning if isinstance(error, BusError) else failure)("", str(error))
     broken = [*scenario_check.files_named(scenario), *scenario_check.places_counted(scenario)]
     yield from broken
     if broken:

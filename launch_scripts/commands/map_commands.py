@@ -17,7 +17,7 @@ from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.report.exporter import FORMATS, check_target, write_layers, write_raster
+from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 app = family_app("Look at shared maps and the keeper's store.")
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
-_TEXT = (".json",)
-_PIXELS = (".tif", ".tiff")
 _TIMEOUT_S = 2.0
 """A process without a reply for this time counts as ended (`network.lease_s`), and a keeper replies from memory."""
 
@@ -121,30 +119,24 @@ def export(store: Store, out: Path) -> None:
     out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
     terrain, grid, sets = _read(store)
-    check_target(out, "OUT", *_TEXT, *_PIXELS, *FORMATS)
-    ending, shown = out.suffix.lower(), sets
-    left_out = ""
-    if ending not in _TEXT:
-        # Pixels and polygons show the winners among the marks for all vehicles.
-        shown = [each for each in sets if each.tile < grid.tiles]
-        own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
-        left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
-    if ending in _TEXT:
+    check_target(out, "OUT", ".json", *TIFF, *AREAS)
+    ending = out.suffix.lower()
+    marks, words = _parted(grid, sets)
+    more = f", and what {len(words)} authors have learned" if words else ""
+    if ending == ".json":
         with KeeperStore(store, read_only=True) as kept:
             classes = kept.classes
         write_file(out, stored_marks.to_json(terrain, grid, sets, classes).encode())
-    elif ending in _PIXELS:
-        _write_tiff(out, terrain, grid, sets)
-    else:
-        pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
-        write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
-    print(f"{out}: {_counted(grid, shown)}{left_out}")
-
-
-def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
-    marks, words = _parted(grid, sets)
-    text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
-    return f"{text}, and what {len(words)} authors have learned" if words else text
+    else:  # pixels and polygons show the winners among the marks for all vehicles
+        own = sum(len(each.kinds) for each in marks if each.tile > grid.tiles)
+        more = f"; {own} marks for one class alone are left out, .json has them" if own else ""
+        marks = [each for each in marks if each.tile < grid.tiles]
+        if ending in TIFF:
+            _write_tiff(out, terrain, grid, sets)
+        else:
+            pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+            write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
+    print(f"{out}: {sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets{more}")
 
 
 @command(app)

@@ -19,7 +19,7 @@ from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.exporter import FORMATS, check_target, write_raster
+from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
@@ -35,7 +35,6 @@ app = family_app("""Look at terrains: what a file holds, what it costs, what a p
     Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
     """)
 console = Console()
-_TIFF = (".tif", ".tiff")
 
 Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
 Metres = Annotated[
@@ -144,7 +143,7 @@ def cost(
     """
     from shared_map.vehicle_class_grounds import class_terrains
 
-    check_target(out, "--out", *_TIFF)
+    check_target(out, "--out", *TIFF)
     check_target(picture, "--picture", ".png")
     loaded = find_scenario(scenario, preset)
     with progress() as tell:
@@ -195,8 +194,8 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    check_target(out, "--out", *_TIFF)
-    check_target(photo, "--photo", *_TIFF)
+    check_target(out, "--out", *TIFF)
+    check_target(photo, "--photo", *TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source="synthetic",
@@ -247,7 +246,7 @@ def reach(
     """
     from launch_scripts.commands import terrain_routes
 
-    check_target(out, "--out", *_TIFF, *(ending for ending in FORMATS if ending != ".gpx"))
+    check_target(out, "--out", *TIFF, *AREAS)
     if start is None:
         found = terrain_routes.reach(terrain, to, preset)
     else:
@@ -291,7 +290,7 @@ def classify(
     labels     Learn from these labels (TOML), and compare with them.
     out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
     """
-    check_target(out, "--out", *_TIFF)
+    check_target(out, "--out", *TIFF)
     check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source=str(elevation),

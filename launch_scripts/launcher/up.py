@@ -81,7 +81,7 @@ def run_swarm(options: UpOptions) -> int:
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
     if not options.joins and not options.takes_over:
-        check_ports(options.scenario, options.roles)
+        check_ports(options.scenario, options.roles, (options.signals_address, options.metrics_port or 0))
     run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))

@@ -98,6 +98,10 @@ FORMATS: Mapping[str, Format] = {
     ".csv": Format("", degrees=True, local=True, many=False),
 }
 """Ending -> format of layers."""
+AREAS = tuple(ending for ending in FORMATS if ending != ".gpx")
+"""Endings of the formats which have areas."""
+TIFF = (".tif", ".tiff")
+"""Endings of rasters (`write_raster`)."""
 
 
 def check_target(path: Path | None, option: str, *endings: str) -> None:
@@ -128,8 +132,8 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     placed = frame.grid.crs != "local"
     if not placed and not form.local:
         raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
-    if form.driver == "GPX" and any(layer.shape == "Polygon" for layer in layers):
-        raise ConfigError(f"--out {path}: GPX has no areas; write .geojson, .gpkg or .kml")
+    if path.suffix.lower() not in AREAS and any(layer.shape == "Polygon" for layer in layers):
+        raise ConfigError(f"--out {path}: {form.driver} has no areas; write {' or '.join(AREAS)}")
     with replacing(path) as half:
         if not form.driver:
             _write_csv(half, layers[0], frame)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
 from launch_scripts.report.exporter import (
+    AREAS,
     COSTS,
     FORMATS,
     TIMED,
@@ -171,7 +172,7 @@ def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None,
     """
     tracks = tracks_of_run(folder)
     groups = groups_of(read_report(folder)) if (folder / REPORT_FILE).exists() else {}
-    names = what or [name for name in WHAT if (format, name) != ("gpx", "marks")]
+    names = what or [name for name in WHAT if name != "marks" or f".{format}" in AREAS]
     layers = [layer for name in WHAT if name in names for layer in WHAT[name](tracks, groups)]
     frame, run = MapFrame(tracks.grid), folder.resolve().name
     if FORMATS[f".{format}"].many:

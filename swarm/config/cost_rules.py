@@ -24,21 +24,23 @@ PRESETS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
 """Every preset, by name: settings of `[cost]`, as a scenario would give them."""
 
 
-def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a scenario, with those of its preset where it gives none itself.
+def whole_cost(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a cost: common ones, then those of its preset, then its own.
 
-    A value that is not a preset is left to the check of types.
+    A value that is not of its type is left to the check of types.
     """
-    cost = raw.get("cost")
-    name = cost.get("preset") if isinstance(cost, dict) else None
-    row = PRESETS.get(name) if isinstance(name, str) else None
-    if not isinstance(cost, dict) or row is None:
-        return raw
-    settings = {**row, **cost}
-    factors = row.get("class_factor")
-    if factors is not None and isinstance(cost.get("class_factor"), dict):
-        settings["class_factor"] = {**factors, **cost["class_factor"]}
-    return {**raw, "cost": settings}
+    name = own.get("preset")
+    preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
+    named = {**preset, **own}
+    changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
+    tables = {"slope_table", "slope_csv"}
+    left_out = tables if changes_rule or tables & named.keys() else set()
+    below = {key: value for key, value in common.items() if key not in left_out}
+    cost = {**below, **named}
+    factors = [each.get("class_factor") for each in (common, preset, own)]
+    if any(isinstance(each, dict) for each in factors) and all(isinstance(each, dict | None) for each in factors):
+        cost["class_factor"] = {key: value for each in factors for key, value in (each or {}).items()}
+    return cost
 
 
 def cost_of_preset(name: str | None) -> CostConfig:
@@ -47,7 +49,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
         return CostConfig()
     if name not in PRESETS:
         raise ConfigError(f"no preset {quoted(name)}{nearest(name, list(PRESETS))}; there are {', '.join(PRESETS)}")
-    return msgspec.convert(with_preset({"cost": {"preset": name}})["cost"], CostConfig)
+    return msgspec.convert(whole_cost({}, {"preset": name}), CostConfig)
 
 
 # --- slope tables -------------------------------------------------------------------------------------------

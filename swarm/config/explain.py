@@ -12,13 +12,14 @@ import re
 import types
 import typing
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal
 
 import msgspec
 
 from swarm.config.input_files import quoted
+from swarm.errors import ConfigError
 
 # --- what a setting means and may be ------------------------------------------------------------------------------
 
@@ -138,10 +139,32 @@ _UNITS: tuple[tuple[str, dict[str, float]], ...] = (
     ("", {}),
 )
 """Suffix of a key -> units that a user may write after its number, in its own unit."""
-_MEANT = dict.fromkeys(
-    ("vehicles.count", "vehicles.number", "vehicles.vehicles"),
-    "how many vehicles there are is `vehicles` of [[groups]]",
-)
+_REMOVED = "it was removed after version 0.2:"
+_MEANT = {
+    r"vehicles\.(count|number|vehicles)": "how many vehicles there are is `vehicles` of [[groups]]",
+    r"map\.plot_regions": "it is shard_regions now",
+    r"targets\.body_radius_m": "it is obstacle_radius_m now",
+    r"monitor\.grpc_port": f"{_REMOVED} native viewers use web_port; leave it out",
+    r"cost\.(cross_slope_factor|critical_slope_percent)": f"{_REMOVED} no cost depends on it now; leave it out",
+    r"cost\.rough_per_m": f"{_REMOVED} roughness costs nothing; leave it out, or write a cost layer",
+    r"cost\.slope_rule = '(herzog\w*|minetti)'": f"{_REMOVED} give its curve as 'table', or use another rule",
+    r"terrain\.elevation_encoding = 'terr(ain-rgb|arium)'": f"{_REMOVED} convert tiles to heights; leave it out",
+}
+"""End of a key, or of a key and its value, as a pattern -> what to write instead."""
+
+
+def complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
+    """The sentence with which a check refuses what it is given, if it does."""
+    try:
+        check(*of)
+    except ConfigError as error:
+        yield str(error)
+
+
+def _meant(found: str) -> str:
+    """Returns the advice on a key, or on a key and its value, after "; "; empty if there is none."""
+    path = re.sub(r"\[\d+\]", "", found)
+    return next((f"; {advice}" for end, advice in _MEANT.items() if re.search(rf"(^|\.)({end})\Z", path)), "")
 
 
 def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario") -> str:
@@ -241,8 +264,8 @@ def _unknown(key: str, name: str, section: Any, root: type) -> str:
     where = f"{name}.{key}" if name else key
     if len(key) > 60:
         return f"unknown key {name + '.' if name else ''}{key[:57]}...; {_allowed_here(allowed)}"
-    if where in _MEANT:
-        return f"unknown key {where}; {_MEANT[where]}"
+    if advice := _meant(where):
+        return f"unknown key {where}{advice}"
     near = nearest(key, allowed)
     elsewhere = [place for place, other in _places(root) if other is not section and _holds(other, key)]
     if elsewhere and not difflib.get_close_matches(key, allowed, n=1, cutoff=0.75):
@@ -289,7 +312,8 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
         shape = f"{key} = [{item}]" if typing.get_args(kind)[-1] is Ellipsis else expected(hint)
         return f"{name}: found {quoted(value)}, expected a list: {shape}"
     if typing.get_origin(kind) is Literal:
-        return f"{name}: found {quoted(value)}{choice(str(value), list(map(str, typing.get_args(kind))))}"
+        allowed = list(map(str, typing.get_args(kind)))
+        return f"{name}: found {quoted(value)}{_meant(f'{name} = {value!r}') or choice(str(value), allowed)}"
     if typing.get_origin(kind) is dict and isinstance(value, dict):
         return f"{name}: found the key {_refused_key(value, typing.get_args(kind)[0])}"
     found = "" if isinstance(value, dict | list) and value else f" found {quoted(value)},"

@@ -5,21 +5,21 @@ from __future__ import annotations
 import copy
 import ipaddress
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
-from swarm.config.explain import choice, doubled, explain, located, nearest
+from swarm.config.cost_rules import check_cost, with_slope_csv
+from swarm.config.explain import choice, complaint, doubled, explain, located, nearest
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
-from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
+from swarm.config.scenario import Scenario, TlsConfig, ids_of
 from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
-from swarm.config.vehicle_classes import aloft_classes, class_faults, with_class_costs
+from swarm.config.vehicle_classes import aloft_classes, class_faults, complete_costs
 from swarm.errors import ConfigError
 from swarm.liveness import split_rank
 from swarm.places import read_place
@@ -60,8 +60,8 @@ def read_scenario(
     settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
     try:
-        raw = with_settings(parse_toml(text, source, ConfigError), settings or {}, source)
-        raw = with_class_costs(with_preset(_renamed(raw)))
+        raw = _of_today(parse_toml(text, source, ConfigError))
+        raw = complete_costs(with_settings(raw, settings or {}, source))
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []
@@ -95,25 +95,42 @@ def read_scenario(
     return scenario if base is None else anchored(scenario, base), faults
 
 
-_RENAMED: dict[str, dict[str, str | None]] = {
-    "map": {"plot_regions": "shard_regions"},
-    "targets": {"body_radius_m": "obstacle_radius_m"},
-    "monitor": {"grpc_port": None},
+_FORMER: dict[str, str | tuple[object, ...]] = {
+    "map.plot_regions": "shard_regions",
+    "targets.body_radius_m": "obstacle_radius_m",
+    "monitor.grpc_port": (),
+    "cost.critical_slope_percent": (),
+    "cost.rough_per_m": (0.0,),
 }
-"""Section -> keys of the version before -> their names since, None if they have no effect any more. They are
-accepted for one version."""
+"""Keys of version 0.2, which wrote all of them into the scenarios of runs and kits -> the name since, or the values
+with which a removed key has no effect; (): any. They are read for one version. Other values are unknown keys."""
+_SIDE_SLOPES = {"wheeled": 2.0, "tracked": 1.5}
+"""Presets of version 0.2 -> their `cost.cross_slope_factor`. These presets have none now."""
 
 
-def _renamed(raw: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a scenario under their names of today."""
-    for section, names in _RENAMED.items():
-        found = raw.get(section)
-        for table in found if isinstance(found, list) else [found]:
-            for old, new in names.items():
-                if isinstance(table, dict) and old in table and new not in table:
-                    value = table.pop(old)
-                    table.update({} if new is None else {new: value})
+def _of_today(raw: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a file under their names of today, without removed ones that have no effect."""
+    tables = [(path.removeprefix("classes."), table) for path, table in _tables(raw, "")]
+    presets = [table.get("preset") for path, table in tables if path == "cost."]
+    factors = (factor for preset, factor in _SIDE_SLOPES.items() if preset in presets)
+    former = _FORMER | {"cost.cross_slope_factor": (1.0, *factors)}
+    for path, table in tables:
+        for key, value in list(table.items()):
+            match former.get(path + key):
+                case str(new) if new not in table:
+                    table[new] = table.pop(key)
+                case tuple(neutral) if not neutral or value in neutral:
+                    del table[key]
     return raw
+
+
+def _tables(table: dict[str, Any], path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Returns a table and all tables in it, each after the keys that lead there: "classes.cost."."""
+    yield path, table
+    for key, value in table.items():
+        for each in value if isinstance(value, list) else [value]:
+            if isinstance(each, dict):
+                yield from _tables(each, f"{path}{key}.")
 
 
 def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:
@@ -152,20 +169,20 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
             yield f"{source}: targets: {id!r} is what a standby of another target is called; rename it"
     for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
         for n, zone in enumerate(section.zones):
-            yield from _complaint(_check_zone, zone, f"{source}: {key}.zones[{n}]")
+            yield from complaint(_check_zone, zone, f"{source}: {key}.zones[{n}]")
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
-            yield from _complaint(read_place, target.start, f"{source}: targets[{n}].start")
+            yield from complaint(read_place, target.start, f"{source}: targets[{n}].start")
     for n, group in enumerate(scenario.groups):
         for place in group.cells:
-            yield from _complaint(read_place, place, f"{source}: groups[{n}].cells")
+            yield from complaint(read_place, place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
-        yield from _complaint(check_name, plugin, source)
-    yield from _complaint(check_cost, scenario.cost, source)
-    if scenario.cost.directional:
-        yield from _complaint(_check_climbs, scenario.planner, "cost.directional = true", source)
-    elif aloft := aloft_classes(scenario):
-        yield from _complaint(_check_climbs, scenario.planner, f"class {aloft[0]}, which flies", source)
+        yield from complaint(check_name, plugin, source)
+    yield from complaint(check_cost, scenario.cost, source)
+    aloft = [f"class {name}, which flies" for name in aloft_classes(scenario)]
+    climbs = ["cost.directional = true"] * scenario.cost.directional + aloft
+    if climbs and (weight := scenario.planner.length_weight):
+        yield f"{source}: planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
     yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)
     marked = scenario.monitor.show_target
@@ -175,15 +192,7 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             has_tls = scenario.network.tls is not None
-            yield from _complaint(check_endpoint, endpoint, has_tls, f"{source}: network.{key}")
-
-
-def _complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
-    """The sentence with which a check refuses what it is given, if it does."""
-    try:
-        check(*of)
-    except ConfigError as error:
-        yield str(error)
+            yield from complaint(check_endpoint, endpoint, has_tls, f"{source}: network.{key}")
 
 
 def _group_faults(scenario: Scenario, source: str) -> Iterator[str]:
@@ -227,13 +236,6 @@ def _check_zone(zone: ZoneConfig, where: str) -> None:
     for kind, key in _VALUES.items():
         if getattr(zone, key) is not None and zone.kind != kind:
             raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
-
-
-def _check_climbs(planner: PlannerConfig, why: str, source: str) -> None:
-    if planner.length_weight:
-        raise ConfigError(
-            f"{source}: planner.length_weight: {planner.length_weight:g} does not go with {why}; leave it out"
-        )
 
 
 def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
@@ -335,31 +337,24 @@ def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: s
     return changed
 
 
-def _set(at: dict[str, Any] | list[Any], steps: list[str], value: Any, where: str) -> None:
+def _set(at: Any, steps: list[str], value: Any, where: str) -> None:
     step, *rest = steps
-    if isinstance(at, list):
-        for index in _indices(at, step, where):
-            if rest:
-                _set(_inner(at[index], rest[0], where), rest, value, where)
-            else:
-                at[index] = copy.deepcopy(value)
-        return
-    if rest:
-        _set(_inner(at.setdefault(step, {}), rest[0], where), rest, value, where)
-    else:
-        at[step] = copy.deepcopy(value)
+    for place in _places(at, step, where):
+        if rest:
+            _set(at[place] if isinstance(at, list) else at.setdefault(place, {}), rest, value, where)
+        else:
+            at[place] = copy.deepcopy(value)
 
 
-def _inner(found: Any, step: str, where: str) -> dict[str, Any] | list[Any]:
-    if isinstance(found, dict | list):
-        return found
-    raise ConfigError(f"{where}: found {quoted(found)} above {step!r}, expected a table")
-
-
-def _indices(items: list[Any], step: str, where: str) -> range:
+def _places(found: Any, step: str, where: str) -> Sequence[Any]:
+    """Returns the key of a table or the indices of a list for which a step stands."""
+    if isinstance(found, dict):
+        return (step,)
+    if not isinstance(found, list):
+        raise ConfigError(f"{where}: found {quoted(found)} above {step!r}, expected a table")
     if step == EACH:
-        return range(len(items))
-    if step.isdecimal() and len(step) < 10 and int(step) < len(items):
-        return range(int(step), int(step) + 1)
-    last = f"a number from 0 to {len(items) - 1}" if items else "nothing, as it is empty,"
+        return range(len(found))
+    if step.isdecimal() and len(step) < 10 and int(step) < len(found):
+        return (int(step),)
+    last = f"a number from 0 to {len(found) - 1}" if found else "nothing, as it is empty,"
     raise ConfigError(f"{where}: found {quoted(step)} in a list, expected {last} or {EACH!r} for each")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.config.cost_rules import PRESETS, check_cost
-from swarm.config.explain import choice
+from swarm.config.cost_rules import check_cost, whole_cost
+from swarm.config.explain import choice, complaint
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.config.setting_types import Name, Positive, Section
 from swarm.errors import ConfigError
@@ -85,35 +85,19 @@ def class_numbers(scenario: Scenario) -> dict[str, int]:
     return {each.name: number for number, each in enumerate(scenario.classes, 1)}
 
 
-def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a scenario with the whole cost of every class: that of `[cost]`, then the settings of
-    the class's preset, then the class's own.
+def complete_costs(raw: dict[str, Any]) -> dict[str, Any]:
+    """Completes the costs of a scenario in place, and returns it: `[cost]` by its preset, the cost of each class by
+    `[cost]` and by its own preset, which comes first.
 
     A value that is not a table is left to the check of types. To do it again changes nothing.
     """
     classes, common = raw.get("classes"), raw.get("cost", {})
-    if not isinstance(classes, list) or not isinstance(common, dict):
-        return raw
-    whole = []
-    for each in classes:
-        own = each.get("cost", {}) if isinstance(each, dict) else None
-        whole.append({**each, "cost": _over(common, own)} if isinstance(own, dict) else each)
-    return {**raw, "classes": whole}
-
-
-def _over(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    name = own.get("preset")
-    preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
-    named = {**preset, **own}
-    changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
-    tables = {"slope_table", "slope_csv"}
-    left_out = tables if changes_rule or tables & named.keys() else set()
-    below = {key: value for key, value in common.items() if key not in left_out}
-    cost = {**below, **named}
-    factors = [each.get("class_factor") for each in (common, preset, own)]
-    if any(isinstance(each, dict) for each in factors) and all(isinstance(each, dict | None) for each in factors):
-        cost["class_factor"] = {key: value for each in factors for key, value in (each or {}).items()}
-    return cost
+    if isinstance(common, dict):
+        raw["cost"] = common = whole_cost({}, common)
+        for each in classes if isinstance(classes, list) else ():
+            if isinstance(each, dict) and isinstance(own := each.get("cost", {}), dict):
+                each["cost"] = whole_cost(common, own)
+    return raw
 
 
 def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
@@ -125,10 +109,7 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
         for key in SHARED:
             if getattr(each.cost, key) != getattr(scenario.cost, key):
                 yield f"{source}: classes[{n}].cost.{key} is for all classes alike: give it in [cost] instead"
-        try:
-            check_cost(each.cost, f"{source}: classes[{n}]")
-        except ConfigError as error:
-            yield str(error)
+        yield from complaint(check_cost, each.cost, f"{source}: classes[{n}]")
         if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
             yield (
                 f"{source}: classes[{n}].air.speed_m_per_s: expected more than wind.speed_m_per_s,"

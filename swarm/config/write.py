@@ -44,7 +44,7 @@ def _table(table: Mapping[str, Any], path: tuple[str, ...], section: Any) -> Ite
 
     section  type of the table; its docstring gives the comments. None: the table is written without comments
     """
-    inner = [key for key, value in table.items() if _is_table(value) or _is_tables(value)]
+    inner = [key for key, value in table.items() if _is_tables(value)]
     if section is not None:
         meaning, hints = meanings(section), hints_of(section)
         defaults = {field.encode_name: field.default for field in msgspec.structs.fields(section)}
@@ -69,12 +69,10 @@ def _comment(text: str) -> list[str]:
     return ["", *(f"# {line}" for line in lines)]
 
 
-def _is_table(value: Any) -> bool:
-    return isinstance(value, Mapping) and bool(value)
-
-
 def _is_tables(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(each, Mapping) for each in value)
+    """Returns True if a value is a table or a list of tables, and not empty."""
+    listed = value if isinstance(value, list | tuple) else [value]
+    return bool(value) and all(isinstance(each, Mapping) for each in listed)
 
 
 def toml_key(key: str) -> str:

@@ -215,7 +215,8 @@ def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
     """Values of some cells, (cells,), as stored, no-data left out. Raises TerrainError if they are not whole."""
     if dataset.count >= 3:
         raise TerrainError(
-            f"{what} has {dataset.count} bands, expected one of codes; a photo goes into terrain.photo"
+            f"{what} has {dataset.count} bands, expected one of codes; an image of a map holds no codes, the raster"
+            " of the product is needed; a photo goes into terrain.photo"
         )
     kind = np.dtype(dataset.dtypes[0]).kind
     values = sampled(dataset, 1, _MOST_SAMPLED).compressed()

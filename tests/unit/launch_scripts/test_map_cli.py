@@ -85,7 +85,7 @@ def complaint(arguments: list[str]) -> str:
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
-    assert "write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
+    assert ": write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.gpx")])
     assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
 
 

@@ -45,10 +45,15 @@ def test_an_empty_scenario_is_a_whole_one():
     assert scenario.vehicle_count == 100
 
 
-def test_settings_are_known_by_their_names_of_the_version_before():
-    old, new = "[map]\nplot_regions = 2\n[[targets]]\nbody_radius_m = 3\n", "[map]\nshard_regions = 2\n"
-    assert parse_scenario(old) == parse_scenario(f"{new}[[targets]]\nobstacle_radius_m = 3\n")
-    assert parse_scenario("[monitor]\ngrpc_port = 9876\n") == parse_scenario("")
+def test_a_scenario_which_version_0_2_wrote_is_read_under_the_names_of_today():
+    """It has all keys of 0.2 which are no more, also in the costs of classes, with values of its presets."""
+    old = (Path(__file__).parents[2] / "specimens/scenario-0.2.0.toml").read_text("utf-8")
+    new, gone = re.subn(r"(?m)^(grpc_port|critical_slope\w*|cross_slope\w*|rough_per_m) = .*\n", "", old)
+    new = new.replace("plot_regions", "shard_regions").replace("body_radius_m", "obstacle_radius_m")
+    assert (parse_scenario(old), gone) == (parse_scenario(new), 13)
+    for preset, factor in (("hiker", 1.0), ("wheeled", 2.0), ("tracked", 1.5)):
+        text = f"[cost]\npreset = '{preset}'\n"
+        assert parse_scenario(f"{text}cross_slope_factor = {factor}") == parse_scenario(text)
 
 
 def test_relative_files_lie_beside_the_scenario(tmp_path):
