@@ -80,8 +80,8 @@ class Known(Protocol):
 
 
 class RunObserver:
-    """Receives the messages of a run and passes them to `known`. The owner of the bus passes on the events that `post`
-    is given (`take`).
+    """Receives the messages of a run and passes them to `known`. The owner of the bus passes on the events that
+    `post` is given (`take`).
 
     topics  topic -> how often the newest of each key is taken, in seconds; 0: all that comes
     """

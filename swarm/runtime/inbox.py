@@ -33,8 +33,8 @@ class _Flow(Generic[T]):
 
     sender  who sent the items
     rank    class of priority, 0 first
-    paid    turn of the flow: what the flow taken from last had paid when this one began, plus the prices of its items
-            taken since
+    paid    turn of the flow: what the flow taken from last had paid when this one began, plus the prices of its
+            items taken since
     held    sum of the prices of the waiting items
     """
 
