@@ -19,7 +19,7 @@ import pkgutil
 import re
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import cached_property
@@ -208,14 +208,20 @@ def _files_of(incomplete: str) -> Iterator[str]:
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
+_MOST_MEANT = 3
+"""Commands of other groups that are suggested at most."""
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
     "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
     "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
+    "terrain route": ("swarm route --terrain",),
+    "orders": ("order ls",), "sweep": ("study run",), "synth": ("generate",), "map": ("marks",),
+    "gone": ("forget",), "go": ("resume", "start"), "learned": ("factors",), "inspect": ("show",),
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
-"""Word that other programs have, or we had -> our words, the first of which that a group knows is meant."""
+"""Word that other programs have, or we had, perhaps after its group -> our words, the first of which that a group
+knows is meant."""
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -284,7 +290,7 @@ def _sentence(error: TyperException) -> str:
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
     elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
-        said = said.removesuffix(".") + _meant(unknown[1], ctx.command.commands)
+        said = said.removesuffix(".") + _meant(unknown[1], ctx)
     elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
         names = [name for each in ctx.command.params for name in each.opts]
         said = f"No such option: {option}{nearest(option, names)}"
@@ -297,12 +303,30 @@ def _sentence(error: TyperException) -> str:
     return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
 
 
-def _meant(word: str, known: Collection[str]) -> str:
-    """Returns the end of a sentence about an unknown command: the command which is meant, or all that are known."""
+def _meant(word: str, ctx: Any) -> str:
+    """Returns the end of a sentence about an unknown command: the command which is meant, here or in another group,
+    or all that are known here."""
+    known, root = ctx.command.commands, ctx.find_root()
     file = (f"up {word}", f"info {word}") if "." in word else ()
-    found = (each for each in _SYNONYMS.get(word, file) if each.split()[0] in known or each[0] in "-.")
-    synonym = next(found, None)
-    return choice(word, list(known), " there are: ") if synonym is None else f"; did you mean {synonym!r}?"
+    words = _SYNONYMS.get(f"{ctx.info_name} {word}", _SYNONYMS.get(word, file))
+    meant = [each for each in words if each.split()[0] in {root.info_name, *known} or each[0] in "-."][:1]
+    singular = word.removesuffix("s")
+    if not meant and singular not in known:
+        paths = list(_paths(root.command))
+        meant = [f"{root.info_name} {each}" for each in paths if each.split()[-1] == word] or [
+            f"{root.info_name} {each}" for each in paths if each.split()[-1] == singular
+        ]
+    if 1 <= len(meant) <= _MOST_MEANT:
+        return f"; did you mean {' or '.join(map(repr, meant))}?"
+    return choice(word, list(known), " there are: ")
+
+
+def _paths(group: Any) -> Iterator[str]:
+    """Yields the words of each command of a group and of the groups in it."""
+    for name, command in group.commands.items():
+        yield name
+        for path in _paths(command) if hasattr(command, "commands") else ():
+            yield f"{name} {path}"
 
 
 def _fill_streams() -> None:

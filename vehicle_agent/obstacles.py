@@ -6,7 +6,8 @@ cell is open again only if a newer report of the same obstacle leaves it, or its
 receiver's clock, from when a report was heard; nothing depends on what the sender's clock says.
 
 If reports contradict each other, all cells of both are closed: two senders under one id are two obstacles, and an
-obstacle that leaps keeps its old position closed until that report's lease ends.
+obstacle that leaps keeps its old position closed until that report's lease ends. A report is refused, and changes
+nothing, if its id could then close more than a quarter of the cells that all obstacles may close.
 """
 
 from __future__ import annotations
@@ -128,6 +129,8 @@ STANDS_NS = NS_PER_S
 MOST_OBSTACLES = 256
 MOST_CELLS = 100_000
 """Limit for all obstacles together: bounds time and memory, and the effect of false reports."""
+MOST_CELLS_OF_ONE = MOST_CELLS // 4
+"""Limit for one id: all its senders, and the places that it has leapt from. A larger obstacle is refused."""
 _FURTHEST_CELLS = 64
 """Largest number of cells ahead of an obstacle that are closed: a faster obstacle must look out itself."""
 _LONGEST_PAUSE_NS = NS_PER_S // 4
@@ -245,8 +248,8 @@ class Obstacles:
         kind = "refused"
         if wrong is None:
             kind, wrong = "crowded", self._crowded(known, leaps, charge)
-        if wrong is None and known is None:
-            kind, wrong = "senders", self._outgrown(report.id, charge)
+        if wrong is None:
+            kind, wrong = "senders", self._outgrown(report.id, known, leaps, charge)
         if wrong is not None:
             self._complain(kind, report.id, f"is not avoided: {wrong}")
             return
@@ -283,7 +286,7 @@ class Obstacles:
             return 0, f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
         if report.speed_m_per_s > MOST_M_PER_S:
             return 0, f"its speed_m_per_s is {report.speed_m_per_s:g}, expected at most {MOST_M_PER_S:g}"
-        window = self._capsule(report, report.speed_m_per_s * (REACTION_S + report.lease_s)).window(self._grid)
+        window = self._capsule(report, self._ahead_m(report, report.lease_s)).window(self._grid)
         if window.empty:
             grid, place = self._grid, f"x_m {report.x_m:.10g}, y_m {report.y_m:.10g}"
             east_m = grid.west_m + grid.cols * grid.resolution_m
@@ -302,14 +305,16 @@ class Obstacles:
             return f"with it, obstacles could close {charged} cells, expected at most {MOST_CELLS}"
         return None
 
-    def _outgrown(self, id: str, charge: int) -> str | None:
-        """Reason why one more sender under an id is refused: it is what a certificate names, so it has a share."""
-        own = [known for n in self._senders.get(id, ()) if (known := self._known.get((id, n))) is not None]
-        if len(own) >= _MOST_SENDERS:
+    def _outgrown(self, id: str, known: _Known | None, leaps: bool, charge: int) -> str | None:
+        """Reason why a report would give an id more than its share, which holds for all its senders and for the
+        places that they have left by a leap: an id is what a certificate names."""
+        own = [each for n in self._senders.get(id, ()) if (each := self._known.get((id, n))) is not None]
+        if known is None and len(own) >= _MOST_SENDERS:
             return f"{len(own)} senders have this id already"
-        charged, most = charge + sum(known.charge for known in own), MOST_CELLS // _MOST_SENDERS
-        if own and charged > most:
-            return f"its senders could close {charged} cells, expected at most {most}"
+        charged = charge + sum(each.charge for one in own for each in (one, *one.ghosts))
+        charged -= 0 if known is None or leaps else known.charge
+        if charged > MOST_CELLS_OF_ONE:
+            return f"with it, this id could close {charged} cells, expected at most {MOST_CELLS_OF_ONE}"
         return None
 
     def _leaps(self, before: Obstacle, report: Obstacle, passed_ns: int) -> bool:
@@ -392,10 +397,7 @@ class Obstacles:
         """Closes what the obstacle can reach by now and within the reaction time."""
         report = known.report
         age_s = max(now_ns - known.heard_ns, 0) / NS_PER_S
-        # In steps of half a cell, so that it is seldom computed; never less than said.
-        step_m = 0.5 * self._grid.resolution_m
-        ahead_m = min(report.speed_m_per_s * (age_s + REACTION_S), _FURTHEST_CELLS * self._grid.resolution_m)
-        ahead_m = math.ceil(ahead_m / step_m) * step_m
+        ahead_m = self._ahead_m(report, age_s)
         if ahead_m == known.ahead_m:
             return
         known.ahead_m = ahead_m
@@ -417,6 +419,13 @@ class Obstacles:
                 del closed[cell]
         self._changed.append(window.union(known.window))
         known.cells, known.window = cells, window
+
+    def _ahead_m(self, report: Obstacle, age_s: float) -> float:
+        """Returns the distance ahead of a report of this age that is closed. In steps of half a cell, so that it
+        seldom changes; never less than the report says."""
+        step_m = 0.5 * self._grid.resolution_m
+        ahead_m = min(report.speed_m_per_s * (age_s + REACTION_S), _FURTHEST_CELLS * self._grid.resolution_m)
+        return math.ceil(ahead_m / step_m) * step_m
 
     def _capsule(self, report: Obstacle, ahead_m: float) -> Capsule:
         return capsule_of(report, self._grid, ahead_m, self._margin_m)

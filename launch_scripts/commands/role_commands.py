@@ -110,7 +110,7 @@ def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str
 def planner(target: Annotated[str, typer.Option()], part: Part, rank: Rank = 0) -> None:
     """Run the planner of one target, or a standby of it.
 
-    swarm role planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert . --tls-key .
+    swarm role planner jacksboro --target t0 --connect tls/HOST:7447 --tls-dir .
 
     target  The target whose tree this planner keeps, such as t0.
     rank    0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).

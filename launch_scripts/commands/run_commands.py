@@ -36,7 +36,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
 
     swarm up my.toml --only router.1 --only planner.t3 --only planner.t0.r1 --only agent
 
-    swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-dir .
     """
     if run.detach:
         from launch_scripts.commands.runs_commands import in_background

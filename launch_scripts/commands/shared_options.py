@@ -91,10 +91,10 @@ Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 class Tls:
     """The three files of mutual TLS: all, or none. Every option that states how a swarm is reached includes them.
 
-    tls_dir   Folder of ca.pem, certificate and key, in place of the three files.
+    tls_dir   Folder of ca.pem, certificate and key, in place of --tls-ca, --tls-cert and --tls-key.
     tls_ca    Certificate of the authority, PEM.
-    tls_cert  Our certificate, PEM.
-    tls_key   Our private key, PEM.
+    tls_cert  Certificate of this process, PEM.
+    tls_key   Private key of this process, PEM.
     """
 
     panel: ClassVar[str | None] = CERTIFICATES

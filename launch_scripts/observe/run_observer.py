@@ -1,8 +1,8 @@
 """The one observer of a running swarm: hears it on the bus, and keeps what it hears in a `LatestState` or recorder.
 
 `RunObserver` is for those who know the run: launcher, live view, simulation. `OutsideObserver` is for commands
-which know the namespace alone: `status`, `top`, `metrics`. It asks who takes part, goes by the run that most of the
-answers name, and makes the state from what they say. Both only listen: nothing in the swarm waits for them.
+which know the namespace alone: `status`, `top`, `metrics`. It first asks which processes take part, follows the run
+that most of the answers name, and makes the state from what they say. Neither publishes anything.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class Known(Protocol):
 
 
 class RunObserver:
-    """Hears a run for one keeper. The owner of the bus passes on the events that `post` is given (`take`).
+    """Receives the messages of a run and passes them to `known`. The owner of the bus passes on the events that
+    `post` is given (`take`).
 
     topics  topic -> how often the newest of each key is taken, in seconds; 0: all that comes
     """

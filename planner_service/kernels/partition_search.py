@@ -257,7 +257,8 @@ def _any_cut_off(t, wanted, across):
 @kernel(GRID, partition.TREE, partition.TILES, partition.SCRATCH, partition.SCHEDULE, "f8")
 def improve_tiles(grid, tree, tiles, scratch, schedule, most):
     """Evaluates totals, checks tiles and repairs them, until the tree is optimal or `most` tiles have been checked;
-    a repaired one counts three times. Returns (tiles checked, tiles repaired, rounds, whether some are left).
+    a check that ends in a repair counts as three. Returns (tiles checked, tiles repaired, rounds, whether some are
+    left).
 
     schedule  (order, place, turn, now, stack, sets, words):
            order  int64 (n,), all tiles, those nearest the root first

@@ -38,8 +38,8 @@ from shared_map.array_files import Floats
 from swarm.grid import Window
 
 MOST_LOOKS = 3.0
-"""A move or a repair gives way to a full search once it has checked this multiple of the map's tiles; repairing one
-counts double (docs/design/incremental-trees.md)."""
+"""A move or a repair gives way to a full search once it has checked this multiple of the map's tiles; a check that
+ends in a repair counts as three (docs/design/incremental-trees.md)."""
 
 MOST_KEPT = 1 << 9
 """Number of tiles for which the costs of their cells inside are kept: 17 MB. On 4096 x 4096 cells, a repair checks

@@ -1,4 +1,4 @@
-"""The inbox of a process: events from any thread to the one thread that owns the state, fair to those who ask."""
+"""The inbox of a process: events from any thread to the one thread that owns the state, fair to their senders."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ _IDLE = 1024
 class _Flow(Generic[T]):
     """The waiting items of one sender, with the number and the price of each.
 
-    paid  sum of the prices of what was taken, since it first waited
-    held  sum of the prices of what waits
+    sender  who sent the items
+    rank    class of priority, 0 first
+    paid    turn of the flow: what the flow taken from last had paid when this one began, plus the prices of its
+            items taken since
+    held    sum of the prices of the waiting items
     """
 
     sender: str
@@ -47,8 +50,8 @@ class FairQueue(Generic[T]):
 
     Each sender has a flow. The flow that has paid least is next, and pays the price of the item that is taken
     (self-clocked fair queueing: Golestani, INFOCOM 1994). A sender with one item therefore waits for one item of
-    each other sender at most, however many those have. An idle sender saves up nothing. Items of a lower rank come
-    before all of a higher one.
+    each other sender at most, however many those have. An idle sender saves up nothing. Items of rank 0 come
+    first, then those of rank 1, and so on.
 
     most       limit of all prices together: beyond it the oldest of the highest rank are dropped
     most_each  limit of the prices of one sender: beyond it the sender's oldest are dropped

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shared_map.terrain.step_climb import Climb, climb_of
@@ -18,7 +19,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
-from vehicle_agent.obstacles import MOST_CELLS, MOST_OBSTACLES, Obstacles
+from vehicle_agent.obstacles import MOST_CELLS_OF_ONE, MOST_OBSTACLES, Obstacles
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
 
@@ -104,46 +105,57 @@ def test_too_many_obstacles_and_too_many_cells_are_refused_and_those_before_stay
     fine = Obstacles(GridSpec(2000, 2000, 1.0))
     fine.tick(NOW)
     for number in range(10):
-        fine.take_report(obstacle(20.0 + number, 20.0, id=f"r{number}", radius_m=95.0), NOW)
-    assert fine.refused == 8
+        fine.take_report(obstacle(20.0 + number, 20.0, id=f"r{number}", radius_m=75.0), NOW)
+    assert fine.refused == 6
     assert "expected at most 100000" in fine.complaints[0]
     for tick in range(1, 21):
         obstacles.tick(NOW + tick * TICK)
         fine.tick(NOW + tick * TICK)
     assert not obstacles.any
     assert not fine.any
-    fine.take_report(obstacle(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
+    fine.take_report(obstacle(20.0, 20.0, radius_m=75.0), NOW + 2 * NS_PER_S)
     assert fine.any, "what was given back can be used again"
 
 
 LIES = st.tuples(
-    st.integers(1, 40),
-    st.floats(0, 3990),
-    st.floats(-3990, 0),
+    st.integers(1, 8),
+    st.floats(0, 399),
+    st.floats(0, 399),
     st.floats(0, 100),
-    st.floats(0, 340),
+    st.floats(0, 340) | st.just(0.0),
     st.floats(0.1, 10),
+    st.none() | st.floats(0, 6.28),
 )
 
 
-@given(st.lists(LIES, max_size=60))
-@settings(max_examples=25)
-def test_whoever_has_one_id_closes_a_part_of_the_map_for_a_while_and_crowds_nobody_out(
-    lies: list[tuple[int, float, float, float, float, float]],
+@given(st.sampled_from([0.5, 0.7, 1.0, 10.0]), st.booleans(), st.lists(LIES, max_size=60))
+@example(0.5, False, [(1, row, col, 25.0, 0.0, 10.0, None) for row in (60, 300) for col in (60, 300)])
+@settings(max_examples=50)
+def test_whoever_has_one_id_closes_a_quarter_of_the_cells_at_most_for_a_while_and_crowds_nobody_out(
+    resolution_m: float,
+    is_crowded: bool,
+    lies: list[tuple[int, float, float, float, float, float, float | None]],
 ) -> None:
-    obstacles, now_ns = Obstacles(GridSpec(400, 400, 10.0)), NOW
-    everywhere = [(99 + n, n % 20 * 200.0, n // 20 * -200.0, 50.0, 0.0, 10.0) for n in range(400)]
-    for seq, (incarnation, x_m, y_m, radius_m, speed, lease_s) in enumerate(everywhere + lies):
+    """Also by the first report, by one that grows, and by leaps."""
+    obstacles, now_ns = Obstacles(GridSpec(400, 400, resolution_m)), NOW
+    everywhere = [(99 + n, n // 20 * 20.0, n % 20 * 20.0, 50.0, 0.0, 10.0, None) for n in range(400)]
+    for seq, (incarnation, row, col, radius_m, speed, lease_s, heading) in enumerate(
+        everywhere * is_crowded + lies
+    ):
         now_ns += TICK // 8
         obstacles.tick(now_ns)
-        said = {"x_m": x_m, "y_m": y_m, "radius_m": radius_m, "speed_m_per_s": speed, "lease_s": lease_s}
-        obstacles.take_report(obstacle(0, 0, id="thief", incarnation=incarnation, seq=seq, **said), now_ns)
-    assert sum(cell in obstacles.closed for cell in range(160_000)) <= MOST_CELLS // 2
-    obstacles.take_report(obstacle(7.5, 7.5, id="honest"), now_ns)
+        place = {"x_m": col * resolution_m, "y_m": -row * resolution_m, "radius_m": radius_m}
+        said = {"speed_m_per_s": speed, "lease_s": lease_s, "heading_rad": heading}
+        obstacles.take_report(obstacle(0, 0, id="thief", incarnation=incarnation, seq=seq, **place, **said), now_ns)
+        assert isinstance(obstacles.closed, Counter)
+        assert len(obstacles.closed) <= MOST_CELLS_OF_ONE
+    honest = {"x_m": 7.5 * resolution_m, "y_m": -7.5 * resolution_m}
+    obstacles.take_report(obstacle(0, 0, id="honest", **honest), now_ns)
     assert 7 * 400 + 7 in obstacles.closed
     for _ in range(120):
         now_ns += TICK
         obstacles.tick(now_ns)
+        assert len(obstacles.closed) <= MOST_CELLS_OF_ONE + 25
     assert not obstacles.any
 
 
