@@ -125,38 +125,27 @@ class BegunRoute(NamedTuple):
 
 TrackKey = tuple[str, int]
 """Id, and piece of its track: a target which jumps begins a new piece."""
-_Sampling = tuple[int, tuple[TrackKey, ...], NDArray[np.float32]]
 
 
-class Tracks:
-    """Samples of places, at most about `limit` of them, taken every `interval_ns`."""
+class Sampling(NamedTuple):
+    """Places of all vehicles, or of all targets, at an instant: `places_m` has a row (east, south) for each key."""
 
-    def __init__(self, interval_ns: int, limit: int = 400_000) -> None:
-        self._interval_ns = interval_ns
-        self._due_ns = 0
-        self._samplings: Thinned[_Sampling] = Thinned(limit, lambda sampling: len(sampling[1]))
+    time_ns: int
+    keys: tuple[TrackKey, ...]
+    places_m: NDArray[np.float32]
 
-    def due(self, now_ns: int) -> bool:
-        """Returns True if a sample is due."""
-        return now_ns >= self._due_ns
 
-    def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:
-        """Adds one sample per key: `places_m` has a row (east, south) for each."""
-        self._due_ns = now_ns + self._interval_ns
-        if not keys:
-            return
-        before = self._samplings.last[1] if self._samplings.last else ()
-        # The same keys come each time: they take most of the memory unless they are kept once.
-        shared = before if len(before) == len(keys) and before == tuple(keys) else tuple(keys)
-        self._samplings.add((now_ns, shared, np.asarray(places_m, np.float32).reshape(-1, 2)))
+Tracks = dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]
+"""Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
 
-    def lines(self) -> dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
-        points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
-        for now_ns, keys, places in self._samplings.kept:
-            for key, place in zip(keys, places, strict=True):
-                points.setdefault(key, []).append((now_ns, place))
-        return {
-            key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
-            for key, each in points.items()
-        }
+
+def tracks_of(samplings: Sequence[Sampling]) -> Tracks:
+    """The places of each key, in order of time."""
+    points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
+    for time_ns, keys, places_m in samplings:
+        for key, place in zip(keys, places_m, strict=True):
+            points.setdefault(key, []).append((time_ns, place))
+    return {
+        key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
+        for key, each in points.items()
+    }
