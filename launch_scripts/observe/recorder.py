@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe import history
 from launch_scripts.observe.fact_table import for_report, verdict
-from launch_scripts.observe.history import BegunRoute, Sample, Sampling, Thinned, TrackKey
+from launch_scripts.observe.history import BegunRoute, Driven, Sample, Sampling, Thinned, TrackKey
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
-from launch_scripts.observe.run_results import Driven, results
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import of_excess
 from swarm.clock import NS_PER_S
@@ -206,7 +205,7 @@ class Recorder:
             "gap": self._gap(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_per_s": _mean(rates),
-            **results(observed, self.driven, self.scenario),
+            **history.results(observed, self.driven, self.scenario),
         }
         numbers = {name: _rounded(value) for name, value in fields.items()}
         return {"verdict": verdict(numbers, failures), **numbers}
