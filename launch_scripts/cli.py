@@ -17,7 +17,7 @@ from launch_scripts.command_line import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Fa
 
 LEAVES = (
     "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
-    "simulation_commands:app",
+    "simulation_commands:app", "role_commands:app",
 )  # fmt: skip
 """Apps of commands without a family, in `launch_scripts.commands`."""
 FAMILIES = {
@@ -29,7 +29,6 @@ FAMILIES = {
     "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
     "marks": ("map_commands:app", "Inspect and export marks of a store; learned factors.", LEFT),
     "study": ("simulation_commands:study_app", "Run scenarios with many settings and seeds.", LEFT),
-    "role": ("role_commands:app", "Start one process of a swarm, by hand.", ADMIN),
     "gateway": ("gateway_commands:app", "Connect a running swarm to ROS 2 and MAVLink.", ADMIN),
     "deploy": ("deploy_commands:app", "Plan several machines: archives, certificates, router.", ADMIN),
 }

@@ -34,6 +34,7 @@ class Role:
     any_id      whether a run may have more of it than its scenario says
     lasting     whether what it writes must outlive its container: a keeper's store, recordings, and what an agent
                 has promised of right of way (docs/design/right-of-way.md). All else is made again
+    options     of `swarm role`, which go with this role alone
     takes_over  how its next life follows one that still runs: "beside" it (each answer is complete, and of two the
                 younger life's counts), or after it; one that "waits" starts immediately, and waits for a file that
                 the life before has locked
@@ -52,6 +53,7 @@ class Role:
     simulated: bool = True
     any_id: bool = False
     lasting: bool = False
+    options: tuple[str, ...] = ()
     takes_over: Literal["beside", "waits", "after"] = "after"
 
 
@@ -63,6 +65,7 @@ TABLE: dict[str, Role] = {
         is_needed=False,
         simulated=False,
         any_id=True,
+        options=("listen",),
     ),
     "keeper": Role(
         entry="shared_map.keeper.main:run",
@@ -72,6 +75,7 @@ TABLE: dict[str, Role] = {
         photo=True,
         any_id=True,
         lasting=True,
+        options=("store_path", "rebuild"),
     ),
     "monitor": Role(
         entry="launch_scripts.monitor.main:run",
@@ -93,6 +97,7 @@ TABLE: dict[str, Role] = {
         memory_mib=2048,
         kernels=True,
         takes_over="beside",
+        options=("target",),
     ),
     "places": Role(
         entry="planner_service.main:run_places",
@@ -103,6 +108,7 @@ TABLE: dict[str, Role] = {
         memory_mib=2048,
         kernels=True,
         takes_over="beside",
+        options=("group",),
     ),
     "targets": Role(  # the referee also where all targets are external
         entry="launch_scripts.simulation.world.main:run",

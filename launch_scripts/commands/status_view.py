@@ -130,8 +130,8 @@ def print_status(status: Status, console: Console) -> None:
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
         say(line, "yellow")
     if state.targets:
-        console.print(targets_table(state, len(state.targets)))
-        console.print(_planning(state))
+        for always in (True, False):  # apart, so that the main table fits a terminal
+            console.print(targets_table(state, len(state.targets), always=always))
     for id, planner in sorted(status.latest.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
@@ -178,15 +178,6 @@ def _processes(status: Status) -> Table:
         pid = str(status.pids.get(name, "-"))
         crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
-
-
-def _planning(state: RunState) -> Table:
-    """Table of the remaining target columns. Separate, so that the main table fits a terminal."""
-    told = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
-    shown = columns(*(column.label for column in told))
-    for line in state.targets:
-        shown.add_row(*(column.shown(line) for column in told), style="yellow" if line.lost else None)
-    return shown
 
 
 def status_fields(status: Status) -> dict[str, Any]:

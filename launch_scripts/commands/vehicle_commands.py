@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.order_commands import give
-from launch_scripts.commands.role_commands import Joins, Part, run_role
+from launch_scripts.commands.role_commands import Part, run_role
 from launch_scripts.commands.shared_options import AsJson, Where
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
@@ -109,7 +109,7 @@ def add(
     """
     if at is not None:
         read_place(at, "--at")
-    run_role("agent", id, part, joins=Joins(group, count, at))
+    run_role("agent", id, part, joins=(group, count, at))
 
 
 @command(app)

@@ -27,7 +27,6 @@ from launch_scripts.process_table import TABLE
 from swarm.bus.zenoh_config import access_control, low_pass_filter, tls_settings
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.config.write import scenario_text
-from swarm.liveness import split_rank
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
 from swarm.wire.topics import MARKS
 
@@ -108,16 +107,9 @@ def containers_of(plan: Plan, host: PlannedHost, image: str = "") -> list[Contai
 
 
 def _words(process: PlannedProcess, run_id: str) -> list[str]:
-    job, rank = split_rank(process.id)
-    which = {
-        "planner": ["--target", job, "--rank", str(rank)],
-        "places": ["--group", job, "--rank", str(rank)],
-        "targets": ["--rank", str(rank)],
-        "monitor": [],
-    }.get(process.role, ["--id", process.id])
-    run = [] if process.role == ROUTER else ["--run-id", run_id]
+    which = ["--id", process.id, *(() if process.role == ROUTER else ("--run-id", run_id))]
     told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]
-    return ["role", process.role, f"/etc/swarm/{_SCENARIO}", *which, *run, "--runs", "/var/lib/swarm/runs", *told]
+    return ["role", process.role, f"/etc/swarm/{_SCENARIO}", *which, "--runs", "/var/lib/swarm/runs", *told]
 
 
 def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Sequence[str] = ()) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -39,9 +39,9 @@ def fitted(state: RunState, above: list[RenderableType], console: Console) -> Gr
     return Group(*above, Text(), targets)
 
 
-def targets_table(state: RunState, most: int) -> Table:
-    """A line for each target, `most` at most."""
-    labels, rows = facts.table(state)
+def targets_table(state: RunState, most: int, *, always: bool = True) -> Table:
+    """A line for each target, `most` at most, with the columns of every table, or else with the others."""
+    labels, rows = facts.table(state, always=always)
     shown = columns(*labels)
     kept = most if len(rows) <= most else most - 1
     for line, row in list(zip(state.targets, rows, strict=True))[:kept]:
@@ -82,44 +82,40 @@ def _style(line: TargetLine) -> str | None:
 def loads_table(processes: Sequence[ProcessLoad], *, each: bool) -> Table:
     """A line for each process, or else for each role, in the order of the table of processes. At most 80 columns
     wide."""
-    first = ("process", "pid") if each else ("role",)
-    table = columns(*first, "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
-    if each:
-        for line in processes:
-            up = facts.seconds(line.up_s) if line.alive else "gone"
-            pid = "-" if line.pid is None else str(line.pid)
-            table.add_row(
-                line.name, pid, up, *_load_row([line], [line]), style=_load_style(line.restarts, line.alive)
-            )
-        return table
-    table.add_column("busiest", no_wrap=True, overflow="ellipsis")
-    for role in dict.fromkeys([*ROLES, *(line.role for line in processes)]):
-        mine = [line for line in processes if line.role == role]
-        alive = [line for line in mine if line.alive]
-        cpu = {line.name: line.cpu_percent for line in alive if line.cpu_percent is not None}
-        busiest = max(cpu, key=cpu.__getitem__) if cpu and len(mine) > 1 else None
-        last = "" if busiest is None else f"{busiest} {cpu[busiest]:.0f} %"
-        if mine:
-            style = _load_style(sum(line.restarts for line in mine), len(alive) == len(mine))
-            table.add_row(role, f"{len(alive)} of {len(mine)}", *_load_row(alive, mine), last, style=style)
+    groups: dict[str, list[ProcessLoad]] = {}
+    for line in processes if each else sorted(processes, key=lambda line: (*ROLES, line.role).index(line.role)):
+        groups.setdefault(line.name if each else line.role, []).append(line)
+    table = columns(*(("process", "pid") if each else ("role",)), "up", *_LOADS)
+    if not each:
+        table.add_column("busiest", no_wrap=True, overflow="ellipsis")
+    for name, mine in groups.items():
+        alive, first = [line for line in mine if line.alive], mine[0]
+        row = [name, *(shown(alive, mine) for shown in _LOADS.values())]
+        if each:
+            row[1:1] = [str(first.pid or "-"), facts.seconds(first.up_s) if alive else "gone"]
+        else:
+            row[1:1] = [f"{len(alive)} of {len(mine)}"]
+            busy = [line for line in alive if line.cpu_percent is not None] if len(mine) > 1 else []
+            busiest = max(busy, key=lambda line: line.cpu_percent or 0.0, default=None)
+            row += [] if busiest is None else [f"{busiest.name} {busiest.cpu_percent:.0f} %"]
+        restarted = any(line.restarts for line in mine)
+        table.add_row(*row, style="red" if len(alive) < len(mine) else "yellow" if restarted else None)
     return table
 
 
-def _load_row(alive: Sequence[ProcessLoad], mine: Sequence[ProcessLoad]) -> tuple[str, ...]:
-    """Sums of those that are alive; of all of them the worst lateness, and how often they were started again."""
-    memory = sum_of(line.rss_bytes for line in alive)
-    return (
-        _number(sum_of(line.cpu_percent for line in alive)),
-        "-" if memory is None else f"{memory / (1 << 20):,.0f} MB",
-        _number(max((line.late_per_s for line in mine if line.late_per_s is not None), default=None)),
-        facts.count(sum_of(line.messages_per_s for line in alive)),
-        str(sum(line.restarts for line in mine)),
-    )
+_LOADS: Mapping[str, Callable[[Sequence[ProcessLoad], Sequence[ProcessLoad]], str]] = {
+    "CPU %": lambda alive, _: _number(sum_of(line.cpu_percent for line in alive)),
+    "memory": lambda alive, _: _number(sum_of(line.rss_bytes for line in alive), 1 << 20, " MB"),
+    "late/s": lambda _, mine: _number(
+        max((line.late_per_s for line in mine if line.late_per_s is not None), default=None)
+    ),
+    "messages/s": lambda alive, _: facts.count(sum_of(line.messages_per_s for line in alive)),
+    "restarts": lambda _, mine: str(sum(line.restarts for line in mine)),
+}
+"""Column -> its text, from the processes of a line that are alive, and all of them."""
 
 
-def _load_style(restarts: int, whole: bool) -> str | None:
-    return ("yellow" if restarts else None) if whole else "red"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
+def _number(value: float | None, unit: float = 1.0, name: str = "") -> str:
+    if value is None:
+        return facts.NONE
+    return f"{value / unit:,.0f}{name}" if value >= 10 else f"{value:.1f}"

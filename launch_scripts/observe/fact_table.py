@@ -177,9 +177,9 @@ def fact(name: str) -> Fact[RunState]:
     return _BY_NAME[name]
 
 
-def table(state: RunState) -> tuple[list[str], list[list[str]]]:
-    """The labels of the columns that every table of targets has, and a row for each target."""
-    columns = [column for column in TARGET_FACTS if column.always]
+def table(state: RunState, *, always: bool = True) -> tuple[list[str], list[list[str]]]:
+    """The labels of the columns that every table of targets has, or of the target and the others; and the rows."""
+    columns = [column for column in TARGET_FACTS if column.always == always or column is TARGET_FACTS[0]]
     rows = [[column.shown(line) for column in columns] for line in state.targets]
     return [column.label for column in columns], rows
 

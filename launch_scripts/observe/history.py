@@ -1,4 +1,4 @@
-"""A run over time, in bounded memory: samples of its figures, tracks, routes that vehicles began.
+"""A run over time, in bounded memory: samples of its figures, tracks, routes that vehicles began; and its results.
 
 Memory does not grow with the length of a run: `Thinned` forgets every second entry when it holds too many, and
 keeps half as many from then on. Kept samples therefore stay evenly spread from the beginning of a run to its end.
@@ -7,16 +7,21 @@ keeps half as many from then on. Kept samples therefore stay evenly spread from 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.summed_counts import of_excess
-from swarm.runtime.stats import Histogram
-from swarm.wire.messages.vehicles import Followed
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
+from launch_scripts.observe.summed_counts import CertifiedGap, gap_of, gaps_of, gaps_to, of_excess
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of, plan_agents
+from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
+from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, UNPROVEN_OF, Histogram, merged
+from swarm.wire.messages.vehicles import Followed, VehicleState
 
 T = TypeVar("T")
 
@@ -125,38 +130,161 @@ class BegunRoute(NamedTuple):
 
 TrackKey = tuple[str, int]
 """Id, and piece of its track: a target which jumps begins a new piece."""
-_Sampling = tuple[int, tuple[TrackKey, ...], NDArray[np.float32]]
 
 
-class Tracks:
-    """Samples of places, at most about `limit` of them, taken every `interval_ns`."""
+class Sampling(NamedTuple):
+    """Places of all vehicles, or of all targets, at an instant: `places_m` has a row (east, south) for each key."""
 
-    def __init__(self, interval_ns: int, limit: int = 400_000) -> None:
-        self._interval_ns = interval_ns
-        self._due_ns = 0
-        self._samplings: Thinned[_Sampling] = Thinned(limit, lambda sampling: len(sampling[1]))
+    time_ns: int
+    keys: tuple[TrackKey, ...]
+    places_m: NDArray[np.float32]
 
-    def due(self, now_ns: int) -> bool:
-        """Returns True if a sample is due."""
-        return now_ns >= self._due_ns
 
-    def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:
-        """Adds one sample per key: `places_m` has a row (east, south) for each."""
-        self._due_ns = now_ns + self._interval_ns
-        if not keys:
-            return
-        before = self._samplings.last[1] if self._samplings.last else ()
-        # The same keys come each time: they take most of the memory unless they are kept once.
-        shared = before if len(before) == len(keys) and before == tuple(keys) else tuple(keys)
-        self._samplings.add((now_ns, shared, np.asarray(places_m, np.float32).reshape(-1, 2)))
+Tracks = dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]
+"""Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
 
-    def lines(self) -> dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
-        points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
-        for now_ns, keys, places in self._samplings.kept:
-            for key, place in zip(keys, places, strict=True):
-                points.setdefault(key, []).append((now_ns, place))
-        return {
-            key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
-            for key, each in points.items()
+
+def tracks_of(samplings: Sequence[Sampling]) -> Tracks:
+    """The places of each key, in order of time."""
+    points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
+    for time_ns, keys, places_m in samplings:
+        for key, place in zip(keys, places_m, strict=True):
+            points.setdefault(key, []).append((time_ns, place))
+    return {
+        key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
+        for key, each in points.items()
+    }
+
+
+# --- results per target, group and vehicle ------------------------------------------------------------------------
+
+_MOST_VEHICLES = 100_000
+"""A hostile message must not fill the memory: vehicles beyond these have no results."""
+
+
+_DRIVEN = ("distance_m", "waiting_s", "standing_s")
+
+
+class Driven:
+    """Distance and waiting time of each vehicle, from its observed positions.
+
+    totals  float64 (3, n), a column for each of `ids`: metres along straight lines between samples, on the map;
+            seconds of waiting for a route; seconds with a route on one spot from one sample to the next
+    """
+
+    def __init__(self) -> None:
+        self.ids: list[str] = []
+        self.groups: dict[str, str] = {}
+        self.totals = np.zeros((3, 0))
+        self._place_m = np.zeros((0, 2))
+        """Last position of each; NaN before."""
+        self._rows: dict[str, int] = {}
+        self._seen: list[str] = []
+        self._seen_rows: NDArray[np.intp] = np.zeros(0, np.intp)
+        """The rows of the vehicles of the last sample; -1 of those beyond the bound."""
+        self.at_ns: int | None = None
+        """Time of the last sample."""
+
+    def add(self, now_ns: int, vehicles: VehicleColumns, groups: Callable[[], Mapping[str, str]]) -> None:
+        """Takes in one sample of all vehicles."""
+        if vehicles.ids != self._seen:
+            self._seen = vehicles.ids
+            self._know(vehicles.ids, groups())
+        some = np.flatnonzero(self._seen_rows >= 0)
+        rows, states = self._seen_rows[some], vehicles.states[some]
+        place_m = np.stack([vehicles.east_m[some], vehicles.south_m[some]], axis=1).astype(np.float64)
+        moved_m = np.hypot(*(place_m - self._place_m[rows]).T)  # NaN of those that are new
+        passed_s = 0.0 if self.at_ns is None else max(now_ns - self.at_ns, 0) / NS_PER_S
+        stands = (states == VehicleState.FOLLOWING) & (moved_m == 0)
+        self.totals[0, rows] += np.nan_to_num(moved_m)
+        self.totals[1, rows] += passed_s * (states == VehicleState.WAITING)
+        self.totals[2, rows] += passed_s * stands
+        self._place_m[rows] = place_m
+        self.at_ns = now_ns
+
+    def _know(self, ids: list[str], groups: Mapping[str, str]) -> None:
+        for id in [id for id in ids if id not in self._rows][: _MOST_VEHICLES - len(self.ids)]:
+            self._rows[id] = len(self.ids)
+            self.ids.append(id)
+            self.groups[id] = groups.get(id, "")
+        more = len(self.ids) - len(self._place_m)
+        self.totals = np.pad(self.totals, ((0, 0), (0, more)))
+        self._place_m = np.pad(self._place_m, ((0, more), (0, 0)), constant_values=np.nan)
+        self._seen_rows = np.array([self._rows.get(id, -1) for id in ids], np.intp)
+
+
+def results(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
+    """`by_target`, `by_group` and `by_vehicle` of the report."""
+    by_vehicle = _by_vehicle(latest, driven, scenario)
+    return {
+        "by_target": _by_target(latest, scenario),
+        "by_group": _by_group(latest, by_vehicle, scenario),
+        "by_vehicle": by_vehicle,
+    }
+
+
+def _by_target(latest: LatestState, scenario: Scenario) -> dict[str, Any]:
+    captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
+    vehicles = latest.vehicles()
+    return {
+        id: {
+            "captures": captures.get(id, 0),
+            **_gap_fields(gaps.get(id)),
+            "growths": latest.of_job("planner", id, "growths"),
+            "window_growths": latest.of_job("planner", id, "window_growths"),
+            "chased_by_at_end": len(vehicles.chasing(id)),
         }
+        for id in _all(scenario.target_ids, captures, gaps, latest.status)
+    }
+
+
+def _by_vehicle(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
+    planned = {plan.id: plan.group.name for plan in plan_agents(scenario)}
+    classes = {group.name: group.vehicle_class for group in scenario.groups}
+    captures, gaps, told = latest.counts_by(CAPTURES_BY), gaps_of(latest), latest.classes()
+    totals = dict(zip(driven.ids, driven.totals.T.tolist(), strict=True))
+    vehicles = latest.vehicles()
+    last = {id: n for n, id in enumerate(vehicles.ids)}
+    rows: dict[str, Any] = {}
+    for id in _all([], sorted(driven.ids), captures, gaps):
+        at = last.get(id)
+        chased = -1 if at is None else int(vehicles.targets[at])
+        group = planned.get(agent_of(id)) or driven.groups.get(id, "")
+        rows[id] = {
+            "group": group,
+            "class": told.get(id) or classes.get(group, GROUND),
+            "captures": captures.get(id, 0),
+            **dict(zip(_DRIVEN, totals.get(id, (0.0, 0.0, 0.0)), strict=True)),
+            **_gap_fields(gaps.get(id)),
+            "state_at_end": None if at is None else VehicleState(int(vehicles.states[at])).name.lower(),
+            "target_at_end": vehicles.target_ids[chased] if chased >= 0 else None,
+        }
+    return rows
+
+
+def _by_group(latest: LatestState, by_vehicle: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    proven, unproven = latest.histograms_by(GAPS_OF), latest.counts_by(UNPROVEN_OF)
+    members: dict[str, list[str]] = {group.name: [] for group in scenario.groups}
+    classes = {group.name: group.vehicle_class for group in scenario.groups}
+    for id, row in by_vehicle.items():
+        members.setdefault(row["group"], []).append(id)
+    rows: dict[str, Any] = {}
+    for group, ids in members.items():
+        excess = merged(proven[id].buckets for id in ids if id in proven)
+        gap = gap_of(excess, sum(unproven.get(id, 0) for id in ids))
+        rows[group] = {
+            "class": classes.get(group, GROUND),
+            "vehicles": len(ids),
+            **{name: sum(by_vehicle[id][name] for id in ids) for name in ("captures", *_DRIVEN)},
+            **_gap_fields(gap if gap.routes else None),
+        }
+    return rows
+
+
+def _gap_fields(gap: CertifiedGap | None) -> dict[str, Any]:
+    return {"routes": 0 if gap is None else gap.routes, "certified_gap": None if gap is None else gap.fields()}
+
+
+def _all(first: Iterable[str], *others: Iterable[str]) -> list[str]:
+    """Each id once, in order."""
+    return list(dict.fromkeys([*first, *(id for other in others for id in other)]))

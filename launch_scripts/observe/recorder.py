@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from launch_scripts.observe import history
 from launch_scripts.observe.fact_table import for_report, verdict
-from launch_scripts.observe.history import BegunRoute, Sample, Thinned, TrackKey, Tracks
-from launch_scripts.observe.latest_messages import LatestState, VehicleColumns, plan_of
+from launch_scripts.observe.history import BegunRoute, Driven, Sample, Sampling, Thinned, TrackKey
+from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
-from launch_scripts.observe.run_results import Driven, results
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import of_excess
 from swarm.clock import NS_PER_S
@@ -38,6 +38,8 @@ _MOST_SAMPLES = 1024
 _POINTS = 120
 """Instants in a report: a plot of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
+_MOST_PLACES = 400_000
+"""Sampled places that are kept at most, of vehicles and of targets each."""
 _NOTES_KEPT = 1000
 _ROUTE_BYTES = 4_000_000
 """Size of all routes that are kept."""
@@ -68,7 +70,7 @@ class Recorder:
         self.grid = grid
         self.observed = LatestState(plan_of(scenario, started_ns), grid)
         self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
-        self._sample_due_ns = 0
+        self._due_ns = self._sample_due_ns = 0
         self.ready_ns: int | None = None
         """Time when all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
@@ -76,8 +78,8 @@ class Recorder:
         self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + _OF_ROUTE_BYTES)
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
-        self.vehicle_tracks = Tracks(_TRACK_NS)
-        self.target_tracks = Tracks(_TRACK_NS)
+        self.vehicle_tracks = Thinned[Sampling](_MOST_PLACES, lambda sampling: len(sampling.keys))
+        self.target_tracks = Thinned[Sampling](_MOST_PLACES, lambda sampling: len(sampling.keys))
         self.routed: set[str] = set()
         self._gap_max: float | None = None
 
@@ -94,12 +96,12 @@ class Recorder:
                 if message.kind == "capture":
                     self._capture(message, now_ns)
                 self.notes.append((self.seconds(now_ns), message))
-        self._sample_due(now_ns)
+        self._sample(now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         self.observed.alive(peer, up, now_ns)
-        self._sample_due(now_ns)
+        self._sample(now_ns)
 
     def finish(self, now_ns: int) -> None:
         """The run is over: its last sample is of its end."""
@@ -123,29 +125,29 @@ class Recorder:
         east_m, south_m = x_m - self.grid.west_m, self.grid.north_m - y_m
         self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
-    def _sample_due(self, now_ns: int) -> None:
-        fleet_ns, driven_ns = self.observed.fleet_ns, self.driven.at_ns
-        if fleet_ns is not None and (driven_ns is None or fleet_ns - driven_ns >= _TRACK_NS):
-            # By the time of the agents: vehicles without messages, as at the end of a run, are not at rest.
-            self.driven.add(fleet_ns, self.observed.vehicles(), self.observed.groups)
-        tracks_due, sample_due = self.vehicle_tracks.due(now_ns), now_ns >= self._sample_due_ns
-        if tracks_due:
-            self._sample_tracks(now_ns, self.observed.vehicles())
-        if sample_due:
+    def _sample(self, now_ns: int) -> None:
+        """Samples what is due: places and what vehicles have driven every half second, figures every second."""
+        if now_ns >= self._due_ns:
+            self._due_ns = now_ns + _TRACK_NS
+            self._sample_places(now_ns)
+        if now_ns >= self._sample_due_ns:
             self._add_sample(now_ns)
-        if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.observed.missing():
-            self.ready_ns = now_ns
 
-    def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
+    def _sample_places(self, now_ns: int) -> None:
+        observed, vehicles = self.observed, self.observed.vehicles()
+        if observed.fleet_ns is not None and observed.fleet_ns != self.driven.at_ns:
+            # By the time of the agents: vehicles without messages, as at the end of a run, are not at rest.
+            self.driven.add(observed.fleet_ns, vehicles, observed.groups)
         moving = np.isin(vehicles.states, _ON_THE_WAY)
         if len(self.routed) < self.scenario.vehicle_count:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
-        keys: list[TrackKey] = [(id, 0) for id in vehicles.ids]
-        self.vehicle_tracks.add(now_ns, keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
-        poses = sorted(self.observed.poses.items())
-        pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
-        places = [self.observed.place_m(pose) for _, pose in poses]
-        self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
+        places_m = np.stack([vehicles.east_m, vehicles.south_m], axis=1)
+        _track(self.vehicle_tracks, now_ns, ((id, 0) for id in vehicles.ids), places_m)
+        poses = sorted(observed.poses.items())
+        places = [observed.place_m(pose) for _, pose in poses]
+        _track(self.target_tracks, now_ns, ((id, pose.jumps) for id, pose in poses), np.array(places, np.float32))
+        if self.ready_ns is None and self.routed and not observed.missing():
+            self.ready_ns = now_ns
 
     def _add_sample(self, now_ns: int) -> None:
         self._sample_due_ns = now_ns + _SAMPLE_NS
@@ -203,7 +205,7 @@ class Recorder:
             "gap": self._gap(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_per_s": _mean(rates),
-            **results(observed, self.driven, self.scenario),
+            **history.results(observed, self.driven, self.scenario),
         }
         numbers = {name: _rounded(value) for name, value in fields.items()}
         return {"verdict": verdict(numbers, failures), **numbers}
@@ -244,6 +246,13 @@ class Recorder:
         """Driven cost over optimum, as the planners measured it."""
         gap = of_excess(self.observed.histogram("gap_excess"))
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
+
+
+def _track(tracks: Thinned[Sampling], now_ns: int, keys: Iterable[TrackKey], places_m: NDArray[np.float32]) -> None:
+    """Adds a sampling. The same keys come each time: they take most of the memory unless they are kept once."""
+    of, before = tuple(keys), tracks.last.keys if tracks.last else ()
+    if of:
+        tracks.add(Sampling(now_ns, before if before == of else of, places_m))
 
 
 _TOTALS = (

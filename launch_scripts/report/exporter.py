@@ -16,7 +16,6 @@ in the description of the layer, where the format has one. All formats but CSV a
 from __future__ import annotations
 
 import csv
-import datetime
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -138,8 +137,7 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
         if not form.driver:
             _write_csv(half, layers[0], frame)
             return
-        timed = [layer for layer in layers if any(each.time_ns is not None for each in layer.features)]
-        extra = map(_places_of, timed) if form.driver == "GPKG" else ()
+        extra = map(_places_of, filter(_is_timed, layers)) if form.driver == "GPKG" else ()
         for number, layer in enumerate([*layers, *extra]):
             _write_layer(half, layer, frame, form, append=number > 0)
 
@@ -164,21 +162,7 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
             layer, options = _gpx_points(layer), {}
     fields = {name: kind for name, (kind, _) in more.items()} | dict(layer.fields)
     columns = [_column(layer, name, kind, more.get(name, ("text", None))[1]) for name, kind in fields.items()]
-    shapes = np.empty(len(layer.features), object)
-    for n, feature in enumerate(layer.features):
-        parts = [_placed(part, frame) for part in feature.parts] if degrees else feature.parts
-        if not all(np.isfinite(part[:, :2]).all() for part in parts):
-            raise StoreError(
-                f"cannot write the layer {layer.name}: a place has no longitude and latitude in "
-                f"{frame.grid.crs[:60]}; write a .gpkg, which is in metres of the map"
-            )
-        match layer.shape:
-            case "Point":
-                shapes[n] = shapely.Point(parts[0][0])
-            case "LineString":
-                shapes[n] = shapely.LineString(parts[0])
-            case "Polygon":
-                shapes[n] = shapely.Polygon(parts[0], parts[1:])
+    shapes = _shapes(layer, frame, degrees)
     high = any(part.shape[1] == 3 for feature in layer.features for part in feature.parts)
     crs = "EPSG:4326" if form.driver in ("LIBKML", "GPX") else None
     if form.driver == "GPKG" and frame.grid.crs != "local":
@@ -207,6 +191,28 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
             )
     except (DataSourceError, DataLayerError) as error:
         raise StoreError(f"cannot write {path}: {error}") from error
+
+
+def _shapes(layer: Layer, frame: MapFrame, degrees: bool) -> NDArray[Any]:
+    """The geometries of a layer, in degrees or in metres of the map."""
+    import shapely
+
+    shapes = np.empty(len(layer.features), object)
+    for n, feature in enumerate(layer.features):
+        parts = [_placed(part, frame) for part in feature.parts] if degrees else feature.parts
+        if not all(np.isfinite(part[:, :2]).all() for part in parts):
+            raise StoreError(
+                f"cannot write the layer {layer.name}: a place has no longitude and latitude in "
+                f"{frame.grid.crs[:60]}; write a .gpkg, which is in metres of the map"
+            )
+        match layer.shape:
+            case "Point":
+                shapes[n] = shapely.Point(parts[0][0])
+            case "LineString":
+                shapes[n] = shapely.LineString(parts[0])
+            case "Polygon":
+                shapes[n] = shapely.Polygon(parts[0], parts[1:])
+    return shapes
 
 
 def _is_timed(layer: Layer) -> bool:
@@ -273,8 +279,13 @@ def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
     is one row, with its shape as WKT, longitude first."""
     layer = _places_of(layer) if _is_timed(layer) else layer
     placed = frame.grid.crs != "local"
-    names, where = ["wkt"], [[_wkt(layer, each, frame)] for each in layer.features if layer.shape != "Point"]
-    if layer.shape == "Point":
+    if layer.shape != "Point":
+        import shapely
+
+        digits = 8 if placed else 3
+        texts = shapely.to_wkt(_shapes(layer, frame, placed), rounding_precision=digits, output_dimension=2)
+        names, where = ["wkt"], [[text] for text in texts]
+    else:
         points = np.concatenate([np.empty((0, 2)), *(each.parts[0][:, :2] for each in layer.features)])
         degrees = _placed(points, frame)[:, ::-1].round(8) if placed else np.empty((len(points), 0))
         names = ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
@@ -284,15 +295,6 @@ def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
         writer.writerow([*layer.fields, *names])
         for feature, place in zip(layer.features, where, strict=True):
             writer.writerow([*(_cell(feature.values[name]) for name in layer.fields), *place])
-
-
-def _wkt(layer: Layer, feature: Feature, frame: MapFrame) -> str:
-    placed = frame.grid.crs != "local"
-    parts = [(_placed(part, frame) if placed else part).round(8 if placed else 3) for part in feature.parts]
-    texts = [", ".join(" ".join(map(str, place)) for place in part[:, :2].tolist()) for part in parts]
-    if layer.shape == "LineString":
-        return f"LINESTRING ({texts[0]})"
-    return f"POLYGON ({', '.join(f'({text})' for text in texts)})"
 
 
 def _cell(value: Value) -> Any:
@@ -313,8 +315,7 @@ def iso_time(value: Any) -> Any:
         value = moment(value)
     if not isinstance(value, np.datetime64):
         return value
-    at = datetime.datetime.fromtimestamp(int(value.astype(np.int64)) / 1000, datetime.UTC)
-    return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return f"{np.datetime_as_string(value, 'ms')}Z"
 
 
 def in_degrees(points: Points, frame: MapFrame) -> Points:

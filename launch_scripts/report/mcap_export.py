@@ -37,7 +37,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
     headings_along,
     ros_name,
 )
-from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
+from launch_scripts.gateways.ros2.ros_types import RosTypes, types_of
 from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, read_report
@@ -72,7 +72,7 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     if not any(len(each.time_ns) for each in (*tracks.vehicles, *tracks.targets)):
         raise ConfigError(f"{folder} has no tracks: no messages about vehicles and targets")
     (path,) = free_places(folder, [f"{run}.mcap"], out, force)
-    types = types_of(Distribution.JAZZY)
+    types = types_of("jazzy")
     timeline = _Timeline(RosMessages(types, RosMap(tracks.grid)), tracks, ground, _colours(report))
     counts = _write(path, timeline.messages_in_order(lines), types, _facts(run, report, tracks.grid))
     topics = ", ".join(f"{count:,} {topic}" for topic, count in sorted(counts.items()))

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.observe.history import tracks_of
 from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.pyramid import Level
@@ -156,7 +157,7 @@ def packed_tracks(recorder: Recorder) -> bytes:
     began_ns, marked, routes = observed.began_ns or 0, observed.marked(), [each.route for each in begun]
     columns: dict[str, Any] = {}
     for of, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
-        lines = dict(sorted(tracks.lines().items()))
+        lines = dict(sorted(tracks_of(tracks.kept).items()))
         columns |= {
             f"{of}_id": [id for id, _ in lines],
             f"{of}_piece": [piece for _, piece in lines],

@@ -75,7 +75,7 @@ def test_a_pod_of_the_example_may_and_writes_no_more_than_it_must(name: str) -> 
 
 def takes(words: list[str], address: str) -> bool:
     """The command line has a role which takes the words of a container."""
-    taken = command().commands["role"].commands[words[1]].make_context(words[1], words[2:]).params
+    taken = command().commands["role"].make_context("role", words[1:]).params
     given = [taken[name] for name in ("health_port", "signals_address", "log_format", "scenario")]
     return given == [HEALTH_PORT, address, "json", "/etc/swarm/scenario.toml"]
 

@@ -14,12 +14,12 @@ from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
 from launch_scripts.gateways.ros2.ros_messages import RosMap
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.client import Observer, Swarm, connect
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-TYPES = types_of(Distribution.JAZZY)
+TYPES = types_of("jazzy")
 OPTIONS = ("--no-live",)
 ALSO = """
 [[targets]]

@@ -21,7 +21,7 @@ from support.ros_peer import RosPeer, ros_router, write_definitions
 
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS, TABLE, Direction
 from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
@@ -30,7 +30,7 @@ from swarm.config.scenario import NetworkConfig
 pytestmark = pytest.mark.network
 
 OPTIONS = ("--no-live",)
-TYPES = types_of(Distribution.JAZZY)
+TYPES = types_of("jazzy")
 OUT = [row.name for row in TABLE if row.direction is Direction.OUT]
 
 
@@ -136,7 +136,7 @@ def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(
     elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
     eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
     elsewhere.close()
-    older = PeerNode(session, "old", types_of(Distribution.HUMBLE))
+    older = PeerNode(session, "old", types_of("humble"))
     older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
     eventually(lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble")
     older.close()

@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from launch_scripts.gateways.ros2 import topic_table
 from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
+from launch_scripts.gateways.ros2.ros_types import Distribution
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import is_loopback
@@ -28,7 +29,6 @@ MOST_HZ, MOST_ROBOT_HZ = 100.0, 50.0
 """Bounds of rates. A robot's topic is read once a turn of the gateway, which takes `TICK_S`, 0.02 s: more than 50
 times a second the swarm cannot hear of it. Bounds of topics to ROS are twice that and are never reached."""
 
-DistributionName = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
 NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}\Z")]
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)\Z")]
 RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}\Z")]
@@ -52,7 +52,7 @@ class RosSide(Section, frozen=True, kw_only=True):
     endpoint: str = ROS_ENDPOINT
     in_the_clear: bool = False
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
-    distribution: DistributionName = "jazzy"
+    distribution: Distribution = "jazzy"
     node: NodeName = "swarm_gateway"
 
 

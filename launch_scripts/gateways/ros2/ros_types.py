@@ -6,9 +6,8 @@ a char[16]). And it knows no services, so those in use are stated below, with th
 
 from __future__ import annotations
 
-from enum import StrEnum
-from functools import lru_cache
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -24,18 +23,8 @@ _DTYPES = {"byte": "uint8", "char": "uint8", "string": "object"}
 REQUEST, RESPONSE, _EVENT = "_Request", "_Response", "_Event"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _GID: Any = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
-
-
-class Distribution(StrEnum):
-    """ROS 2 distribution of the peers: it determines the hashes of types, which are part of every key."""
-
-    HUMBLE = "humble"
-    JAZZY = "jazzy"
-    KILTED = "kilted"
-    LYRICAL = "lyrical"
-    ROLLING = "rolling"
-
-
+Distribution = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
+"""ROS 2 distribution of the peers: it determines the hashes of types, which are part of every key."""
 _ADDED = {
     "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\n"
     "uint32 width\nuint32 height\nint8[] data",
@@ -58,7 +47,7 @@ class RosTypes:
 
     def __init__(self, distribution: Distribution) -> None:
         self.distribution = distribution
-        rolling = distribution is Distribution.ROLLING
+        rolling = distribution == "rolling"
         self._store = get_typestore(Stores.LATEST if rolling else Stores[f"ROS2_{distribution.upper()}"])
         for name, text in _ADDED.items():
             if name not in self._store.fielddefs:
@@ -95,7 +84,7 @@ class RosTypes:
 
     def hash_of(self, name: str) -> str:
         """RIHS01_... of a message or a service (of the service itself, not of its parts)."""
-        return NO_HASH if self.distribution is Distribution.HUMBLE else self._store.hash_rihs01(name)
+        return NO_HASH if self.distribution == "humble" else self._store.hash_rihs01(name)
 
     def definition_of(self, name: str) -> str:
         """The definition of a message with those that it is made of, as recordings keep it."""
@@ -143,7 +132,7 @@ class RosTypes:
             raise ProtocolError(f"{name} of {len(content)} bytes is not CDR of its type: {error}") from error
 
 
-@lru_cache(maxsize=len(Distribution))
+@cache
 def types_of(distribution: Distribution) -> RosTypes:
     """The types of a distribution, loaded once: it takes a sixth of a second."""
     return RosTypes(distribution)

@@ -19,7 +19,7 @@ from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client import Frame, Observer, Swarm, SwarmError
 from swarm.errors import BusError, ConfigError
@@ -50,9 +50,7 @@ def serve(
         swarm: Swarm | None = connect()
         while swarm is not None:
             with swarm, swarm.observer(every_s=_POSITIONS_S) as observer:
-                node = Node(
-                    ros, settings.ros.node, types_of(Distribution(settings.ros.distribution)), settings.ros.domain
-                )
+                node = Node(ros, settings.ros.node, types_of(settings.ros.distribution), settings.ros.domain)
                 run = _Run(settings, node, swarm, observer, runs, say)
                 try:
                     while not stopping() and swarm.ended is None:

@@ -16,7 +16,7 @@ from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.history import BegunRoute, Tracks
+from launch_scripts.observe.history import BegunRoute, Sampling, Thinned, tracks_of
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.summed_counts import CertifiedGap
@@ -264,7 +264,7 @@ def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(record
 def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> None:
     for n in range(4):
         hear(recorder, pose("t0", 100.0 + n, 200.0, n, captures=int(n >= 2)), at_s=float(n))
-    lines = recorder.target_tracks.lines()
+    lines = tracks_of(recorder.target_tracks.kept)
     assert lines[("t0", 0)][1].tolist() == [[100.0, 200.0], [101.0, 200.0]]
     assert lines[("t0", 1)][1].tolist() == [[102.0, 200.0], [103.0, 200.0]]
 
@@ -390,11 +390,10 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
 
 
 def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
-    tracks = Tracks(interval_ns=1, limit=100)
+    samplings = Thinned[Sampling](100, lambda sampling: len(sampling.keys))
     for now_ns in range(1000):
-        if tracks.due(now_ns):
-            tracks.add(now_ns, [("a", 0), ("b", 0)], np.full((2, 2), now_ns, np.float32))
-    times_ns, places = tracks.lines()["a", 0]
+        samplings.add(Sampling(now_ns, (("a", 0), ("b", 0)), np.full((2, 2), now_ns, np.float32)))
+    times_ns, places = tracks_of(samplings.kept)["a", 0]
     assert 25 <= len(places) <= 51
     assert (times_ns == places[:, 0]).all()
     assert (places[0, 0], places[-1, 0] > 900) == (0, True)
@@ -408,7 +407,7 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
         for at_s in range(from_s, until_s, step_s):
             places = {f"a0-{n:02d}": (float(at_s % 900), 5.0) for n in range(4)}
             hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s), capture("t0", 7), at_s=at_s)
-        kept = [recorder.vehicle_tracks._samplings, recorder.target_tracks._samplings]
+        kept = [recorder.vehicle_tracks, recorder.target_tracks]
         for each in kept:
             each._limit = 2000
         return len(pickle.dumps([recorder.captures, *(each.kept for each in (recorder.samples, *kept))]))

@@ -23,7 +23,7 @@ from support.command import Swarm
 from support.fake_run import BEGAN_NS, little_scenario, played
 from support.map_strategies import set_of
 
-from launch_scripts.observe.history import BegunRoute
+from launch_scripts.observe.history import BegunRoute, tracks_of
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.exporter import in_degrees, write_layers
 from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
@@ -79,7 +79,7 @@ def test_a_geojson_has_every_place_and_time_in_wgs84(
     assert (code, "4 vehicle_tracks" in out) == (0, True)
     layers = read_layers(tmp_path)
     assert len(layers["captures"]) == len(recorder.captures) > 0
-    lines = recorder.vehicle_tracks.lines()
+    lines = tracks_of(recorder.vehicle_tracks.kept)
     for feature in layers["vehicle_tracks"]:
         said = feature["properties"]
         points = np.array(feature["geometry"]["coordinates"])

@@ -33,13 +33,13 @@ from launch_scripts.gateways.ros2.incoming.readings import (
 )
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import MOST_M_PER_S
 
-TYPES = types_of(Distribution.JAZZY)
+TYPES = types_of("jazzy")
 GRID = GridSpec(12, 16, 10.0, 5000.0, 70_000.0)
 MAP = RosMap(GRID)
 NUMBERS = st.floats() | st.floats(-50, 250)

@@ -35,7 +35,7 @@ GRIDS = st.builds(
 GRID = GridSpec(4, 6, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 
 
-def maker(grid: GridSpec = GRID, distribution: Distribution = Distribution.JAZZY) -> RosMessages:
+def maker(grid: GridSpec = GRID, distribution: Distribution = "jazzy") -> RosMessages:
     return RosMessages(types_of(distribution), RosMap(grid))
 
 

@@ -19,10 +19,10 @@ from launch_scripts.gateways.ros2.incoming.robot import Robot
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
-from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.clock import NS_PER_S
 
-TYPES = types_of(Distribution.JAZZY)
+TYPES = types_of("jazzy")
 
 
 class Questions:

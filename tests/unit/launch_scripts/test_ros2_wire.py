@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import zenoh
@@ -36,18 +36,18 @@ NODE = rmw.NodeName(0, "54c1e0b8e18f2313ebc2c48bce10effe", "swarm_gateway")
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,2}", fullmatch=True)
 
 
-@pytest.mark.parametrize("distribution", [each for each in Distribution if each is not Distribution.HUMBLE])
+@pytest.mark.parametrize("distribution", [each for each in get_args(Distribution) if each != "humble"])
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_hashes_are_those_that_ros_publishes(distribution: Distribution, name: str) -> None:
     assert types_of(distribution).hash_of(name).startswith(f"RIHS01_{PUBLISHED[name]}")
 
 
 def test_humble_has_no_hashes() -> None:
-    assert types_of(Distribution.HUMBLE).hash_of("nav_msgs/msg/Path") == rmw.NO_HASH
+    assert types_of("humble").hash_of("nav_msgs/msg/Path") == rmw.NO_HASH
 
 
 def test_key_and_token_of_a_latched_map() -> None:
-    hash = types_of(Distribution.JAZZY).hash_of("nav_msgs/msg/OccupancyGrid")
+    hash = types_of("jazzy").hash_of("nav_msgs/msg/OccupancyGrid")
     endpoint = rmw.Endpoint(
         NODE, 4, rmw.Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", hash, rmw.Qos.LATCHED.value
     )
@@ -104,21 +104,21 @@ def test_other_attachments_are_refused(content: bytes) -> None:
 
 
 def test_an_empty_request_is_one_byte() -> None:
-    types = types_of(Distribution.JAZZY)
+    types = types_of("jazzy")
     request = types.make("std_srvs/srv/Trigger_Request", structure_needs_at_least_one_member=0)
     assert types.pack(request, "std_srvs/srv/Trigger_Request") == b"\0\1\0\0\0"
 
 
 @given(st.binary(max_size=200), st.sampled_from(sorted(set(PUBLISHED) - {n for n in PUBLISHED if "/srv/" in n})))
 def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, name: str) -> None:
-    types = types_of(Distribution.JAZZY)
+    types = types_of("jazzy")
     for each in (content, b"\0\1\0\0" + content, b"\0\0\0\0" + content):
         with suppress(ProtocolError):
             types.unpack(each, name)
 
 
 def test_the_newest_message_waits_until_somebody_asks_and_is_taken_once() -> None:
-    types, name = types_of(Distribution.JAZZY), "std_msgs/msg/String"
+    types, name = types_of("jazzy"), "std_msgs/msg/String"
     node: Any = SimpleNamespace(types=types, dropped=lambda topic, error: None)
     newest = Newest(node, SimpleNamespace(topic="/said", type_name=name), 100)  # type: ignore[arg-type]
     for word in ("old", "new"):
