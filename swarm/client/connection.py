@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -158,7 +159,7 @@ _ASK_S = 1.0
 
 
 class Swarm:
-    """A running swarm. Made by `connect`; use it in a `with`, or `close` it at the end.
+    """A running swarm. Made by `connect`; use it in a `with`, or `close` it. The end of the program does it, too.
 
     It may be used from any thread. Callbacks come on a thread of its own, one after the other.
 
@@ -332,7 +333,9 @@ class Swarm:
         self._session.on_problem(callback)
 
     def close(self) -> None:
-        """Takes away all vehicles and targets of this program, and leave. May be repeated."""
+        """Takes away all vehicles and targets of this program, and leaves. May be repeated; the end of the program
+        does it, too."""
+        atexit.unregister(self.close)
         for external in self._externals:
             external.close()
         self._stop()
@@ -397,7 +400,9 @@ def connect(
     def trust() -> None:
         bus.trust(authenticator_of(network, session.run.run_id))
 
-    return Swarm(session, stop, open_trusted, trust)
+    swarm = Swarm(session, stop, open_trusted, trust)
+    atexit.register(swarm.close)  # an open session of Zenoh aborts the interpreter at its exit
+    return swarm
 
 
 def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tuple[RunInfo, int]:

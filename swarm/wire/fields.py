@@ -180,7 +180,8 @@ MOST_VEHICLES = 1000
 """Limit for one agent: the largest number in a scenario."""
 MOST_IDS = 1 << 12
 """Agents, authors or targets in one message."""
-SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
+MOST_LARGE = 100_000
+SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=MOST_LARGE)
 """Bounds of lists and maps: as many as an agent has vehicles, or as one request may name cells."""
 IDS = Meta(max_length=MOST_IDS)
 

@@ -53,6 +53,22 @@ def test_a_complete_program_has_twenty_lines_at_most(name: str) -> None:
     assert len([line for line in (EXAMPLES / name).read_text().splitlines() if line.strip()]) <= 20
 
 
+def test_a_program_that_ends_without_closing_ends_well_and_its_vehicle_leaves(
+    live: LiveSwarm, swarm: Swarm
+) -> None:
+    text = """
+from swarm.client import connect
+swarm = connect("tcp/127.0.0.1:7447")
+rover = swarm.vehicle("short", lease_s=10.0)
+rover.at(*swarm.frame.centre_m(0))
+rover.route("t0", timeout_s=20.0)
+"""
+    with swarm.observer() as watching:
+        run = Run(text, live.endpoint)
+        assert (run.end(within_s=40), run.process.returncode) == ("", 0)
+        eventually(lambda: "short" not in watching.vehicles, 3, "the vehicle's leaving")
+
+
 def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live: LiveSwarm, swarm: Swarm) -> None:
     with swarm.observer() as watching:
         run = Run((EXAMPLES / "vehicle.py").read_text(), live.endpoint)

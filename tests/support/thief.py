@@ -77,11 +77,16 @@ class Thief(Process):
         return actions if stored is None else [replace(self.lied_about(stored), epoch=max(epoch - 4, 1), seq=9)]
 
     def lied_about(self, table: Table) -> Table:
-        """The table with a lie of any kind."""
+        """The table with a lie of any kind, whole or as changes since an earlier one."""
+        member = self.rights._members.get(table.shard)
+        if table.since is not None and member is not None:
+            table = member.stored
         lie = self.chance.choice(
             (self.stolen_from, self.stolen_from, self.added_to, self.dropped_from, self.reordered, self.replayed)
         )
-        return lie(table)
+        told, bases = lie(table), [] if member is None else [*member._bases.values()]
+        bases = [base for base in bases if base.epoch == told.epoch]
+        return told.changes(self.chance.choice(bases)) if bases and self.chance.random() < 0.5 else told
 
     def added_to(self, table: Table) -> Table:
         """Free cells are given to a vehicle of its own, of another, or to one that does not exist."""
@@ -234,12 +239,13 @@ class ThiefWorld(TrafficWorld):
         return [member.stored for process in self.processes for member in process.rights._members.values()]
 
     def is_of_one_mind(self, shard: int) -> bool:
-        """True if all honest members of a shard have the same table on file, and all honest hosts with vehicles
+        """True if all honest members of a shard had one table on file lately, and all honest hosts with vehicles
         there know one of its epoch: they have the words of a majority."""
-        stored = [table for table in self.files() if table.shard == shard]
+        seats = [seats[shard] for process in self.processes if shard in (seats := process.rights._members)]
         hosts = [process.rights.holdings for process in self.processes]
         epochs = {host._entries.knows.get(shard, (0, 0))[0] for host in hosts if shard in host.shards}
-        return all(table == stored[0] and epochs <= {table.epoch} for table in stored)
+        same = [base for stamp, base in seats[0]._bases.items() if all(s._bases.get(stamp) == base for s in seats)]
+        return any(epochs <= {table.epoch} for table in same)
 
     def restart(self, process: Process) -> None:
         if process.agent != self.stolen or not self.quiet:

@@ -6,7 +6,7 @@ their own host, or by proof that its generation has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agents import agent_of
@@ -98,6 +98,11 @@ class Orders:
     def by_host_count(self, host: str) -> int:
         """The number of entries of a host."""
         return sum(len(self.of[vehicle]) for vehicle in self.by_host.get(host, ()))
+
+    def has(self, cell: int, vehicles: Collection[str]) -> bool:
+        """Returns True if one of these vehicles has an entry of a cell, by its host's newest generation."""
+        order = self.order(cell).items()
+        return any(vehicle in vehicles and number not in self._fences for number, vehicle in order)
 
     def is_fenced(self, cell: int) -> bool:
         """Returns True if an earlier generation of a host may be on a cell, or enter it."""
@@ -254,6 +259,8 @@ class Orders:
     def remove(self, host: str, holds: Mapping[str, Iterable[Number]], knows: Stamp) -> None:
         """Drops the entries that a host which knows a table does not hold any more."""
         for vehicle in list(self.by_host.get(host, ())):
+            if vehicle in holds and holds[vehicle] == self._held.get(vehicle):
+                continue
             held, entries = [*holds.get(vehicle, ())], self.of[vehicle]
             kept = [entry for entry in entries if entry in held or entry[1:] > knows]
             if len(kept) < len(entries):

@@ -32,6 +32,9 @@ SLOW_NS = 3 * NS_PER_S // 10
 """Above this round trip a link is reported as slow: an election then takes longer than on a fast link."""
 _ASKED_KEPT = 16
 """Tables and claims of which it is kept when they were sent."""
+_BASES_KEPT = 8
+"""Tables on file from which changes can be told: on links so slow that members are further behind, tables come
+whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +143,10 @@ class Member:
         self._said = self._other_said = (0, 0)
         """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
-        self._has: dict[str, Stamp] = {}
-        """Other member -> the table that it said last to have stored."""
+        self._has: dict[str, tuple[Stamp, int]] = {}
+        """Other member -> the table that it said last to have stored, and when."""
+        self._bases = {stored.stamp: stored}
+        """Stamp -> table, of those that were stored last."""
 
     # --- timeouts -------------------------------------------------------------------------------------------
 
@@ -216,9 +221,16 @@ class Member:
         self._led(now_ns, table.agent)
         actions: list[MemberAction] = []
         if table.stamp > self.stored.stamp:
+            if table.since is not None:
+                base = self._bases.get(table.since) if table.since[0] == table.epoch else None
+                whole = None if base is None else table.whole(base)
+                if whole is None:
+                    return [self.on_file]  # by which the leader knows what we lack
+                table = whole
             if not self._accepts(table):
                 return self._words(now_ns)
-            self.promised, self.stored = table.epoch, table
+            self.promised = table.epoch
+            self._store(table)
             if table.without in self._distrusted:
                 self._distrusted.clear()
             actions.append(Save(self.promised, self.stored))
@@ -228,6 +240,11 @@ class Member:
             if self._shards.leader(self.shard, table.epoch + 1) == self._me:
                 actions.append(self._say(now_ns))
         return actions
+
+    def _store(self, table: Table) -> None:
+        self.stored = self._bases[table.stamp] = table
+        if len(self._bases) > _BASES_KEPT:
+            del self._bases[next(iter(self._bases))]
 
     def _say(self, now_ns: int) -> Stored:
         self._said, self._said_ns = self.stored.stamp, now_ns
@@ -268,7 +285,7 @@ class Member:
         return [Save(self.promised, self.stored), self.stored]
 
     def hear_promise(self, member: str, epoch: int, table: Table, now_ns: int) -> None:
-        if member not in self._others:
+        if member not in self._others or table.since is not None:
             return
         self._answered(member, (epoch, 0), now_ns)
         if epoch == self._claimed and epoch == self.promised:
@@ -279,13 +296,11 @@ class Member:
         """Takes acknowledgements as leader, and grants by the tables that are on file now."""
         if stored.agent not in self._others:
             return []
-        self._has[stored.agent] = (stored.epoch, stored.seq)
+        self._has[stored.agent] = (stored.epoch, stored.seq), now_ns
         if self.leader is not None and all(
-            self._has.get(member, (0, 0)) > (self.leader.epoch, 0) for member in self._trusted
+            member in self._has and self._has[member][0] > (self.leader.epoch, 0) for member in self._trusted
         ):
             self._distrusted.clear()
-        if stored.seq and stored.agent == self._shards.leader(self.shard, stored.epoch):
-            return self._hear_same(stored, now_ns)
         self._other_said = max(self._other_said, (stored.epoch, stored.seq))
         if self.leader is None:
             return []
@@ -297,19 +312,6 @@ class Member:
         if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
         return []
-
-    def _hear_same(self, stored: Stored, now_ns: int) -> list[MemberAction]:
-        """Handles a leader's repetition of a table by its number. A member that has it replies as if it had come
-        whole; one with an older table says so, and gets the whole. A member with a newer one is silent: two that
-        both reply would never end."""
-        stamp = (stored.epoch, stored.seq)
-        if stored.epoch < self.promised:
-            return [Stored(shard=self.shard, agent=self._me, epoch=self.promised, seq=0)]
-        if self.leader is not None and stored.epoch > self.leader.epoch:
-            self.leader = None
-        if stamp == self.stored.stamp:
-            return self.hear_table(self.stored, now_ns)
-        return [self.on_file] if stamp > self.stored.stamp else []
 
     def _on_file(self, leader: Leader, seq: int, now_ns: int) -> list[MemberAction]:
         """Another member has stored the table of this number, or a later one: with ours that is a majority."""
@@ -354,19 +356,22 @@ class Member:
         if table is not None:
             self._ask(table.stamp, now_ns)
             if table is not self.stored:
-                self.stored = table
+                self._store(table)
                 self._told = [*self._told[-TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
-            # A table on file with both others needs no more than its number: at rest tables were a fifth of all
-            # bytes.
-            answered = all(now_ns - acked_ns < 2 * HEARTBEAT_NS for acked_ns in self._acked_ns.values())
-            known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
-            actions.append(self.on_file if known and answered else table)
+            base = self._base(now_ns)
+            actions.append(table if base is None or base.epoch != table.epoch else table.changes(base))
             if self._witness is not None:
                 actions += leader.granted(table, now_ns)  # the hosts count the members' words
             elif self._shards.majority == 1:
                 actions += self._on_file(leader, table.seq, now_ns)
         return actions
+
+    def _base(self, now_ns: int) -> Table | None:
+        """Returns the newest table which all members that have spoken lately have on file, if we know it: they need
+        no more than changes since that."""
+        has = [stamp for stamp, said_ns in self._has.values() if now_ns - said_ns < 2 * HEARTBEAT_NS]
+        return self._bases.get(min(has)) if has else None
 
     def _take_charge(self, now_ns: int) -> None:
         promises = [table for member, table in self._promises.items() if member not in self._distrusted]

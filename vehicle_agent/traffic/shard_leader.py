@@ -278,16 +278,14 @@ class Leader:
 
     def _content_of(self, table: Table) -> dict[str, _Content]:
         """Returns host -> what is new to it in the table that has just been made."""
-        orders, cols = self._orders, self._shards.grid.cols
-        held, followed = orders.orders.keys(), orders.followed()
+        orders, cols, followed = self._orders, self._shards.grid.cols, self._orders.followed()
         found: dict[str, _Content] = {}
         for name, host in self._hosts.items():
             grants, waits = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
             stands = () if host.standing is None else host.standing.vehicles
-            others = held - {each[0] for vehicle in grants for each in orders.of[vehicle]}
-            near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
-            occupied = sorted(others.intersection(chain.from_iterable(near)))
+            near = set[int]().union(*(cells_beside(stand.end, cols) for stand in stands))
+            occupied = sorted(cell for cell in near & orders.orders.keys() if not orders.has(cell, grants))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             generation, heard = table.hosts.get(name, (0, 0))
             behind, awaited = followed.get(name, {}), 0 if stands else heard
@@ -400,8 +398,9 @@ class Leader:
 
     def _is_near(self, cell: int, vehicle: str) -> bool:
         """Returns True if another vehicle has an entry of a cell, or of one beside it."""
-        orders = map(self._orders.order, (cell, *cells_beside(cell, self._shards.grid.cols)))
-        return any(other != vehicle for order in orders for other in order.values())
+        held = self._orders.orders
+        near = (held[each] for each in (cell, *cells_beside(cell, self._shards.grid.cols)) if each in held)
+        return any(other != vehicle for order in near for other in order.values())
 
     def _may_follow(self, stand: Stand, order: Mapping[Number, str]) -> bool:
         """Returns True if a vehicle may be put behind those in an order."""

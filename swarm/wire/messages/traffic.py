@@ -9,9 +9,23 @@ from typing import Annotated
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import replace
 
 from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS
-from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Shard, VehicleId
+from swarm.wire.fields import (
+    IDS,
+    LARGE,
+    MOST_IDS,
+    MOST_LARGE,
+    SMALL,
+    Bounded,
+    Cell,
+    Id,
+    Natural,
+    Part,
+    Shard,
+    VehicleId,
+)
 from swarm.wire.messages import Message, schema_of
 
 Stamp = tuple[Natural, Natural]
@@ -22,6 +36,7 @@ Before = tuple[Natural, Natural, VehicleId]
 """(epoch, seq, vehicle) of another entry of the same cell."""
 _MOST_CELLS = 1 << 32
 """Cells of the largest grid; as those of a `Cell`, the cells of an entry may lie outside the grid."""
+_LEAST_CELL = -_MOST_CELLS // 2
 _Turn = Annotated[int, Meta(gt=-2 * _MOST_CELLS, lt=2 * _MOST_CELLS)]
 _Run = Annotated[int, Meta(ge=1, le=64)]
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
@@ -53,13 +68,16 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
         return cls(cells[0], turns, [(*stamp, len([*run])) for stamp, run in runs])
 
     def __post_init__(self) -> None:
-        cells = [*self.cells, 0]
-        if (
-            sum(run[2] for run in self.stamps) != len(cells) - 1
-            or max(cells) >= _MOST_CELLS
-            or min(cells) < -_MOST_CELLS // 2
+        stamps = self.stamps
+        count = stamps[0][2] if len(stamps) == 1 else sum(run[2] for run in stamps)
+        if count != len(self):
+            raise ValueError("expected as many stamps as cells")
+        # No cell is further from the first than this, and most are near: that is known without computing each.
+        reach = count * sum(map(abs, self.turns))
+        if not _LEAST_CELL + reach <= self.first < _MOST_CELLS - reach and not all(
+            _LEAST_CELL <= cell < _MOST_CELLS for cell in self.cells
         ):
-            raise ValueError("expected as many stamps as cells, and cells of 32 bits")
+            raise ValueError("expected cells of 32 bits")
 
     def __len__(self) -> int:
         return len(self.turns) + 1 if self.stamps else 0
@@ -163,6 +181,8 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     pushed  vehicle -> the age with which it is to make way into another shard
     without name that was revoked: a leader began with what two of three other members had on file, or with a table
             that followed from such a one
+    since   stamp of an earlier table of the same epoch: `hosts` and `grants` have only what differs from that, an
+            empty one for a vehicle that has no entry any more. None if the table is whole
     """
 
     shard: Shard
@@ -174,10 +194,29 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     fences: Annotated[list[Fence], IDS] = []
     pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
     without: Id | None = None
+    since: Stamp | None = None
 
     @property
     def stamp(self) -> Stamp:
         return self.epoch, self.seq
+
+    def changes(self, base: Table) -> Table:
+        """Returns the same table for members that have an earlier one on file."""
+        if not base.hosts.keys() <= self.hosts.keys():
+            return self
+        hosts = {host: said for host, said in self.hosts.items() if base.hosts.get(host) != said}
+        grants = {vehicle: held for vehicle, held in self.grants.items() if base.grants.get(vehicle) != held}
+        grants.update((vehicle, _NONE_HELD) for vehicle in base.grants if vehicle not in self.grants)
+        return replace(self, hosts=hosts, grants=grants, since=base.stamp)
+
+    def whole(self, base: Table) -> Table | None:
+        """Returns the table of which this one has the changes since a base; None if it is too large to be true."""
+        hosts, grants = {**base.hosts, **self.hosts}, {**base.grants, **self.grants}
+        for vehicle, held in self.grants.items():
+            if not held.stamps:
+                del grants[vehicle]
+        fits = len(hosts) <= MOST_IDS and len(grants) <= MOST_LARGE
+        return replace(self, hosts=hosts, grants=grants, since=None) if fits else None
 
 
 class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):

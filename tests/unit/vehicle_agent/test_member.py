@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec.structs import replace
 from support.shard_tables import (
     MEMBERS,
     SHARDS,
@@ -13,6 +14,7 @@ from support.shard_tables import (
 )
 
 from swarm.right_of_way.incarnations import HEARTBEAT_NS
+from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
 from vehicle_agent.traffic.member import Member, Refused, Save
 
@@ -63,54 +65,67 @@ def leader_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
     return member, table
 
 
-def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_it() -> None:
+def test_members_that_answer_are_told_what_has_changed_since_the_table_that_all_of_them_have() -> None:
     member, table = leader_that_told({"a0": ["a0-00"]})
     now_ns = 2 * S
-    number = Stored(shard=0, agent=MEMBERS[0], epoch=table.epoch, seq=table.seq)
-    for stored, told in (
-        ((table.seq, None), table),  # the second has not said anything
-        ((table.seq, table.seq), number),
-        ((table.seq, table.seq - 1), table),  # it has lost its table, or its word was late: the whole does no harm
-        ((None, table.seq), number),
+    for stored, base in (
+        ((table.seq, None), table),  # the third has not said anything: it does not count
+        ((table.seq, table.seq), table),
+        ((table.seq, table.seq - 1), None),  # it has lost its table, or its word was late
+        ((None, table.seq), table),
     ):
         now_ns += HEARTBEAT_NS
         member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
         for other, seq in zip(MEMBERS[1:], stored, strict=True):
             if seq is not None:
                 member.hear_stored(Stored(shard=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
+        told = table if base is None else table.changes(base)
         assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
     now_ns += 2 * HEARTBEAT_NS
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
-    assert member.tick(now_ns) == [table]  # no member has answered the number
+    assert member.tick(now_ns) == [table]  # no member has answered
 
 
-def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
+def test_changes_are_answered_as_the_table_that_they_stand_for() -> None:
     first, second = (
         Member(SHARDS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
     )  # of epoch 1
-    same = Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=4)
-    lags = [Stored(shard=0, agent=MEMBERS[2], epoch=0, seq=0)]
-    assert first.hear_stored(same, S) == lags  # it needs the whole table
-    assert [first.hear_table(table_of(1, 4), S)[-1]] == first.hear_stored(same, S) == [first.on_file]
-    second.hear_table(table_of(1, 4), S)
+    tables = [table_of(1, 3, a1=[2]), table_of(1, 4, a0=[1], a1=[2, 3]), table_of(1, 5, a0=[1])]
+    tables[2] = replace(tables[2], hosts={**tables[1].hosts, **tables[2].hosts})
+    changes = tables[1].changes(tables[0])
+    lacks = [Stored(shard=0, agent=MEMBERS[2], epoch=0, seq=0)]
+    assert first.hear_table(changes, S) == lacks  # it needs the whole table
+    first.hear_table(tables[0], S)
+    assert first.hear_table(changes, S) == [Save(1, tables[1]), first.on_file]
+    assert first.hear_table(changes, S) == [first.on_file]
+    assert first.hear_table(tables[2].changes(tables[0]), S) == [Save(1, tables[2]), first.on_file]  # an older base
+    assert first.hear_table(changes, S) == []  # it came late
+    second.hear_table(tables[1], S)
     assert second.tick(S) == [second.on_file]
-    second.hear_stored(first.on_file, 2 * S)
-    assert second.hear_stored(same, 2 * S) == []
+    second.hear_stored(Stored(shard=0, agent=MEMBERS[2], epoch=1, seq=4), 2 * S)
+    assert second.hear_table(tables[1].changes(tables[1]), 2 * S) == []
     assert second.tick(2 * S) == [second.on_file]
-    assert second.hear_claim(2, 2 * S + HEARTBEAT_NS) == []  # the sender of a number leads, too
-    assert first.hear_stored(Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # the table came late
 
 
-def test_a_number_of_a_later_epoch_ends_a_leader_and_one_of_an_earlier_epoch_is_told_so() -> None:
+def test_changes_of_a_later_epoch_end_a_leader_and_those_of_an_earlier_epoch_are_told_so() -> None:
     member, table = leader_that_told({"a0": ["a0-00"]})
     later = next(
         epoch for epoch in range(table.epoch + 1, table.epoch + 3) if SHARDS.leader(0, epoch) == MEMBERS[1]
     )
-    assert member.hear_stored(Stored(shard=0, agent=MEMBERS[1], epoch=later, seq=7), 2 * S) == [member.on_file]
+    changes = table_of(later, 7).changes(table_of(later, 6))
+    assert member.hear_table(changes, 2 * S) == [member.on_file]
     assert member.leader is None
+    of_another_epoch = replace(changes, since=member.stored.stamp)
+    assert member.hear_table(of_another_epoch, 2 * S) == [member.on_file]
     member = member_of(promised=5)
-    old = Stored(shard=0, agent=MEMBERS[1], epoch=1, seq=7)
-    assert member.hear_stored(old, S) == [Stored(shard=0, agent=MEMBERS[0], epoch=5, seq=0)]
+    old = table_of(1, 7).changes(table_of(1, 6))
+    assert member.hear_table(old, S) == [Stored(shard=0, agent=MEMBERS[0], epoch=5, seq=0)]
+
+
+def test_changes_make_no_table_that_is_larger_than_a_message_may_be() -> None:
+    base = table_of(1, 3, **{f"a{n}": [n] for n in range(3)})
+    more = replace(table_of(1, 4), hosts={f"h{n}": (1, 1) for n in range(MOST_IDS - 2)}, since=base.stamp)
+    assert more.whole(base) is None
 
 
 def test_an_epoch_has_one_leader_only_though_a_promise_comes_twice() -> None:
