@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from launch_scripts.web.health_probe import fast
-from swarm.errors import EXTRAS, ConfigError, require
+from swarm.errors import EXTRAS, ConfigError, missing, require
 
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 _RUNS = ("demo", "up")
@@ -35,11 +35,7 @@ def main() -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OURS:
             raise  # a fault of ours
-        print(
-            f"swarm: the command needs {error.name}, which is not installed: install the extra 'all' "
-            "(docs/start/install.md has smaller ones)",
-            file=sys.stderr,
-        )
+        print(f"swarm: the command needs {missing(error.name or '', 'view' if runs else None)}", file=sys.stderr)
         return ConfigError.exit_code
     except KeyboardInterrupt:
         print("swarm: stopped", file=sys.stderr)

@@ -258,7 +258,7 @@ class KernelLoader:
         while waiting := missing(self._first):
             self._have_built()
             now_s = time.monotonic()
-            if now_s - told_s > 2.0:
+            if now_s - told_s > 10.0:
                 told_s = now_s
                 tell(f"compiling kernels: {len(waiting)} of {len(self._first)} left, {now_s - began_s:.0f} s")
             time.sleep(_POLL_S)

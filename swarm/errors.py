@@ -16,9 +16,11 @@ EXTRAS = {
 """Package that the base install lacks -> the smallest extra which brings it."""
 
 
-def missing(package: str) -> str:
-    """End of a sentence about a package of `EXTRAS` which is not installed."""
-    return f"{package}, which is not installed: install the extra '{EXTRAS[package]}' (docs/start/install.md)"
+def missing(package: str, extra: str | None = None) -> str:
+    """End of a sentence about a package which is not installed; `extra` is the smallest which brings it, if no
+    larger one is needed."""
+    extra = extra or EXTRAS.get(package.partition(".")[0], "all")
+    return f"{package}, which is not installed: install the extra '{extra}' (docs/start/install.md)"
 
 
 def require(module: str, *packages: str) -> None:

@@ -80,6 +80,7 @@ _MOST_DIGITS = 9
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
+_SLOW_FOR_NS = 5 * NS_PER_S
 _WAITING_AGAIN_NS = 10 * NS_PER_S
 """Interval of repeated events: a late watcher receives them, and the log stays readable."""
 
@@ -238,16 +239,18 @@ class RightOfWaySync:
             self.hear(heard.message, now_ns)
 
     def _tell_slow(self, now_ns: int) -> None:
-        """States which agents answer so late that vehicles wait longer for cells."""
+        """States which agents answer so late, for some seconds on end, that vehicles wait longer for cells."""
         slow = self.core.trips.slow()
-        if slow and now_ns >= self._slow_due_ns:
+        if not slow:
+            self._slow_due_ns = max(self._slow_due_ns, now_ns + _SLOW_FOR_NS)
+        elif now_ns >= self._slow_due_ns:
             self._slow_due_ns = now_ns + _SILENT_AGAIN_NS
             agent = max(slow, key=slow.__getitem__)
             self._warn(
                 "slow_link",
-                f"{len(slow)} of the agents answer slowly, {agent} after {slow[agent] / NS_PER_S:.1f} s (expected: "
-                f"below {SLOW_NS / NS_PER_S:g} s): vehicles wait longer for cells, and a failed agent is replaced "
-                "later",
+                f"agent {agent} answers slowly, after {slow[agent] / NS_PER_S:.1f} s (expected: below "
+                f"{SLOW_NS / NS_PER_S:g} s){f', and {len(slow) - 1} more' * (len(slow) > 1)}: vehicles wait longer "
+                "for cells, and a failed agent is replaced later",
             )
 
     def _look_after_store(self, now_ns: int) -> None:

@@ -94,10 +94,7 @@ def down(run: RunArgument = None) -> int:
     from launch_scripts.observe.run_folder import read_report
     from launch_scripts.observe.run_registry import is_of_a_swarm, registered
 
-    running = [each.name for each in registered() if each.launchers]
-    if run is None and len(running) > 1:
-        raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
-    found = _chosen(run)
+    found = _only(run)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
     if not found.launchers and (left_over := found.processes()):
         for pid in left_over.values():
@@ -106,7 +103,8 @@ def down(run: RunArgument = None) -> int:
         terminal.say(f"run {found.name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
         return 0
     if not found.launchers:
-        raise ConfigError(f"run {found.name} does not run here; these do: {', '.join(running) or 'none'}")
+        running = ", ".join(each.name for each in registered() if each.launchers)
+        raise ConfigError(f"run {found.name} does not run here; these do: {running or 'none'}")
     for pid in found.launchers:
         with suppress(psutil.NoSuchProcess):  # it ended by itself
             process = psutil.Process(pid)
@@ -196,11 +194,11 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     swarm kill planner-t3
 
     process  The process, such as planner-t3.
-    run      Name of the run, or its folder; if not given, the newest that runs.
+    run      Name of the run, or its folder. May be omitted if exactly one run is running here.
     """
     import psutil
 
-    found = _chosen(run)
+    found = _only(run)
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
     if process not in running:
@@ -241,6 +239,16 @@ def in_background(*, as_json: bool) -> int:
                 return launcher.wait()
             except KeyboardInterrupt:
                 launcher.send_signal(signal.SIGINT)
+
+
+def _only(name: str | None) -> KnownRun:
+    """The run of a name or folder; without one the only one that runs. Raises ConfigError if several do."""
+    from launch_scripts.observe.run_registry import registered
+
+    running = [each.name for each in registered() if each.launchers]
+    if name is None and len(running) > 1:
+        raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
+    return _chosen(name)
 
 
 def _chosen(name: str | None) -> KnownRun:

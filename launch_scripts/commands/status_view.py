@@ -23,6 +23,7 @@ from launch_scripts.observe.run_registry import pids_of
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import ProcessLoad, gaps_to
 from launch_scripts.plain_text import plain, unanswered
+from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
 from swarm.clock import NS_PER_S, MonotonicClock
@@ -65,11 +66,11 @@ class Status:
 
     @property
     def silent(self) -> list[str]:
-        """Processes that the run needs, or that are alive, and have not answered."""
+        """Processes that the run needs, or that are alive, and have not answered. Outside vehicles never do."""
         latest = self.latest
         expected = dict.fromkeys((*latest.plan.crew_now(latest.plan.targets_now(latest.book)), *latest.up()))
         answered = {(info.role, info.id) for info in (*self.members, *self.strangers)}
-        return [f"{role}-{id}" for role, id in expected if (role, id) not in answered]
+        return [f"{role}-{id}" for role, id in expected if role in ROLES and (role, id) not in answered]
 
     @property
     def state(self) -> RunState:

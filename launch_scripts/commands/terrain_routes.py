@@ -32,6 +32,7 @@ from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.map_frame import MapFrame, middles_of
+from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError
@@ -49,6 +50,7 @@ class DescribedRoute:
     at_s         float64 (n,)     seconds driven until there; None if not known
     height_m     float64 (n,)     m, NaN over a void; None if not known
     terrain      what it lies on, for a picture; None if not at hand
+    rule         sentence of the speed and slope rule by which it costs; "" if not at hand
     """
 
     name: str
@@ -60,6 +62,7 @@ class DescribedRoute:
     at_s: NDArray[np.float64] | None = None
     height_m: NDArray[np.float64] | None = None
     terrain: Terrain | None = None
+    rule: str = ""
 
     @property
     def length_m(self) -> float:
@@ -200,6 +203,7 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
         at_s=np.concatenate(([0.0], np.cumsum(steps_s))),
         height_m=terrain.elevation_m.reshape(-1)[cells].astype(np.float64),
         terrain=terrain,
+        rule=said_of_cost(scenario.cost),
     )
 
 
@@ -217,8 +221,9 @@ def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
     # A route from a place to itself takes no time, which is the optimum.
     above = max(found.gap - 1, 0) if found.cost_s > 0 else 0.0
     climbed = f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
-    typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
+    typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} steps")
     typer.echo(f"proven to be at most {above:.2%} above the optimum")
+    typer.echo(f"{found.rule}, cells of {found.grid.resolution_m:g} m")
 
 
 class Ends(NamedTuple):
@@ -391,7 +396,7 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        told, tags = ["seconds of driving, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
+        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
         write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:

@@ -101,7 +101,7 @@ class WarmUp:
         """Returns the progress."""
         if not self._all:
             return "loading kernels"
-        first = f" ({len(self._first)} to go before the first route)" if self._first else ""
+        first = f", {len(self._first)} more before the first route" if self._first else ""
         return f"compiling kernels, once: {self._all - len(self._left)} of {self._all}{first}"
 
     def close(self) -> None:
@@ -159,17 +159,20 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
     if scenario is None:
         _say(tell, ([], []))
         return
-    from planner_service.kernel_build import build, can_build, missing, name_of, needed_kernels
+    from planner_service.kernel_build import build, can_build, missing, name_of, needed_kernels, place_kernels
 
     threading.Thread(target=_end_with_launcher, daemon=True).start()
     needed = needed_kernels(scenario)
-    first, others = (missing(needed.first), missing(needed.later)) if can_build() else ((), ())
+    # The places process starts with these: before kernels which only make planners faster.
+    later = dict.fromkeys([*place_kernels(scenario).first, *needed.later])
+    kernels = needed.first, [each for each in later if each not in needed.first]
+    first, others = map(missing, kernels) if can_build() else ((), ())
     if tells:
         _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
-    for kernels, niceness in ((first, 0), (others, _BACKGROUND)):
-        if kernels:
+    for group, niceness in ((first, 0), (others, _BACKGROUND)):
+        if group:
             os.nice(niceness)
-            build(kernels, lambda kernel: _say(tell, name_of(kernel)))
+            build(group, lambda kernel: _say(tell, name_of(kernel)))
 
 
 def _say(tell: Connection, what: object) -> None:

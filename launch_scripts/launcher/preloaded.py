@@ -21,6 +21,8 @@ from launch_scripts.process_table import TABLE
 _AT_RUN_TIME = ("encodings.idna", "numpy.ma", "psutil")
 """Modules which roles import at run time, each for itself otherwise."""
 
+# What rerun writes goes to log files: without colours, and without its warning of how we write recordings.
+os.environ.update(NO_COLOR="1", RUST_LOG=os.environ.get("RUST_LOG", "warn,re_log_encoding=error"))
 loads = os.environ.pop(LOADS, "")
 if loads:
     end_with_parent(signal.SIGKILL)  # with the launcher, even after kill -9 while kernels compile

@@ -153,7 +153,7 @@ class _Run:
             name = f"{self._scenario.name}, run {run_id}"
             told = {"life": "", "at_s": 0.0, "name": name}
             self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
-            self._terminal.say(f"watch it at {page_of(view.web_port)}", "bold")
+            self._say_page(view.web_port)
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
 
@@ -377,33 +377,38 @@ class _Run:
             self._terminal.say(sentence, "red")
         for note in watcher.take_notes():
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
-        if watcher.web_port != self._web_port:
-            self._web_port = watcher.web_port
+        if watcher.web_port not in (0, self._web_port):
+            self._say_page(watcher.web_port)
             self._register()
-            self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
-            self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
-            self._show(known, watcher.now_ns())
+            self._show(known, watcher.now_ns(), self._missing(watcher))
+
+    def _say_page(self, port: int) -> None:
+        """States the one address of the run's page. It shows the terrain first, then the swarm."""
+        self._web_port = port
+        self._terminal.say(f"live view, at first the terrain alone: {page_of(port)}", "bold")
+        self._terminal.say(f"from elsewhere: {tunnel(port)}, then the same address")
 
     def _register(self) -> None:
         """Says to commands how far the run is; `begin_run` has said if that is impossible."""
         register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
-    def _show(self, known: Recorder | OwnPart, now_ns: int) -> None:
+    def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
         if isinstance(known, OwnPart):
             up = f"{known.well} of this machine's"
-            title = self._title(up, elapsed_s)
+            title = self._title(up, elapsed_s, missing)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
-        title = self._title(facts.fact("processes_well").shown(state), elapsed_s)
+        title = self._title(facts.fact("processes_well").shown(state), elapsed_s, missing)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
-    def _title(self, up: str, elapsed_s: float) -> str:
+    def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
         """Returns the run time (s), start-up included. All displays show this value."""
         if self._up_at_s is None:
-            return f"{self._scenario.name}: starting, {up} processes are up, {elapsed_s:.0f} s"
+            but = f" (not {', '.join(missing)})" * (0 < len(missing) < 4)
+            return f"{self._scenario.name}: starting, {up} processes are up{but}, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
         of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""

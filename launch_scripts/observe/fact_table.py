@@ -247,7 +247,9 @@ def together(alarms: Sequence[Alarm]) -> str:
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
     others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     lasting = "the longest " if first.lasts else "over, the first "
-    return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when}"
+    return (
+        f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when or 'now'}"
+    )
 
 
 def for_report(state: RunState) -> dict[str, Any]:

@@ -102,8 +102,8 @@ class Alarm:
             if self.since_s is None:
                 return f"until {self._at(self.over_s)}"
             return f"at {self._at(self.since_s)}" + (f", for {lasted}" if self.over_s > self.since_s else "")
-        last = f", last report at {self._at(end_s)}" if self.is_old and end_s is not None else ""
-        return ("now" if lasted is None else f"for {lasted}") + last
+        last = f"last report at {self._at(end_s)}" if self.is_old and end_s is not None else ""
+        return ", ".join(filter(None, ("" if lasted is None else f"for {lasted}", last)))
 
     def _at(self, run_s: float) -> str:
         if self.began_ns is None:
@@ -192,7 +192,7 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[W
             continue
         leads = next((ranked for each, ranked in latest.up() if (each, job_of(ranked)) == (role, job_of(id))), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
-        state = "is gone" if latest.knows(role, id) else "has not come up"
+        state = "is gone" if latest.knows(role, id) else "has not come up yet"
         yield _of_process("down", role, id, f"{state}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 

@@ -33,10 +33,17 @@ from swarm.files import check_writable, replacing
 from swarm.grid import GridSpec
 
 COSTS = (
-    "Costs (cost_s, at_s, from_s, to_s) are seconds of driving: a step takes its length in metres times the pace, "
-    "in seconds per metre, of the cell that it enters. certified_gap is the cost over a proven lower bound of it."
+    "Costs are seconds of travel: a step takes its length in metres times the pace, in seconds per metre, of the "
+    "cell that it enters."
 )
 """The convention of costs, in each file that has some."""
+_MEANINGS = {
+    "lower_bound_s": "proven, no route takes less", "certified_gap": "cost over a proven lower bound",
+    "steps": "from cell to cell", "up_m": "sum of all climbs", "down_m": "sum of all descents",
+    "height_m": "height of the ground", "at_m": "from the start", "at_s": "from the start",
+    "from": "JSON, first cell", "to": "JSON, last cell", "from_s": "least of the area", "to_s": "most of the area",
+}  # fmt: skip
+"""Field -> its meaning, in the description of each layer which has costs and the field."""
 
 Value = str | int | float | np.datetime64 | list[Any] | dict[str, Any] | None
 FieldKind = Literal["text", "int", "flag", "real", "time", "json"]
@@ -72,6 +79,11 @@ class Layer:
     fields: Mapping[str, FieldKind]
     features: list[Feature] = field(default_factory=list)
     about: str = ""
+
+    def described(self) -> str:
+        """Returns the description: what the layer is about, and the meaning of its fields."""
+        fields = [f"{name}: {_MEANINGS[name]}" for name in self.fields if name in _MEANINGS]
+        return f"{self.about} {'; '.join(fields)}.".strip(" .") + "." if self.about else ""
 
 
 class Format(NamedTuple):

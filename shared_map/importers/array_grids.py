@@ -32,6 +32,7 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
 
 _NPZ_ARRAYS = ("elevation", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
+_READ_ARRAYS = "elevation and resolution_m, or elevation, dx, dy, xmin and ymin (degrees)"
 _HEADER_BYTES = 4096
 _MOST_TABLE_BYTES = 1 << 20
 """Limit of an archive's table of contents."""
@@ -79,15 +80,18 @@ def read_npz(path: Path, what: str) -> Numbers:
     TerrainError
         If the file cannot be read, its arrays would unpack to more than the file may have, or are not as above.
     """
-    arrays, held = _members(path, what)
+    arrays, unread = _members(path, what)
     heights = arrays.pop("elevation", None)
     if heights is None:
-        raise TerrainError(f"{what} has no `elevation`; it has {held}")
+        held = ", ".join(sorted([*arrays, *unread])) or "nothing"
+        raise TerrainError(f"{what} has no `elevation` (read: {_READ_ARRAYS}); it has {held}")
     if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
         found = f"{heights.shape} {heights.dtype}"
         raise TerrainError(f"{what}: elevation is {found}; expected numbers in two dimensions")
     check_cells(heights.shape[0], heights.shape[1], what)
     heights, notes = heights.astype(np.float32), ("arrays of NumPy",)
+    if unread:
+        notes = (*notes, f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})")
     try:
         numbers = {name: float(array) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
@@ -106,8 +110,8 @@ def read_npz(path: Path, what: str) -> Numbers:
     return Numbers(heights, notes=notes)
 
 
-def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], str]:
-    """The arrays of `_NPZ_ARRAYS` in an .npz, and the names of what it holds. Others are never unpacked."""
+def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """The arrays of `_NPZ_ARRAYS` in an .npz, and the names of others, which are never unpacked."""
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
     try:
@@ -117,8 +121,8 @@ def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], str]:
             if total > kind.most_bytes:
                 most = size(kind.most_bytes)
                 raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
-            held = ", ".join(name[:40] for name in sorted(archive.files)[:_SHOWN_MEMBERS])
-            return {name: archive[name] for name in wanted}, held or "nothing"
+            unread = sorted(set(archive.files) - {*_NPZ_ARRAYS, "xmax"})
+            return {name: archive[name] for name in wanted}, [name[:40] for name in unread[:_SHOWN_MEMBERS]]
     except (TerrainError, OSError):
         raise
     except Exception as error:  # of damaged headers numpy raises whatever it runs into

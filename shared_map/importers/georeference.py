@@ -102,11 +102,15 @@ def systems_of(grid: GridSpec, own: Any, given: str | None, what: str, key: str)
     return rasterio.CRS.from_user_input(grid.crs), found
 
 
-def overruled(found: Any, given: str | None) -> tuple[str, ...]:
-    """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`)."""
-    if given is None or not found or not (found.is_geographic or found.is_projected):
+def overruled(found: Any, given: str | None, transform: Any) -> tuple[str, ...]:
+    """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`), or cannot place it."""
+    if given in (None, "local") or not found:
         return ()
-
+    if not (found.is_geographic or found.is_projected):
+        nowhere = (
+            f"! the file has no origin: x = 0, y = 0 of terrain.crs = {given!r} is taken for its north-west corner"
+        )
+        return (nowhere,) if transform.c == transform.f == 0 else ()
     counts = rasterio.CRS.from_user_input(given)
     if counts == found:
         return ()

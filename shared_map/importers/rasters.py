@@ -145,7 +145,7 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
         return _Place(rasterio.CRS.from_wkt(METRES), dataset.transform, notes)
     if has_place or not (is_cover or own is not None or path.suffix.lower() == ".png"):
         crs = crs_of(dataset.crs, config.crs, what)
-        return _Place(crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs)))
+        return _Place(crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform)))
     is_grey = not is_cover and own is None
     if config.resolution_m is None or (is_grey and not config.height_scale):
         scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""

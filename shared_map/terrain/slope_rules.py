@@ -66,8 +66,9 @@ def said_of_cost(cost: CostConfig) -> str:
     way = "the mean of up and down" if row.is_directed else "the same up and down"
     if cost.directional:
         way = "each step by its way up or down"
-    preset = f" of preset {cost.preset}" if cost.preset else ""
-    return f"slope rule {cost.slope_rule}{preset}, {way}; {cost.flat_speed_m_per_s:g} m/s on level open ground"
+    preset = f"preset {cost.preset}" if cost.preset else "no preset"
+    speed = f"{cost.flat_speed_m_per_s:g} m/s ({3.6 * cost.flat_speed_m_per_s:.3g} km/h) on level open ground"
+    return f"{preset}: {speed}, slope rule {cost.slope_rule}, {way}"
 
 
 def step_limits_deg(cost: CostConfig) -> tuple[float, float]:

@@ -134,7 +134,7 @@ class Host:
             if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(shard)):
                 members = self.shards.members(shard)
                 found[shard] = (
-                    f"shard {shard} has no leader: {len(vehicles)} of our vehicles there wait until "
-                    f"{self.shards.majority} of its members {', '.join(members)} run and reach each other and us"
+                    f"{len(vehicles)} of our vehicles wait to enter cells: no agent leads the right of way there "
+                    f"(shard {shard}) until {self.shards.majority} of {', '.join(members)} reach each other and us"
                 )
         return found

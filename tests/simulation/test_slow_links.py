@@ -33,7 +33,7 @@ def test_a_swarm_whose_messages_are_all_late_drives_and_says_so(delay_ms: float)
     assert laws.collisions == laws.lethal == []
     notes = [note for _, note in simulation.recorder.notes if note.kind == "slow_link"]
     assert notes
-    assert "answer slowly" in notes[0].text
+    assert "answers slowly" in notes[0].text
 
 
 def test_with_a_second_each_way_vehicles_still_drive_and_none_meet() -> None:

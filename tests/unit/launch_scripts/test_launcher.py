@@ -15,11 +15,14 @@ from pathlib import Path
 import pytest
 from support.processes import eventually, session_of
 
+from launch_scripts.launcher import forkserver
 from launch_scripts.launcher.child_process import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _build
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import TABLE, ProcessSpec
+from planner_service import kernel_build
+from planner_service.kernel_build import name_of, needed_kernels, place_kernels
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
 
@@ -340,3 +343,16 @@ def test_what_loads_kernels_for_a_launcher_that_is_gone_ends_without_a_word() ->
     _build(tell, None, tells=True)
     with pytest.raises(OSError, match="Broken pipe"):
         tell.send(0)
+
+
+def test_builders_make_what_the_places_process_starts_with_before_what_saves_time(monkeypatch) -> None:
+    for name, fake in (("_end_with_launcher", lambda: None), ("os.nice", lambda _: None)):
+        monkeypatch.setattr(name if "." in name else f"{forkserver.__name__}.{name}", fake)
+    built: list[str] = []
+    monkeypatch.setattr(kernel_build, "missing", list)
+    monkeypatch.setattr(kernel_build, "build", lambda kernels, _: built.extend(map(name_of, kernels)))
+    _build(multiprocessing.Pipe()[1], Scenario(), tells=True)
+    needed, places = needed_kernels(Scenario()), place_kernels(Scenario())
+    soon = set(map(name_of, (*needed.first, *places.first)))
+    assert sorted(built) == sorted({*map(name_of, (*needed, *places))})
+    assert set(built[: len(soon)]) == soon

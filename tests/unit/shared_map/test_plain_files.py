@@ -65,7 +65,7 @@ def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str |
 def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     for arrays, words in (
-        ({"height": np.ones((3, 3))}, "no `elevation`; it has height"),
+        ({"height": np.ones((3, 3))}, r"no `elevation` \(read: .*resolution_m.*\); it has height"),
         ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected numbers in two dimensions"),
         ({"elevation": np.ones((3, 3))}, "does not say how large a cell is; set terrain.resolution_m"),
         ({"elevation": np.ones((3, 3)), "resolution_m": -1.0}, "must be positive"),
@@ -80,6 +80,13 @@ def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
         load(path, path.read_bytes()[:9000])
     with pytest.raises(TerrainError, match=r"truncated or no \.npz"):
         load(path, b"PK nonsense")
+
+
+def test_an_npz_names_the_arrays_which_are_not_read_and_that_no_system_can_place_it(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", elevation=np.eye(20), resolution_m=10.0, west_m=500_000.0)
+    said = "\n".join(load(tmp_path / "a.npz", crs="EPSG:32632").notes)
+    assert "! not read: the arrays west_m (read: elevation" in said
+    assert "! the file has no origin" in said
 
 
 def test_an_hgt_is_known_by_its_length(tmp_path: Path) -> None:

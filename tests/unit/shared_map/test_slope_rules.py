@@ -167,9 +167,9 @@ def test_a_terrain_says_its_rule_and_its_preset() -> None:
         text = f'[terrain]\nsource = "synthetic"\nrows = 40\ncols = 40\n[cost]\n{more}'
         return build_terrain(parse_scenario(text)).notes
 
-    level = "10 m/s on level open ground"
-    assert f"slope rule quadratic, each step by its way up or down; {level}" in notes("directional = true")
-    hiker = "slope rule tobler of preset hiker, the mean of up and down"
+    level = "no preset: 10 m/s (36 km/h) on level open ground"
+    assert f"{level}, slope rule quadratic, each step by its way up or down" in notes("directional = true")
+    hiker = "preset hiker: 0.84 m/s (3.02 km/h) on level open ground, slope rule tobler, the mean of up and down"
     assert any(note.startswith(hiker) for note in notes('preset = "hiker"'))
 
 
