@@ -45,8 +45,8 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
                 what that added, the host holds no more than it lists. `dead` are generations that are proved to
                 have ended, by which their entries are over.
-`Table`         Leader to members: the entries of one shard, or those that differ from an earlier table. Its stamp is
-                (epoch, seq).
+`Table`         Leader to members: the entries of one shard, or those that differ from an earlier table. Its stamp
+                is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable. Said
                 instead of storing changes since a table that is not on file here: then the leader sends all.
 `Granted`       Leader to host: what a usable table says of the vehicles of one host, under its stamp, each entry
