@@ -208,16 +208,12 @@ def _files_of(incomplete: str) -> Iterator[str]:
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
-_MOST_MEANT = 3
-"""Commands of other groups that are suggested at most."""
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
     "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
     "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
-    "terrain route": ("swarm route --terrain",),
-    "orders": ("order ls",), "sweep": ("study run",), "synth": ("generate",), "map": ("marks",),
-    "gone": ("forget",), "go": ("resume", "start"), "learned": ("factors",), "inspect": ("show",),
+    "terrain route": ("swarm route --terrain",), "orders": ("order ls",), "sweep": ("study run",),
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
 """Word that other programs have, or we had, perhaps after its group -> our words, the first of which that a group
@@ -306,27 +302,22 @@ def _sentence(error: TyperException) -> str:
 def _meant(word: str, ctx: Any) -> str:
     """Returns the end of a sentence about an unknown command: the command which is meant, here or in another group,
     or all that are known here."""
-    known, root = ctx.command.commands, ctx.find_root()
+    known, singular = ctx.command.commands, word.removesuffix("s")
     file = (f"up {word}", f"info {word}") if "." in word else ()
     words = _SYNONYMS.get(f"{ctx.info_name} {word}", _SYNONYMS.get(word, file))
-    meant = [each for each in words if each.split()[0] in {root.info_name, *known} or each[0] in "-."][:1]
-    singular = word.removesuffix("s")
+    meant = [each for each in words if each.split()[0] in {"swarm", *known} or each[0] in "-."][:1]
     if not meant and singular not in known:
-        paths = list(_paths(root.command))
-        meant = [f"{root.info_name} {each}" for each in paths if each.split()[-1] == word] or [
-            f"{root.info_name} {each}" for each in paths if each.split()[-1] == singular
-        ]
-    if 1 <= len(meant) <= _MOST_MEANT:
-        return f"; did you mean {' or '.join(map(repr, meant))}?"
-    return choice(word, list(known), " there are: ")
+        same = re.compile(rf" {re.escape(singular)}s?$")
+        meant = [each for each in _paths(ctx.find_root().command) if same.search(each)]
+    said = f"; did you mean {' or '.join(map(repr, meant))}?"
+    return said if len(meant) in (1, 2, 3) else choice(word, list(known), " there are: ")
 
 
-def _paths(group: Any) -> Iterator[str]:
+def _paths(group: Any, before: str = "swarm") -> Iterator[str]:
     """Yields the words of each command of a group and of the groups in it."""
-    for name, command in group.commands.items():
-        yield name
-        for path in _paths(command) if hasattr(command, "commands") else ():
-            yield f"{name} {path}"
+    for name, command in getattr(group, "commands", {}).items():
+        yield f"{before} {name}"
+        yield from _paths(command, f"{before} {name}")
 
 
 def _fill_streams() -> None:

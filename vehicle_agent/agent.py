@@ -62,17 +62,17 @@ class Agent:
     """The vehicles of one agent process.
 
     Call `place` as soon as a vehicle's place is known. In each tick call `begin_drive`, `drive` until it returns
-    None, writing what it found into the map each time, and `decide`.
+    None, writing each result into the map, and `decide`.
 
     plan       which vehicles, of which group
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
-    obstacles  what they must not drive into, though it speaks no right of way
+    obstacles  what they must not drive into, and takes no part in right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
     group      costs published by the other agents of the group, if the assigner asks for them
 
-    stopped     whether an operator wants a vehicle to stand
+    stopped     whether an operator has stopped a vehicle
     assignment  asks for costs, and gives vehicles their targets
     """
 

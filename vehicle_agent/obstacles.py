@@ -245,11 +245,12 @@ class Obstacles:
             return
         leaps = known is not None and self._leaps(known.report, report, now_ns - known.came_ns)
         charge, wrong = self._charge(report)
+        more = charge - (0 if known is None or leaps else known.charge)
         kind = "refused"
         if wrong is None:
-            kind, wrong = "crowded", self._crowded(known, leaps, charge)
+            kind, wrong = "crowded", self._crowded(known is None, more)
         if wrong is None:
-            kind, wrong = "senders", self._outgrown(report.id, known, leaps, charge)
+            kind, wrong = "senders", self._outgrown(report.id, known is None, more)
         if wrong is not None:
             self._complain(kind, report.id, f"is not avoided: {wrong}")
             return
@@ -297,22 +298,20 @@ class Obstacles:
             )
         return window.cells, None
 
-    def _crowded(self, known: _Known | None, leaps: bool, charge: int) -> str | None:
-        if known is None and len(self._known) >= MOST_OBSTACLES:
+    def _crowded(self, is_new: bool, more: int) -> str | None:
+        if is_new and len(self._known) >= MOST_OBSTACLES:
             return f"there are {MOST_OBSTACLES} others already, as many as there may be"
-        charged = self._charged + charge - (0 if known is None or leaps else known.charge)
-        if charged > MOST_CELLS:
+        if (charged := self._charged + more) > MOST_CELLS:
             return f"with it, obstacles could close {charged} cells, expected at most {MOST_CELLS}"
         return None
 
-    def _outgrown(self, id: str, known: _Known | None, leaps: bool, charge: int) -> str | None:
+    def _outgrown(self, id: str, is_new: bool, more: int) -> str | None:
         """Reason why a report would give an id more than its share, which holds for all its senders and for the
         places that they have left by a leap: an id is what a certificate names."""
         own = [each for n in self._senders.get(id, ()) if (each := self._known.get((id, n))) is not None]
-        if known is None and len(own) >= _MOST_SENDERS:
+        if is_new and len(own) >= _MOST_SENDERS:
             return f"{len(own)} senders have this id already"
-        charged = charge + sum(each.charge for one in own for each in (one, *one.ghosts))
-        charged -= 0 if known is None or leaps else known.charge
+        charged = more + sum(each.charge for one in own for each in (one, *one.ghosts))
         if charged > MOST_CELLS_OF_ONE:
             return f"with it, this id could close {charged} cells, expected at most {MOST_CELLS_OF_ONE}"
         return None

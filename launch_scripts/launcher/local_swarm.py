@@ -60,7 +60,12 @@ class Backoff:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """End of a process that was not asked to end."""
+    """End of a process that was not asked to end.
+
+    sentence      why it ended
+    restart_in_s  seconds until its next start; None: never
+    times         number of endings of this process
+    """
 
     spec: ProcessSpec
     sentence: str

@@ -58,7 +58,7 @@ TIMED: Mapping[str, FieldKind] = {"begins": "time", "ends": "time", "samples": "
 class Feature:
     """One geometry and its values.
 
-    parts    rings of a polygon, or the points of a line or the point
+    parts    polygon: its rings; line: one array of points; point: one array of one point
     time_ns  int64 (n,), UNIX time of each point of a line
     """
 

@@ -238,7 +238,7 @@ def _said_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
         (height_m, cells), many = found.patches[0], len(found.patches)
         taken = f"is taken for {config.level_is}, as terrain.level_is says"
         if config.level_is == "water":
-            taken = "is taken for water where no photo shows it; of dry ground say terrain.level_is = 'ground'"
+            taken = "counts as water unless a photo shows dry ground; if it is dry, set terrain.level_is = 'ground'"
         # Filled sinks are many small lakes; they close much of a map.
         share = float(found.mask.mean())
         filled = share > _MUCH_WATER and 4 * cells < share * found.mask.size and config.level_is == "water"

@@ -42,7 +42,8 @@ _LOOK_CELLS = 128
 def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """Reads a raster: heights, or the classes of a land-cover map on flat ground.
 
-    Raises TerrainError if it cannot be read, may be one or the other, or does not fit a grid (see `plan_grid`).
+    Raises TerrainError if it cannot be read, if it is unclear which of them it holds, or if it does not
+    fit a grid (see `plan_grid`).
     """
     what = f"terrain {path}"
     with opened(path, "terrain") as dataset, ExitStack() as files:
@@ -70,7 +71,7 @@ def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig,
 def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
     """Returns True if a raster holds codes of land cover, by the scenario or else by its values.
 
-    Raises TerrainError that names the setting which answers, if they may be heights, too.
+    Raises TerrainError, which names the setting that decides, if the values may also be heights.
     """
     if dataset.count >= 3:
         found = f"{dataset.count} bands of {dataset.dtypes[0]}, expected one of elevation"

@@ -1,4 +1,4 @@
-"""The keeper's shell: the map on the bus, and every set of it in the store."""
+"""The keeper's shell: the map on the bus, and every mark set in the store."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ class KeeperService:
 
     replica   the marks
     counters  what the process publishes of itself
-    modules   whether what zones are drawn with is loaded; the first call begins that. If not given, it is
+    modules   returns True if the modules which draw zones are loaded; its first call starts loading them. None:
+              they are loaded
     """
 
     def __init__(

@@ -19,12 +19,11 @@
    *tombstone*: an empty set with a number between two of the author's, at which replicas drop the author's set and
    remember the number for a while (`held_sets`), so that a late copy is not accepted again. An author that is alive
    after all hears of it, and states the same again under a higher epoch.
-6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has a
-budget
-   of changed cells. Sets beyond the budget wait; sets beyond the bounds are refused and counted for any sender.
-7. *Interest* (`mark_filter`): a replica may hold only regions near its vehicles and only
-groups that it may
-   read. Then it hears only the digests that can concern it.
+6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has
+   a budget of changed cells. Sets beyond the budget wait; sets beyond the bounds are refused and counted for
+   any sender.
+7. *Interest* (`mark_filter`): a replica may hold only regions near its vehicles and only groups
+   that it may read. Then it hears only the digests that can concern it.
 
 `replica` is the core (sets, digests and time in; changed cells and sets to publish out), `replica_sync` its shell
 on the bus.

@@ -2,8 +2,8 @@
 
 `ZenohBus` and `MemoryBus` implement `Bus`; `tests/support/bus_behaviour.py` holds both to the rules below.
 
-Threads     No method but `close` waits for the network: results are posted as events. A `Post` is called
-            on the bus's threads, on several at once, and blocks what its thread reads: a service posts to an
+Threads     No method but `close` waits for the network: results are posted as events. A `Post` runs on
+            threads of the bus, several at once. While it runs, its thread reads nothing more: a service posts to an
             `Inbox` and handles events on its own thread.
 Order       Samples of one publisher on one topic come in the order of their publishing, as do replies to one query
             from one process. Nothing else has an order: not two publishers, not two topics, not samples and
@@ -14,8 +14,8 @@ Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is
 Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
-            logged once per key and minute, and never posted. A message on a trusted topic without the run's code is
-            rejected, too, if the bus has an `Authenticator`; such a query is refused.
+            logged once per key and minute, and never posted. If the bus has an `Authenticator`, a
+            sample on a trusted topic without the run's code is dropped and counted, and such a query is refused.
 Misrouting  A payload that names another key than the one under which it came is never posted, and is counted apart
             (`payloads_misrouted`). A query that names another key is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the

@@ -49,7 +49,8 @@ class _Statement(NamedTuple):
 
 
 class OwnMarks:
-    """The mark sets of one author, which belongs to one group: published, served and digested. Pure; without NumPy.
+    """The mark sets of one author, which belongs to one group: published, answered on query and
+    summarised in digests. No network, no NumPy.
 
     A process of the swarm keeps a whole replica (`shared_map`); this keeps only what its own author says.
     """
@@ -158,10 +159,10 @@ class Vehicle(Reported):
     """One vehicle. Made by `Swarm.vehicle`; use it in a `with`, or `leave` at the end.
 
     id             of the vehicle; no other process may report one of the same id
-    group          whose it is: who reads its marks
-    radius_m       around its place, which others keep clear
+    group          group that owns the vehicle and reads its marks
+    radius_m       radius of the circle around its position which others keep clear
     lease_s        others avoid its last place for so long after they hear nothing more
-    vehicle_class  whose routes it asks for
+    vehicle_class  vehicle class for which it requests routes
     incarnation    when it joined, in ns: tells it from an earlier generation under the same id
     """
 

@@ -5,7 +5,7 @@ The map is divided into *shards* (`lock_regions`). Three agents, or four where c
 are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
 vehicles in a shard or at its border. A *generation* is one incarnation of a host. The leader keeps an order of
 *entries* for each cell (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry
-is never revoked and never runs out: it is over by the word of its host alone. Only authority is leased.
+is never revoked and never runs out: only its host ends it.
 
 This package is the side of hosts. Members and leaders are in `vehicle_agent/traffic`; the proof is in
 docs/design/right-of-way.md, and docs/design/external-vehicles.md says how external vehicles come into it. All but
@@ -13,11 +13,12 @@ docs/design/right-of-way.md, and docs/design/external-vehicles.md says how exter
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
-1. Begin with a generation whose number is greater than all that anybody knows, and have it on file before the first
+1. Begin with a generation whose number is greater than any known number, and have it on file before the first
    word. First ask all agents (`KnownRequest`), until enough members of every shard have replied that one of them
    has its newest usable table.
 2. Tell each shard that concerns it everything about its vehicles there, whenever that is news and once a heartbeat.
-   Entries that it omits are over. To have driven on is no news while enough is ahead and none waits behind.
+   Entries that it omits are over. Send nothing for a vehicle which has only
+   driven on, unless it runs short of cells or another waits behind it.
 3. Enter a cell only by an entry that a `Granted` for this generation, newer than all that it knows of the shard,
    adds to the path of the vehicle, and only once all entries before it are over. Take no entry that an older table
    could have granted. Never go back to an older table of a shard, not even after the vehicles have left it. Where
@@ -67,5 +68,5 @@ An *external vehicle* (`ExternalVehicle`) is a host that is not in the scenario.
 joins and leaves changes no majority. It enters from nowhere: a host state asks for its first cell and holds
 nothing. It leaves by a host state without the vehicle. The cells of a dead external vehicle stay shut until its
 next generation proves, by the file which that has locked, that the process has ended, or until an operator removes
-it (`Removal`): a generation that names all generations as ended, itself among them.
+it (`Removal`): a generation which states that all generations, its own included, have ended.
 """

@@ -29,7 +29,8 @@ class Wish(msgspec.Struct, frozen=True):
     """Candidate cells of a vehicle, in order of preference.
 
     ahead   its next cells after all that it holds
-    wants   where else it could go from its cell, the best first; `better` of them are better than to stay
+    wants   where else it could go from its cell, the best first; the first `better` of them beat staying
+    age_ms  how long it has waited
     """
 
     ahead: Sequence[int] = ()
@@ -43,8 +44,8 @@ _NO_STANDS: Mapping[str, _Told] = {}
 
 
 def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Sequence[Entry]]) -> int:
-    """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and a thief
-    of a name has a fraction of a second to find other grants with the same digest."""
+    """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and an
+    attacker has under a second to find other grants with the same digest."""
     said = msgspec.msgpack.encode((generation, sorted(grants.items()), sorted(waits.items())))
     return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
 

@@ -1,7 +1,7 @@
 """A member of a shard: it promises, stores tables, and becomes the shard's leader when the last one is silent.
 
 The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. Promises and tables must
-be on file before any message states them. No clock decides anything but when a member tries to become leader.
+be on file before any message states them. Clocks decide only when a member tries to become leader.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ whole."""
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """Put this on file before what follows is said."""
+    """Write this to the file before the next messages are sent."""
 
     promised: int
     table: Table

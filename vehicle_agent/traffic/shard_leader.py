@@ -49,8 +49,8 @@ MOST_CELLS = 64
 
 
 def _turn(stand: Stand) -> tuple[int, int, str]:
-    """Returns the priority: the older first; of one age, another one in each step of it. By name, those of the last
-    agent would always give way where many are of one age, as all are who began the run together."""
+    """Returns the sort key: the longest wait first. Ties are drawn by lot for each step of the age, because sorting
+    by name would always favour the same agent, as all waits begin together at the start of a run."""
     step = stand.age_ms >> _AGE_BITS
     return -step, _lot(stand.vehicle, step), stand.vehicle
 
