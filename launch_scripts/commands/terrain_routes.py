@@ -216,14 +216,14 @@ def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
         typer.echo(json.dumps(facts))
         return
     frame = MapFrame(found.grid)
-    typer.echo(f"from {written(frame, int(found.cells[0]))}")
-    typer.echo(f"to {written(frame, int(found.cells[-1]))}")
+    typer.echo(f"from {written(frame, int(found.cells[0]))}\nto {written(frame, int(found.cells[-1]))}")
     # A route from a place to itself takes no time, which is the optimum.
     above = max(found.gap - 1, 0) if found.cost_s > 0 else 0.0
     climbed = f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
     typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} steps")
-    typer.echo(f"proven to be at most {above:.2%} above the optimum")
-    typer.echo(f"{found.rule}, cells of {found.grid.resolution_m:g} m")
+    typer.echo(
+        f"proven to be at most {above:.2%} above the optimum\n{found.rule}, cells of {found.grid.resolution_m:g} m"
+    )
 
 
 class Ends(NamedTuple):

@@ -396,8 +396,7 @@ class _Run:
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
         if isinstance(known, OwnPart):
-            up = f"{known.well} of this machine's"
-            title = self._title(up, elapsed_s, missing)
+            title = self._title(f"{known.well} of this machine's", elapsed_s, missing)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
@@ -464,11 +463,8 @@ class _Run:
         processes = ", ".join(f"{number} {role}" for role, number in many.items())
         scenario = self._scenario
         self._terminal.say(f"run {self._run_id}: scenario {scenario.name}, seed {scenario.seed}, {processes}")
-        router = self._scenario.network.connect[0]
-        if self._options.records:
-            self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
-        else:
-            self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
+        left = "logs, recording and report" if self._options.records else f"{_ELSEWHERE}; logs"
+        self._terminal.say(f"router at {scenario.network.connect[0]}; {left} in {self._run_dir}")
 
     def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""
