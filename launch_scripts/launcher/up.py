@@ -406,8 +406,8 @@ class _Run:
     def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
         """Returns the run time (s), start-up included. All displays show this value."""
         if self._up_at_s is None:
-            but = f" (not {', '.join(missing)})" * (0 < len(missing) < 4)
-            return f"{self._scenario.name}: starting, {up} processes are up{but}, {elapsed_s:.0f} s"
+            waits = f", waits for {', '.join(missing)}" * (0 < len(missing) < 4)
+            return f"{self._scenario.name}: starting, {up} processes are up{waits}, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
         of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
