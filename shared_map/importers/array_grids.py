@@ -87,7 +87,7 @@ def read_npz(path: Path, what: str) -> Numbers:
         raise TerrainError(f"{what} has no `elevation` (read: {_READ_ARRAYS}); it has {held}")
     if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
         raise TerrainError(
-            f"{what}: elevation is {heights.shape} {heights.dtype}; expected numbers in two dimensions"
+            f"{what}: elevation is {heights.shape} {heights.dtype}; expected numbers in 2 dimensions"
         )
     check_cells(heights.shape[0], heights.shape[1], what)
     ignored = [f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})"] * bool(unread)
