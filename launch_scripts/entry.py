@@ -35,7 +35,9 @@ def main() -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OURS:
             raise  # a fault of ours
-        print(f"swarm: the command needs {missing(error.name or '', 'view' if runs else None)}", file=sys.stderr)
+        print(
+            f"swarm: the command needs {missing(error.name or '', 'view' if runs else 'terrain')}", file=sys.stderr
+        )
         return ConfigError.exit_code
     except KeyboardInterrupt:
         print("swarm: stopped", file=sys.stderr)

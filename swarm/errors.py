@@ -19,7 +19,7 @@ EXTRAS = {
 def missing(package: str, extra: str | None = None) -> str:
     """End of a sentence about a package which is not installed; `extra` is the smallest which brings it, if no
     larger one is needed."""
-    extra = extra or EXTRAS.get(package.partition(".")[0], "all")
+    extra = extra or EXTRAS[package]
     return f"{package}, which is not installed: install the extra '{extra}' (docs/start/install.md)"
 
 

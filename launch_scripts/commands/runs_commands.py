@@ -92,9 +92,9 @@ def down(run: RunArgument = None) -> int:
 
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folder import read_report
-    from launch_scripts.observe.run_registry import is_of_a_swarm, registered
+    from launch_scripts.observe.run_registry import is_of_a_swarm
 
-    found = _only(run)
+    found = _chosen(run, only=True)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
     if not found.launchers and (left_over := found.processes()):
         for pid in left_over.values():
@@ -103,8 +103,7 @@ def down(run: RunArgument = None) -> int:
         terminal.say(f"run {found.name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
         return 0
     if not found.launchers:
-        running = ", ".join(each.name for each in registered() if each.launchers)
-        raise ConfigError(f"run {found.name} does not run here; these do: {running or 'none'}")
+        raise ConfigError(f"run {found.name} does not run here; `swarm ps` lists those which do")
     for pid in found.launchers:
         with suppress(psutil.NoSuchProcess):  # it ended by itself
             process = psutil.Process(pid)
@@ -198,7 +197,7 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     """
     import psutil
 
-    found = _only(run)
+    found = _chosen(run, only=True)
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
     if process not in running:
@@ -241,25 +240,19 @@ def in_background(*, as_json: bool) -> int:
                 launcher.send_signal(signal.SIGINT)
 
 
-def _only(name: str | None) -> KnownRun:
-    """The run of a name or folder; without one the only one that runs. Raises ConfigError if several do."""
-    from launch_scripts.observe.run_registry import registered
-
-    running = [each.name for each in registered() if each.launchers]
-    if name is None and len(running) > 1:
-        raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
-    return _chosen(name)
-
-
-def _chosen(name: str | None) -> KnownRun:
-    """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError."""
+def _chosen(name: str | None, only: bool = False) -> KnownRun:
+    """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError, with
+    `only` also if several run."""
     from launch_scripts.observe.run_folder import RUNS, find_run
     from launch_scripts.observe.run_registry import registered
 
     if name is None:
         if not (known := registered()):
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
-        say_newest(known[0].name, [each.name for each in known[1:] if each.launchers])
+        running = [each.name for each in known if each.launchers]
+        if only and len(running) > 1:
+            raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
+        say_newest(known[0].name, running[1:])
         return known[0]
     return _run_in(find_run(name, RUNS).resolve())
 

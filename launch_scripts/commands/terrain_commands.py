@@ -261,10 +261,13 @@ def reach(
         console.print_json(json.dumps(facts))
     elif found.fastest_s is not None:
         best = f"the best takes {found.fastest_s:.0f} s"
-        _say(f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}")
+        _say(f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}", found.rule)
     else:
         furthest = f"{longest_s:.0f} s from the furthest"
-        _say(f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}")
+        _say(
+            f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}",
+            found.rule,
+        )
 
 
 @command(app)

@@ -216,14 +216,14 @@ def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
         typer.echo(json.dumps(facts))
         return
     frame = MapFrame(found.grid)
-    typer.echo(f"from {written(frame, int(found.cells[0]))}")
-    typer.echo(f"to {written(frame, int(found.cells[-1]))}")
+    typer.echo(f"from {written(frame, int(found.cells[0]))}\nto {written(frame, int(found.cells[-1]))}")
     # A route from a place to itself takes no time, which is the optimum.
     above = max(found.gap - 1, 0) if found.cost_s > 0 else 0.0
     climbed = f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
     typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} steps")
-    typer.echo(f"proven to be at most {above:.2%} above the optimum")
-    typer.echo(f"{found.rule}, cells of {found.grid.resolution_m:g} m")
+    typer.echo(
+        f"proven to be at most {above:.2%} above the optimum\n{found.rule}, cells of {found.grid.resolution_m:g} m"
+    )
 
 
 class Ends(NamedTuple):
@@ -289,11 +289,13 @@ class Reach:
 
     seconds    float32 (rows, cols), s; inf where there is no way. To the place; of a corridor, from one place
                to the other through the cell
+    rule       sentence of the speed and slope rule by which it costs
     fastest_s  of a corridor, what the best way takes; None else
     """
 
     grid: GridSpec
     seconds: Floats
+    rule: str
     fastest_s: float | None = None
 
     @property
@@ -313,7 +315,8 @@ def reach(source: str, place: str, preset: str | None = None) -> Reach:
     goal = read_place(place, "--to")
     scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
-    return Reach(terrain.grid, _to(scenario, terrain, cell_of(goal, MapFrame(terrain.grid), "--to"), "--to"))
+    seconds = _to(scenario, terrain, cell_of(goal, MapFrame(terrain.grid), "--to"), "--to")
+    return Reach(terrain.grid, seconds, said_of_cost(scenario.cost))
 
 
 def corridor(source: str, start: str, end: str, slack: float, preset: str | None = None) -> Reach:
@@ -342,7 +345,7 @@ def corridor(source: str, start: str, end: str, slack: float, preset: str | None
     )
     through[best.cells[:, 0], best.cells[:, 1]] = best.cost_s
     through[through > best.cost_s * (1 + slack)] = np.inf
-    return Reach(terrain.grid, through.astype(np.float32), best.cost_s)
+    return Reach(terrain.grid, through.astype(np.float32), said_of_cost(scenario.cost), best.cost_s)
 
 
 def there_s(back_s: Floats, pace: Floats, resolution_m: float, rules: PlannerConfig) -> NDArray[np.float64]:

@@ -164,15 +164,14 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
     threading.Thread(target=_end_with_launcher, daemon=True).start()
     needed = needed_kernels(scenario)
     # The places process starts with these: before kernels which only make planners faster.
-    later = dict.fromkeys([*place_kernels(scenario).first, *needed.later])
-    kernels = needed.first, [each for each in later if each not in needed.first]
-    first, others = map(missing, kernels) if can_build() else ((), ())
+    later = [k for k in dict.fromkeys([*place_kernels(scenario).first, *needed.later]) if k not in needed.first]
+    first, others = (missing(needed.first), missing(later)) if can_build() else ((), ())
     if tells:
         _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
-    for group, niceness in ((first, 0), (others, _BACKGROUND)):
-        if group:
+    for kernels, niceness in ((first, 0), (others, _BACKGROUND)):
+        if kernels:
             os.nice(niceness)
-            build(group, lambda kernel: _say(tell, name_of(kernel)))
+            build(kernels, lambda kernel: _say(tell, name_of(kernel)))
 
 
 def _say(tell: Connection, what: object) -> None:

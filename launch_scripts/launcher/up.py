@@ -396,8 +396,7 @@ class _Run:
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
         elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
         if isinstance(known, OwnPart):
-            up = f"{known.well} of this machine's"
-            title = self._title(up, elapsed_s, missing)
+            title = self._title(f"{known.well} of this machine's", elapsed_s, missing)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
@@ -407,8 +406,8 @@ class _Run:
     def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
         """Returns the run time (s), start-up included. All displays show this value."""
         if self._up_at_s is None:
-            but = f" (not {', '.join(missing)})" * (0 < len(missing) < 4)
-            return f"{self._scenario.name}: starting, {up} processes are up{but}, {elapsed_s:.0f} s"
+            waits = f", waits for {', '.join(missing)}" * (0 < len(missing) < 4)
+            return f"{self._scenario.name}: starting, {up} processes are up{waits}, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
         of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
@@ -464,11 +463,8 @@ class _Run:
         processes = ", ".join(f"{number} {role}" for role, number in many.items())
         scenario = self._scenario
         self._terminal.say(f"run {self._run_id}: scenario {scenario.name}, seed {scenario.seed}, {processes}")
-        router = self._scenario.network.connect[0]
-        if self._options.records:
-            self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
-        else:
-            self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
+        left = "logs, recording and report" if self._options.records else f"{_ELSEWHERE}; logs"
+        self._terminal.say(f"router at {scenario.network.connect[0]}; {left} in {self._run_dir}")
 
     def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""

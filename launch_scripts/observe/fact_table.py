@@ -246,10 +246,8 @@ def together(alarms: Sequence[Alarm]) -> str:
     first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
     others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    lasting = "the longest " if first.lasts else "over, the first "
-    return (
-        f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when or 'now'}"
-    )
+    when = ("the longest " if first.lasts else "over, the first ") + (first.when or "now")
+    return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {when}"
 
 
 def for_report(state: RunState) -> dict[str, Any]:

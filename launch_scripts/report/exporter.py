@@ -32,10 +32,7 @@ from swarm.errors import ConfigError, StoreError
 from swarm.files import check_writable, replacing
 from swarm.grid import GridSpec
 
-COSTS = (
-    "Costs are seconds of travel: a step takes its length in metres times the pace, in seconds per metre, of the "
-    "cell that it enters."
-)
+COSTS = "Costs are seconds of travel: a step takes its length times the pace (s/m) of the cell that it enters."
 """The convention of costs, in each file that has some."""
 _MEANINGS = {
     "lower_bound_s": "proven, no route takes less", "certified_gap": "cost over a proven lower bound",

@@ -86,12 +86,12 @@ def read_npz(path: Path, what: str) -> Numbers:
         held = ", ".join(sorted([*arrays, *unread])) or "nothing"
         raise TerrainError(f"{what} has no `elevation` (read: {_READ_ARRAYS}); it has {held}")
     if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
-        found = f"{heights.shape} {heights.dtype}"
-        raise TerrainError(f"{what}: elevation is {found}; expected numbers in two dimensions")
+        raise TerrainError(
+            f"{what}: elevation is {heights.shape} {heights.dtype}; expected numbers in 2 dimensions"
+        )
     check_cells(heights.shape[0], heights.shape[1], what)
-    heights, notes = heights.astype(np.float32), ("arrays of NumPy",)
-    if unread:
-        notes = (*notes, f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})")
+    ignored = [f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})"] * bool(unread)
+    heights, notes = heights.astype(np.float32), ("arrays of NumPy", *ignored)
     try:
         numbers = {name: float(array) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:

@@ -107,10 +107,8 @@ def overruled(found: Any, given: str | None, transform: Any) -> tuple[str, ...]:
     if given in (None, "local") or not found:
         return ()
     if not (found.is_geographic or found.is_projected):
-        nowhere = (
-            f"! the file has no origin: x = 0, y = 0 of terrain.crs = {given!r} is taken for its north-west corner"
-        )
-        return (nowhere,) if transform.c == transform.f == 0 else ()
+        nowhere = bool(transform.c == transform.f == 0)
+        return (f"! the file has no origin: its north-west corner is x = 0, y = 0 of {given!r}",) * nowhere
     counts = rasterio.CRS.from_user_input(given)
     if counts == found:
         return ()

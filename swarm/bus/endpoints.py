@@ -100,6 +100,6 @@ def _why_silent(endpoint: str, encrypted: bool) -> str:
     if encrypted:
         return (
             "a process listens there, but refuses us or is not a router "
-            "(is `swarm role router` running there, with certificates of the same authority?)"
+            "(is `swarm role router` running there, with certificates of the same authority, and no proxy between?)"
         )
     return "a process listens there, but does not reply as a router (is `swarm role router` running there?)"

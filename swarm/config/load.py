@@ -249,7 +249,7 @@ def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
     protocol, host = match[1], match[2].strip("[]")
     if protocol == "tls" and not has_tls:
-        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key")
+        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key, or --tls-dir")
     if protocol == "tcp" and not is_loopback(host):
         raise ConfigError(
             f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"

@@ -120,7 +120,7 @@ def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tm
     assert "stopping" in told.stdout
     states = {each["run"]: each["state"] for each in json.loads(swarm("ps", "-a", "--json").stdout)}
     assert (states[first], states[second]) == ("running", "ended")
-    assert "does not run here; these do: " + first in swarm("down", second).stderr
+    assert "does not run here; `swarm ps` lists those which do" in swarm("down", second).stderr
 
 
 def test_a_start_in_the_background_that_is_asked_to_end_leaves_no_run(live: LiveSwarm, tmp_path: Path) -> None:
