@@ -140,13 +140,13 @@ only. Every plan of machines has one, and keeps it on the machine of its store."
 class ProcessSpec:
     """One row of the table.
 
-    entry  `module:function`, called as function(setup, stop_when)
+    entry  `module:function`, called as function(setup, stop_when), in place of that of its role
     added  an operator's order started it: the run goes on without it, whatever keeps it from starting
     """
 
     role: str
     id: str
-    entry: str
+    entry: str = ""
     added: bool = False
 
     @property
@@ -165,18 +165,8 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int |
         if role.standbys is not None:
             ranks = [each for each in range(role.standbys(scenario) + 1) if rank in (None, each)]
         if name in roles:
-            found += [spec_of(name, ranked_id(job, each)) for each in ranks for job in role.jobs(scenario)]
+            found += [ProcessSpec(name, ranked_id(job, each)) for each in ranks for job in role.jobs(scenario)]
     return found
-
-
-def spec_of(role: str, id: str, *, added: bool = False) -> ProcessSpec:
-    """A process of a role. `added`: as `ProcessSpec` has it."""
-    return ProcessSpec(role, id, TABLE[role].entry, added=added)
-
-
-def planner_spec(id: str) -> ProcessSpec:
-    """The planner of a target that was added while the swarm runs, or one of its standbys."""
-    return spec_of("planner", id, added=True)
 
 
 def check_name(option: str, name: str) -> None:

@@ -239,7 +239,7 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
             while True:
                 pids = pids_of(run.run_id) if each or as_json else {}
                 state = state_of(latest, clock.now_ns())
-                processes = [replace(load, pid=pids.get(load.name)) for load in latest.loads.lines(latest.up())]
+                processes = [replace(load, pid=pids.get(load.name)) for load in latest.loads(latest.up())]
                 if as_json:
                     print(json.dumps(top_fields(run, state, processes)), flush=True)
                 elif live is None:

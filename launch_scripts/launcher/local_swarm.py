@@ -329,7 +329,7 @@ class LocalSwarm:
             setup, restarts=restarts, anew=setup.anew and first, takes_over=running.takes_over and first
         )
         # Daemons: should the launcher itself fail, multiprocessing ends them.
-        arguments = (spec.entry, setup, reports)
+        arguments = (spec.entry or TABLE[spec.role].entry, setup, reports)
         process = self._context.Process(target=run_child, args=arguments, name=spec.name, daemon=True)
         with without_main():
             process.start()

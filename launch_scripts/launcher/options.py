@@ -25,7 +25,6 @@ from launch_scripts.process_table import (
     certificate_name,
     check_name,
     processes_of,
-    spec_of,
 )
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.sources import FILE_KINDS, is_terrain
@@ -318,7 +317,7 @@ def chosen_processes(
             if id not in ids and not TABLE[role].any_id:
                 raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
             check_name("--only", id)
-            every = [spec_of(role, id)]
+            every = [ProcessSpec(role, id)]
         chosen |= {spec.name: spec for spec in every}
     if not chosen:
         of_rank = "" if rank is None else f" of rank {rank}"

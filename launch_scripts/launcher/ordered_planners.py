@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 import msgspec
 
 from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.process_table import ProcessSpec, planner_spec
+from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
 from swarm.liveness import job_of, ranked_id
@@ -70,7 +70,7 @@ class OrderedPlanners:
         here = {running.spec.id for running in self._swarm.running if running.spec.role == "planner"}
         for id in sorted(here):
             if job_of(id) not in targets:
-                self._swarm.dismiss(planner_spec(id))
+                self._swarm.dismiss(ProcessSpec("planner", id, added=True))
         due = []
         for id in sorted(wanted - here - self._refused):
             if ("planner", id) in alive:
@@ -96,7 +96,7 @@ class OrderedPlanners:
 
     def _start(self, id: str) -> None:
         try:
-            self._swarm.add(planner_spec(id))
+            self._swarm.add(ProcessSpec("planner", id, added=True))
         except SwarmError as error:
             self._refused.add(id)
             self._say(f"planner-{id}: {error}")

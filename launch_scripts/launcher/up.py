@@ -247,7 +247,7 @@ class _Run:
             fetch_if_missing(
                 self._scenario, self._run_dir, found, roles=self._options.roles, progress=self._prepares
             )
-            setup = self._setup_of(ProcessSpec(LAUNCHER, "0", ""))
+            setup = self._setup_of(ProcessSpec(LAUNCHER, "0"))
             terrain = load_terrain(setup)
             truth = load_truth(setup, terrain)
         else:
@@ -298,7 +298,7 @@ class _Run:
         if not self._options.joins and self._take_over is None:
             return
         found = ask_run(bus)
-        mine = self._setup_of(ProcessSpec(LAUNCHER, "0", "")).info(self._terrain.grid, self._terrain.digest)
+        mine = self._setup_of(ProcessSpec(LAUNCHER, "0")).info(self._terrain.grid, self._terrain.digest)
         check_belongs(mine, found)
         followed = () if self._take_over is None else self._take_over.predecessors
         for running in self._swarm.running:

@@ -7,7 +7,7 @@
 |--------------------|------------------------------------------------------------------------------------------|
 | run_observer.py    | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands   |
 | latest_messages.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be         |
-| summed_counts.py   | `Counts`: sums of all processes, with the certified gap; `ProcessLoads`: CPU and memory  |
+| summed_counts.py   | `Counts`: sums of all processes, with the certified gap, and the load of each            |
 | run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
 | fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                |
 | run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.summed_counts import Counts, ProcessLoads, sum_of
+from launch_scripts.observe.summed_counts import Counts, sum_of
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, crew_of
@@ -188,7 +188,6 @@ class LatestState(Counts):
     status  target -> the newest status of the planner that leads
     poses   target -> its newest pose that counts
     leads   (role, id) -> whether the process leads, where there are standbys
-    loads   what each process takes up
     hears   topics that are heard as long as the run lasts, from all whom this is about: only they are evidence of
             an alarm
     """
@@ -210,7 +209,6 @@ class LatestState(Counts):
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
-        self.loads = ProcessLoads()
         self._goals: dict[str, GoalState] = {}
         self._trackings = Trackings(grid)
         self._fleets: dict[tuple[str, int], Fleet] = {}
@@ -234,7 +232,6 @@ class LatestState(Counts):
         match message:
             case Stats():
                 self.count(message)
-                self.loads.on_stats(message)
                 _remember(self._told_ns, (message.role, message.id), now_ns)
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.

@@ -39,8 +39,35 @@ def sum_of(values: Iterable[Number | None]) -> Number | None:
     return sum(told) if told else None
 
 
+_LEAST_NS = NS_PER_S // 2
+"""Over a shorter time no rate is measured."""
 _MOST_GENERATIONS = 1 << 13
 """Generations of processes that are counted: names may be made up by strangers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessLoad:
+    """Load of one process, over the last second or so; None where it is unknown.
+
+    cpu_percent  100 is one core
+    late_per_s   ticks that came later than half a period, or not at all
+    pid          of a process on this machine
+    """
+
+    role: str
+    cpu_percent: float | None
+    rss_bytes: float | None
+    late_per_s: float | None
+    messages_per_s: float | None
+    restarts: int
+    id: str
+    alive: bool
+    up_s: float
+    pid: int | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.role}-{self.id}"
 
 
 class Counts:
@@ -52,6 +79,8 @@ class Counts:
         """(role, id) -> incarnation -> what it has said last."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
+        self._before: dict[tuple[str, str], Stats] = {}
+        """(role, id) -> of the same incarnation, at least `_LEAST_NS` earlier."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
         """(role, id) -> begin and end of the longest time without counts in one generation, if that was long."""
 
@@ -71,7 +100,11 @@ class Counts:
         elif stats.stamp_ns < known.stamp_ns:
             return
         generations[stats.incarnation] = stats
-        self._newest[of] = generations[max(generations)]
+        newest = self._newest[of] = generations[max(generations)]
+        if newest is stats and known is None:
+            self._before.pop(of, None)
+        elif newest is stats and known is not None and stats.stamp_ns - known.stamp_ns >= _LEAST_NS:
+            self._before[of] = known
         began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
         if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
             self.silences[of] = (known.stamp_ns, stats.stamp_ns)
@@ -119,6 +152,27 @@ class Counts:
     def histogram(self, name: str) -> Histogram:
         """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._summed())
+
+    def loads(self, up: Collection[tuple[str, str]]) -> list[ProcessLoad]:
+        """Returns every process with a known load, in order.
+
+        up  (role, id) of those that are alive
+        """
+        return [
+            ProcessLoad(
+                role=role,
+                id=id,
+                alive=(role, id) in up,
+                up_s=max(now.stamp_ns - now.incarnation, 0) / NS_PER_S,
+                cpu_percent=_rate(before, now, "gauges", CPU_S, 100.0),
+                rss_bytes=now.gauges.get(RSS_BYTES),
+                late_per_s=_rate(before, now, "counts", "ticks_late"),
+                messages_per_s=now.gauges.get(MESSAGES_PER_S),
+                restarts=round(now.gauges.get(RESTARTS, 0.0)),
+            )
+            for (role, id), now in self.newest().items()
+            for before in [self._before.get((role, id))]
+        ]
 
 
 def _carries(stats: Stats, incarnation: int) -> bool:
@@ -192,74 +246,6 @@ def of_excess(histogram: Histogram) -> dict[str, float | None]:
 def percent(gap: float | None) -> str:
     """The excess of a gap over 1, for people."""
     return "-" if gap is None else f"{max(gap - 1, 0):.2%}"
-
-
-_MOST_LOADS = 1 << 13
-"""Processes whose load is kept, as many as are counted: names may be made up by strangers."""
-_LEAST_NS = NS_PER_S // 2
-"""Over a shorter time no rate is measured."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProcessLoad:
-    """Load of one process, over the last second or so; None where it is unknown.
-
-    cpu_percent  100 is one core
-    late_per_s   ticks that came later than half a period, or not at all
-    pid          of a process on this machine
-    """
-
-    role: str
-    cpu_percent: float | None
-    rss_bytes: float | None
-    late_per_s: float | None
-    messages_per_s: float | None
-    restarts: int
-    id: str
-    alive: bool
-    up_s: float
-    pid: int | None = None
-
-    @property
-    def name(self) -> str:
-        return f"{self.role}-{self.id}"
-
-
-class ProcessLoads:
-    """The last two loads of every process."""
-
-    def __init__(self) -> None:
-        self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
-
-    def on_stats(self, stats: Stats) -> None:
-        """Takes in what a process says; of an earlier generation, or older, nothing."""
-        key = (stats.role, stats.id)
-        _, last = self._told.get(key, (None, None))
-        if last is None or stats.incarnation > last.incarnation:
-            if last is not None or len(self._told) < _MOST_LOADS:
-                self._told[key] = (None, stats)
-        elif stats.incarnation == last.incarnation and stats.stamp_ns - last.stamp_ns >= _LEAST_NS:
-            self._told[key] = (last, stats)
-
-    def lines(self, up: Collection[tuple[str, str]]) -> list[ProcessLoad]:
-        """Returns every process with a known load, in order.
-
-        up  (role, id) of those that are alive
-        """
-        return [
-            ProcessLoad(
-                role=role,
-                id=id,
-                alive=(role, id) in up,
-                up_s=max(now.stamp_ns - now.incarnation, 0) / NS_PER_S,
-                cpu_percent=_rate(before, now, "gauges", CPU_S, 100.0),
-                rss_bytes=now.gauges.get(RSS_BYTES),
-                late_per_s=_rate(before, now, "counts", "ticks_late"),
-                messages_per_s=now.gauges.get(MESSAGES_PER_S),
-                restarts=round(now.gauges.get(RESTARTS, 0.0)),
-            )
-            for (role, id), (before, now) in sorted(self._told.items())
-        ]
 
 
 def _rate(before: Stats | None, now: Stats, where: str, name: str, times: float = 1.0) -> float | None:

@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 from msgspec.structs import replace
 
-from launch_scripts.process_table import planner_spec, spec_of
+from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.faults import OBSERVER, FaultPlan
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation, run_to_end
@@ -105,7 +105,7 @@ class OrderedSimulation(Simulation):
 
     def add(self, added: AddedAgent) -> Node:
         """Adds an agent that is not in the scenario."""
-        node = self.node(spec_of("agent", added.plan.id))
+        node = self.node(ProcessSpec("agent", added.plan.id))
         node.added = added
         node.boot()
         return node
@@ -138,7 +138,7 @@ class OrderedSimulation(Simulation):
         wanted = {ranked_id(id, rank) for id in targets for rank in ranks}
         there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}
         for id in sorted(wanted - there.keys()):
-            self.scheduler.after(NS_PER_S // 2, self.node(planner_spec(id)).boot)
+            self.scheduler.after(NS_PER_S // 2, self.node(ProcessSpec("planner", id, added=True)).boot)
         for id in sorted(there.keys() - wanted):
             node = self.nodes.pop(there[id].name)
             node.crash()

@@ -172,8 +172,11 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observe = "launch_scripts.observe"
-    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_GENERATIONS",
-                  "summed_counts._MOST_LOADS"):  # fmt: skip
+    for limit in (
+        "latest_messages._MOST_NAMES",
+        "latest_messages._MOST_SETS",
+        "summed_counts._MOST_GENERATIONS",
+    ):
         monkeypatch.setattr(f"{observe}.{limit}", 10)
     latest = LatestState(plan_of(scenario(), 0), GRID)
 
@@ -191,7 +194,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
     for n in range(40):
         hear_of(f"x{n}", 0)
     hear_of("x3", 7)
-    kept = {**vars(latest), "loads": latest.loads._told}
+    kept = vars(latest)
     sizes = {name: len(each) for name, each in kept.items() if isinstance(each, dict)}
     assert max(sizes.values()) == 10, sizes
     assert latest.newest_stats("agent", "x3") is not None

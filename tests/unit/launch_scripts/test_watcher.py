@@ -18,7 +18,7 @@ from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
-from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
+from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.bus.bus import Disappeared
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -186,7 +186,7 @@ def test_an_alarm_is_opened_only_by_a_launcher_that_hears_what_closes_it(records
 
 
 def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_anywhere() -> None:
-    part = Part(planner_spec("t0"))
+    part = Part(ProcessSpec("planner", "t0", added=True))
     keeper = part.swarm.bus("keeper")
     order = Order(subject="target", name="late", stamp_ns=1, off=False, added=True, cell=3)
     keeper.publish(ORDERS, Orders(role="keeper", id="0", orders=(order,)), role="keeper", id="0")
@@ -196,7 +196,7 @@ def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_a
 
 
 def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
-    mine, other = planner_spec("t0"), planner_spec("t1")
+    mine, other = ProcessSpec("planner", "t0", added=True), ProcessSpec("planner", "t1", added=True)
     known = OwnPart(SwarmModel().terrain.grid, 0)
     known.look_after(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
     now_ns = 100 * NS_PER_S
@@ -221,4 +221,4 @@ def test_of_the_launchers_of_any_plan_by_machines_one_records(tmp_path: Path) ->
     assert UpOptions(SCENARIO, tmp_path, PROCESSES).records
     assert UpOptions(SCENARIO, tmp_path, tuple(of_keeper)).records
     assert not UpOptions(SCENARIO, tmp_path, others).records
-    assert not UpOptions(SCENARIO, tmp_path, (ProcessSpec("keeper", "1", ""), *others)).records
+    assert not UpOptions(SCENARIO, tmp_path, (ProcessSpec("keeper", "1"), *others)).records
