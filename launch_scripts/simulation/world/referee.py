@@ -137,7 +137,8 @@ def _started_ns(author: str) -> int:
 
     The simulated vehicle of a process which has ended stays where it is until the next process of its name starts,
     and is nowhere until that one has a place for it. Others may drive over the cell meanwhile. Where the next
-    process reports another cell, the earlier one may have driven on unheard: nothing is known after its last report.
+    process reports another cell, the earlier one may have driven on unheard: nothing is known after its last
+    report.
     """
     try:
         return int(author.rpartition(".")[2], 16)
