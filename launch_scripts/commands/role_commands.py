@@ -61,7 +61,7 @@ class Part(Tls):
 
 @dataclass(frozen=True)
 class Own:
-    """Which process of its role it is, and what only some roles have (`Role.options`).
+    """Identity of a process in its role, and what only some roles have (`Role.options`).
 
     id          An agent, such as a0; a router or keeper is 0 unless there are several.
     target      Of a planner: the target whose tree it keeps, such as t0.
