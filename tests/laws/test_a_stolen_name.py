@@ -60,11 +60,7 @@ def test_without_a_thief_all_move_although_members_judge_each_table(seed: int) -
     faults = random_faults(chance, LIES_S)
     world = TrafficWorld(seed, *chance.choice(SHAPES), faults, proven=True)
     world.run(LIES_S + 10.0)
-    before = dict(world.moves)
-    world.run(12.0)
-    assert world.collisions == []
-    vehicles = [vehicle for each in world.spawns.values() for vehicle in each]
-    assert [vehicle for vehicle in vehicles if world.moves.get(vehicle, 0) == before.get(vehicle, 0)] == []
+    world.assert_all_move(12.0)
 
 
 # --- the rules, each taken out ------------------------------------------------------------------------------

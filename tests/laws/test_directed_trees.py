@@ -99,7 +99,6 @@ def one_way() -> Climb:
     heights = np.zeros((30, 40), np.float32)
     heights[:, 20:] = -1.0
     climb = climb_of(GridSpec(30, 40, 1.0), heights, CostConfig(directional=True, max_slope_deg=60))
-    assert climb is not None
     factors = climb.factors.copy()
     factors[ENTRIES + 10 :] = np.inf
     return replace(climb, factors=factors)

@@ -8,15 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from laws.test_right_of_way import (
-    believes_that_another_vehicle_of_the_cell_has_left,
-    forgets_who_is_before,
-    takes_what_an_older_table_added,
-)
+from support import broken_rules as rules
 from support.order_world import OrderWorld
 
 from swarm.right_of_way.entries import HostEntries
-from swarm.wire.messages.traffic import Entry, Stamp, Table
+from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.cell_orders import Orders
 
 HISTORIES = 100
@@ -35,22 +31,6 @@ def test_histories_have_what_they_are_about() -> None:
 
 
 # --- rules of hosts ---------------------------------------------------------------------------------------------
-
-
-def enters_at_once(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(HostEntries, "may_enter", lambda self, entry: True)
-
-
-def waits_for_the_last_before_it_only(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-
-    def hasty(
-        self: HostEntries, shard: int, stamp: Stamp, generation: int, grants: dict[str, list[Entry]]
-    ) -> set[str]:
-        last = {id: [Entry(each.number, each.after[-1:]) for each in entries] for id, entries in grants.items()}
-        return hear(self, shard, stamp, generation, last)
-
-    patch.setattr(HostEntries, "hear_granted", hasty)
 
 
 def says_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
@@ -76,30 +56,6 @@ def acts_on_what_was_granted_to_another_generation(patch: pytest.MonkeyPatch) ->
 # --- rules of leaders -------------------------------------------------------------------------------------------
 
 
-def forgets_those_before_in_earlier_generations(patch: pytest.MonkeyPatch) -> None:
-    before = Orders.before
-    patch.setattr(
-        Orders, "before", lambda self, *of: (each for each in before(self, *of) if each[0] not in self._fences)
-    )
-
-
-def opens_what_an_earlier_generation_holds(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_host_state
-
-    def trusting(self: Orders, host: str, *what: Any) -> bool:
-        changed = take(self, host, *what)
-        for generation in [generation for each, generation in self.fenced if each == host]:
-            self.end(host, generation)
-        return changed
-
-    patch.setattr(Orders, "take_host_state", trusting)
-
-
-def frees_what_the_host_did_not_know_of(patch: pytest.MonkeyPatch) -> None:
-    remove = Orders.remove
-    patch.setattr(Orders, "remove", lambda self, host, holds, _: remove(self, host, holds, (1 << 60, 0)))
-
-
 def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
     table = Orders.table
 
@@ -109,11 +65,6 @@ def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
         return table(self, *what)
 
     patch.setattr(Orders, "table", greedy)
-
-
-def forgets_where_bodies_are(patch: pytest.MonkeyPatch) -> None:
-    take = Orders.take_host_state
-    patch.setattr(Orders, "take_host_state", lambda self, *what: take(self, *what[:-2], {}, what[-1]))
 
 
 # --- rules of members and of generations
@@ -129,18 +80,18 @@ def _setting(name: str, value: object) -> Mutation:
 
 
 RULES: list[Mutation] = [
-    enters_at_once,
-    waits_for_the_last_before_it_only,
+    rules.follows_without_a_word,
+    rules.follows_on_the_word_of_the_last_before_it,
     says_left_when_it_sets_out,
-    takes_what_an_older_table_added,
+    rules.takes_what_an_older_table_added,
     acts_on_what_was_granted_to_another_generation,
-    believes_that_another_vehicle_of_the_cell_has_left,
-    forgets_who_is_before,
-    forgets_those_before_in_earlier_generations,
-    opens_what_an_earlier_generation_holds,
-    frees_what_the_host_did_not_know_of,
+    rules.believes_that_another_vehicle_of_the_cell_has_left,
+    rules.forgets_who_is_before,
+    rules.forgets_those_before_in_earlier_generations,
+    rules.forgets_where_an_older_generation_may_stand,
+    rules.frees_what_the_host_did_not_know_of,
     frees_what_was_not_said,
-    forgets_where_bodies_are,
+    rules.forgets_where_bodies_are,
     _setting("majority", 1),
     _setting("forgetful", True),
     _setting("obliging", True),

@@ -94,7 +94,6 @@ def test_places_are_reached_in_order_and_the_last_order_counts_whatever_is_lost_
     assert list(history.keepers[0]) == list(history.keepers[1]) == list(history.agent.book)
     for name, last in history.given.items():
         held = history.agent.book.get(name)
-        assert held is not None
         assert (held.stamp_ns, held.cells, held.then, held.off) == (
             last.stamp_ns, last.cells, last.then, last.off,
         )  # fmt: skip

@@ -121,7 +121,6 @@ def test_a_second_tracker_steals_no_target_while_the_first_lives_whatever_the_cl
         if now_ns >= second.began_ns:
             refused = second.pose(now_ns + 1, cell=7)
             assert tracking.judge(refused, now_ns + 1 + receiver_ns) is Verdict.REFUSED
-        assert tracking.pose is not None
         assert tracking.pose.cell == 5
     # The first dies: its lease ends, and the second counts from its next pose on.
     last_ns = START_NS + 20 * NS_PER_S - NS_PER_S // 2

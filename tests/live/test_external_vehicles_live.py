@@ -89,7 +89,6 @@ def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
     path = route_of(live, GridSpec(run.rows, run.cols, run.resolution_m))
     command = [sys.executable, "-c", ROVER, live.endpoint, tmp_path / "rover", *path[:6]]
     program = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
-    assert program.stdout is not None
     assert program.stdout.readline() == "there\n"
     program.kill()
     program.wait(10)
@@ -171,7 +170,6 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
     ):
         refused = add(live, *options)
         assert refused.wait(20) == 2
-        assert refused.stderr is not None
         assert sentence in refused.stderr.read()
 
 

@@ -44,13 +44,6 @@ per_agent = 10
 
 [planner]
 places = true
-
-[network]
-listen = ["tcp/127.0.0.1:{port}"]
-connect = ["tcp/127.0.0.1:{port}"]
-
-[monitor]
-web_port = 0
 """
 
 

@@ -126,7 +126,6 @@ def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tm
 def test_a_start_in_the_background_that_is_asked_to_end_leaves_no_run(live: LiveSwarm, tmp_path: Path) -> None:
     words = ("up", str(live.path), "--port", "0", "--runs", str(tmp_path), "--no-live", "-d")
     with subprocess.Popen([*SWARM, *words], stderr=subprocess.PIPE, text=True, start_new_session=True) as start:
-        assert start.stderr is not None
         assert start.stderr.readline(), "the launcher has said something"
         start.send_signal(signal.SIGTERM)
         assert "goes on in the background" not in start.communicate(timeout=60)[1]

@@ -96,7 +96,6 @@ def test_a_browser_shows_the_ground_and_each_target_with_its_vehicles_and_asks_n
 def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
     from rerun.experimental import ViewerClient
 
-    assert shown.sinks.page is not None
     location, port = f"rerun+{shown.sinks.page.server.url}/proxy", free_ports(1)[0]
     viewer = subprocess.Popen(
         [viewer_program(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1280x800",

@@ -42,13 +42,6 @@ caught = "stay"
 
 [[groups]]
 vehicles = 1
-
-[network]
-listen = ["tcp/127.0.0.1:{port}"]
-connect = ["tcp/127.0.0.1:{port}"]
-
-[monitor]
-web_port = 0
 """
 
 
@@ -144,7 +137,6 @@ def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(pai
     pair.adapter("--target", "t")
     vehicle.waits_for(r"^mission \d+ ")
     found = vehicle.said(r"^mission (\d+) (\S+) (\S+)")
-    assert found is not None
     end = swarm.frame.cell(*swarm.frame.from_wgs84(float(found[2]), float(found[3])))
     row, col = swarm.frame.grid.row_col(end)
     assert max(abs(row - TARGET[0]), abs(col - TARGET[1])) <= 1, "its last item is the target's cell"

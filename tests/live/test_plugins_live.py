@@ -9,8 +9,6 @@ import pytest
 from support.live_swarm import folders_of_runs, swarm, write_scenario
 from support.plugin_pages import write_all_examples
 
-from launch_scripts.ports import free_ports
-
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 FAILING = """
@@ -100,17 +98,12 @@ cols = 128
 rubble_fields = 5
 [[groups]]
 vehicles = 12
-[network]
-listen = ["tcp/127.0.0.1:{port}"]
-connect = ["tcp/127.0.0.1:{port}"]
-[monitor]
-web_port = 0
 """
 
 
 @pytest.mark.thorough
 def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
-    path = write_all_examples(tmp_path, ALL.format(port=free_ports(1)[0]))
+    path = write_all_examples(tmp_path, write_scenario(tmp_path, text=ALL).read_text())
     assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6
     told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 8, "--plain", timeout_s=110)
     said = told.stdout + told.stderr

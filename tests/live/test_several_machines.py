@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from support.client_rig import keeper_info
 from support.live_swarm import Hands, swarm
+from support.makers import route_reply
 from support.processes import eventually
 
 from launch_scripts.launcher.options import as_process, tls_of
@@ -22,7 +23,6 @@ from swarm.client import BusError, connect
 from swarm.config.load import load_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages import WIRE_VERSION
-from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import Stats
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import MARKS, OBSTACLE, ROUTE, RUN, STATS
@@ -154,10 +154,7 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
     def answer(event: Event) -> None:
         assert isinstance(event, Asked)
         route = Route(status=RouteStatus.OK, start=0, directions=b"\2", cost_s=3.0, lower_bound_s=3.0)
-        reply = RouteReply(
-            target="t0", incarnation=1, target_cell=1, map_version=0, tree_age_ms=0.0, rows=96, cols=128,
-            routes=RouteBatch.of([route]).columns(),
-        )  # fmt: skip
+        reply = route_reply(RouteBatch.of([route]), GridSpec(96, 128, 30.0), target_cell=1)
         event.answer(run if event.topic is RUN else reply)
         event.end()
 

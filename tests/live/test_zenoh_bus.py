@@ -17,7 +17,7 @@ import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_world import Box, answering, asked, pose
-from support.makers import run_info
+from support.makers import cost_reply, run_info
 from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
@@ -36,11 +36,10 @@ from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
 from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode
-from swarm.wire.fields import pack_column
 from swarm.wire.meant import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
-from swarm.wire.messages.planning import CostReply, CostRequest
+from swarm.wire.messages.planning import CostRequest
 from swarm.wire.messages.traffic import Claim
 from swarm.wire.topics import COST, GIVE_ORDER, NAMELESS_COST, NOTE, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
@@ -111,10 +110,7 @@ def world(router: Router) -> Iterator[ZenohWorld]:
 
 
 def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
-    reply = CostReply(
-        target="t0", incarnation=1, target_cell=3, map_version=1, tree_age_ms=1.0,
-        cost_to_go_s=pack_column([2.5, float("inf")], "<f4"),
-    )  # fmt: skip
+    reply = cost_reply([2.5, float("inf")])
 
     def post(event: object) -> None:
         assert isinstance(event, Asked)
@@ -495,11 +491,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
 
     def answer(event):
         heard.append(event)
-        reply = CostReply(
-            target="t0", incarnation=1, target_cell=3, map_version=1, tree_age_ms=1.0,
-            cost_to_go_s=pack_column([7.5], "<f4"),
-        )  # fmt: skip
-        event.answer(reply)
+        event.answer(cost_reply([7.5]))
         event.end()
 
     a.serve(NAMELESS_COST, answer, target="t0")

@@ -75,7 +75,6 @@ def test_an_external_vehicle_must_not_have_the_name_of_an_agent() -> None:
     simulation.run_until(2)
     rover = external(simulation, "a0", 5)
     simulation.run_until(4)
-    assert rover.service is not None
     assert rover.service.external is None
     assert rover.warnings == ["a0 is an agent of this run's scenario: an external vehicle needs another name"]
 
@@ -117,11 +116,9 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     drive(simulation, [], 5)
     restarted = simulation.nodes["agent-a0"]
     assert other not in agent_of_node(restarted).vehicles
-    assert restarted.service is not None
     assert restarted.service.lacks() == []
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
     drive(simulation, [], 2)
-    assert node.service is not None
     assert node.service.over  # type: ignore[attr-defined]
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
     drive(simulation, [], 0.5)

@@ -70,8 +70,6 @@ def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last(
     assert isinstance(planner, PlannerService)
     assert planner is not before
     search = planner._planner.target_search
-    assert search is not None
     assert search.active
-    assert search._remembered is not None
     assert search._remembered.cell == 1234
     assert search._begun_from is search._remembered

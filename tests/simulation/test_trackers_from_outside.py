@@ -156,7 +156,6 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     laws, ear = LawBook(simulation), Ear(simulation)
     OutsideTracker(simulation, "radar", 20, 3, 12, clock_off_s)
     simulation.run_until(2.5)
-    assert ear.status is not None
     assert (ear.status.target_cell, ear.status.pose_age_s, ear.status.tracker_lost) == (None, None, False)
     simulation.run_until(11)
     reply = ear.ask()
@@ -215,7 +214,6 @@ def test_a_target_whose_tracker_stays_lost_is_searched_for_until_it_or_a_vehicle
     )  # fmt: skip
     ear.bus.publish(SIGHTED, seen, target="x", author="all.a0.9")
     simulation.run_until(simulation.now_s + 1)
-    assert ear.status is not None
     assert ear.status.target_cell == cell
     OutsideTracker(simulation, "radar", 22, 53, 62)
     simulation.run_until(58)

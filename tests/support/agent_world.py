@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from support.makers import target_pose
+from support.makers import cost_reply, route_reply, target_pose
 from support.slow_twins import cost_to_go, way_down
 from support.swarm_model import SwarmModel
 
@@ -20,7 +21,7 @@ from swarm.config.agents import AgentPlan, plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.liveness import Peer
-from swarm.wire.fields import column, pack_column
+from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import (
     CostReply,
@@ -146,29 +147,17 @@ class FakePlanner:
         )
 
     def _routes(self, request: RouteRequest) -> RouteReply:
-        grid = self.world.terrain.grid
-        return RouteReply(
-            target=self.target,
-            incarnation=self.incarnation,
-            target_cell=self.cell,
-            map_version=0,
-            tree_age_ms=0.0,
-            rows=grid.rows,
-            cols=grid.cols,
-            routes=RouteBatch.of([self.route(cell, request.max_cells) for cell in request.cells]).columns(),
-        )
+        routes = RouteBatch.of([self.route(cell, request.max_cells) for cell in request.cells])
+        return route_reply(routes, self.world.terrain.grid, **self._fields)
 
     def _costs(self, request: CostRequest) -> CostReply:
         cost, metres = self.cost(), self.world.terrain.grid.resolution_m
         costs = [math.inf if cost is None else cost.flat[cell] * metres for cell in request.cells]
-        return CostReply(
-            target=self.target,
-            incarnation=self.incarnation,
-            target_cell=self.cell,
-            map_version=0,
-            tree_age_ms=0.0,
-            cost_to_go_s=pack_column(costs, "<f4"),
-        )
+        return cost_reply(costs, **self._fields)
+
+    @property
+    def _fields(self) -> dict[str, Any]:
+        return {"target": self.target, "incarnation": self.incarnation, "target_cell": self.cell}
 
 
 class AgentWorld(SwarmModel):
@@ -212,6 +201,13 @@ class AgentWorld(SwarmModel):
     @property
     def plans(self) -> list[AgentPlan]:
         return plan_agents(self.scenario)
+
+    def begin(self, **targets: tuple[int, int]) -> Self:
+        """Puts targets in their places, and starts all."""
+        for target, (row, col) in targets.items():
+            self.put_target(target, row, col)
+        self.start_all()
+        return self
 
     def start_all(self) -> None:
         for target in self.scenario.target_ids:
@@ -281,6 +277,12 @@ class AgentWorld(SwarmModel):
 
     def until(self, true: Callable[[], object], within_s: float = 5.0, step_s: float = 0.1) -> float:
         return super().until(true, within_s, step_s)
+
+    def arrive(self, within_s: float) -> float:
+        """Runs until all vehicles have arrived, by ways that break no law; returns the seconds that it took."""
+        took_s = self.until(lambda: self.all_in(VehicleState.ARRIVED), within_s)
+        self.assert_lawful()
+        return took_s
 
     # --- what there is to see -------------------------------------------------------------------------------
 

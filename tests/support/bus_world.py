@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from swarm.bus.bus import Asked, AskEnded, Bus, Event
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
@@ -72,3 +72,10 @@ def asked(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) ->
     bus.ask(topic, request, box, tag="q", **options)
     world.until(lambda: box.of(AskEnded))
     return box
+
+
+def answer_of(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) -> Any:
+    """The message that answers a query, or the reason of its refusal."""
+    events = asked(world, bus, topic, request, **options)
+    (answer,) = [each.message for each in events.of(Replied)] or [events[-1].failure]
+    return answer

@@ -268,6 +268,10 @@ class ExternalWorld(TrafficWorld):
         if back:
             self.at(self.external_chance.randrange(4 * NS_PER_S), lambda: self.bring_back(process))
 
+    def everybody(self) -> list[str]:
+        added = [id for vehicles in self.added.values() for id in vehicles]
+        return [*super().everybody(), *(f"{robot}-00" for robot in self.robots), *added]
+
     def end_robots(self) -> None:
         """All robots die for good. Once no word of theirs is under way any more, they are carried away."""
         self.never_back.update(self.robots)

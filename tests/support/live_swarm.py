@@ -53,10 +53,11 @@ time_scale = 10
 {SMALL_WORLD}
 [vehicles]
 per_agent = 6
-
+"""
+_ENDS = """
 [network]
-listen = ["tcp/127.0.0.1:{{port}}"]
-connect = ["tcp/127.0.0.1:{{port}}"]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
 
 [monitor]
 web_port = 0
@@ -64,9 +65,9 @@ web_port = 0
 
 
 def write_scenario(folder: Path, also: str = "", text: str = _SCENARIO) -> Path:
-    """A small scenario on a free port; `also` are further sections of it, `text` is another one with `{port}`."""
+    """A small scenario on a free port; `also` are further sections of it, `text` is another one."""
     path = folder / "small.toml"
-    path.write_text(text.format(port=free_ports(1)[0]) + also)
+    path.write_text(text + _ENDS.format(port=free_ports(1)[0]) + also)
     return path
 
 

@@ -8,9 +8,10 @@ from typing import Any
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import PlannerStatus, TargetPose
+from swarm.wire.messages.planning import CostReply, PlannerStatus, RouteReply, TargetPose
 from swarm.wire.messages.processes import RunInfo, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.route_columns import RouteBatch
 
 
 def run_info(grid: GridSpec | None = None, **fields: Any) -> RunInfo:
@@ -66,6 +67,26 @@ def target_pose(target: str = "t0", cell: int = 0, grid: GridSpec | None = None,
     x_m, y_m = (0.0, 0.0) if grid is None else grid.centre_m(cell)
     told = {"incarnation": 1, "seq": 1, "stamp_ns": 0, "cell": cell, "x_m": x_m, "y_m": y_m}
     return TargetPose(target=target, **(told | fields))
+
+
+_ANSWERED: dict[str, Any] = {
+    "target": "t0",
+    "incarnation": 1,
+    "target_cell": 3,
+    "map_version": 0,
+    "tree_age_ms": 0.0,
+}
+
+
+def route_reply(routes: RouteBatch, grid: GridSpec | None = None, **fields: Any) -> RouteReply:
+    """The answer of a planner with these routes, on this grid or on one of a single cell."""
+    grid = grid or GridSpec(1, 1, 1.0)
+    return RouteReply(**(_ANSWERED | fields), rows=grid.rows, cols=grid.cols, routes=routes.columns())
+
+
+def cost_reply(costs_s: Sequence[float], **fields: Any) -> CostReply:
+    """The answer of a planner with these costs."""
+    return CostReply(**(_ANSWERED | fields), cost_to_go_s=pack_column(costs_s, "<f4"))
 
 
 def planner_status(target: str = "t0", **told: Any) -> PlannerStatus:

@@ -335,6 +335,15 @@ class TrafficWorld:
             action()
         self.now_ns = end_ns
 
+    def assert_all_move(self, seconds: float) -> None:
+        before = dict(self.moves)
+        self.run(seconds)
+        assert self.collisions == []
+        assert [id for id in self.everybody() if self.moves.get(id, 0) == before.get(id, 0)] == []
+
+    def everybody(self) -> list[str]:
+        return [id for vehicles in self.spawns.values() for id in vehicles]
+
     @property
     def quiet(self) -> bool:
         return self.now_ns >= self.faults.quiet_s * NS_PER_S

@@ -139,17 +139,6 @@ def test_the_paper_s_tables_have_its_rows() -> None:
     assert [(row["targets"], row["vehicles"]) for row in report["table_1"]] == [
         (targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)
     ]
-    assert [row["printed_ms"] for row in report["table_1"]] == [
-        10.2,
-        10.3,
-        10.4,
-        47.0,
-        48.0,
-        49.0,
-        80.2,
-        84.8,
-        88.2,
-    ]
     assert {row["strategy"]: row["printed_ms"] for row in report["table_2"]} == {
         **dict.fromkeys(STRATEGIES),
         "full": 892.6,

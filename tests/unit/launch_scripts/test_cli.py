@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.command import Swarm
-from support.makers import run_info
+from support.makers import route_reply, run_info
 
 from launch_scripts import ports
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
@@ -26,7 +26,6 @@ from swarm.config.scenario import MonitorConfig, Scenario, TlsConfig
 from swarm.errors import BusError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import cell_of
-from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
@@ -106,11 +105,7 @@ WAY: dict[str, Any] = {"directions": bytes([1, 1, 2]), "cost_s": 30.0, "lower_bo
 def answer(status: RouteStatus = RouteStatus.OK, target: int | None = START - 80 * 2 + 3, **way: Any) -> Answer:
     """A route of two steps to the north-east and one to the east, or none."""
     route = Route(status=status, start=START, **(WAY if status is RouteStatus.OK else way))
-    reply = RouteReply(
-        target="t3", incarnation=1, target_cell=target, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
-        routes=RouteBatch.of([route]).columns(),
-    )  # fmt: skip
-    return Answer(reply, FRAME, START, 2.0)
+    return Answer(route_reply(RouteBatch.of([route]), GRID, target="t3", target_cell=target), FRAME, START, 2.0)
 
 
 def test_an_answer_names_its_places_so_that_they_can_be_given_again(capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,6 +161,5 @@ def test_the_frame_is_that_of_most_processes() -> None:
     frame = frame_of_members(
         [info("a", "local"), info("b", "EPSG:32632"), info("c", "EPSG:32632"), info("d", "x", 0)]
     )
-    assert frame is not None
     assert frame.grid == GRID
     assert frame_of_members([info("d", "x", 0)]) is None

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
-from support.makers import planner_status
+from support.makers import cost_reply, planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground_colours import (
@@ -23,16 +23,7 @@ from launch_scripts.monitor.terrain_mesh import Floats, TerrainMesh
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec
-from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import CostReply
 from swarm.wire.topics import COST, STATUS
-
-
-def answer(samples: CostSamples, target: str, costs: list[float]) -> CostReply:
-    return CostReply(
-        target=target, incarnation=1, target_cell=0, map_version=0, tree_age_ms=0.0,
-        cost_to_go_s=pack_column(costs, "<f4"),
-    )  # fmt: skip
 
 
 def costs_to(pace: Floats, row: int, col: int) -> Floats:
@@ -65,11 +56,11 @@ def test_few_cells_are_asked_about_the_shown_target_most_and_all_others_in_turn(
 def test_an_answer_that_fits_no_question_is_left_out() -> None:
     samples = CostSamples(GridSpec(40, 50, 10.0), "t0")
     right = len(samples.request.cells)
-    assert not samples.on_costs(answer(samples, "t0", [1.0] * right)), "nobody said that there is such a target"
+    assert not samples.on_costs(cost_reply([1.0] * right)), "nobody said that there is such a target"
     samples.targets.append("t0")
-    assert not samples.on_costs(answer(samples, "t0", [1.0] * (right - 1)))
-    assert samples.on_costs(answer(samples, "t0", [1.0] * right))
-    assert samples.on_costs(answer(samples, "t0", [math.inf] * right)), "a target that nobody reaches any more"
+    assert not samples.on_costs(cost_reply([1.0] * (right - 1)))
+    assert samples.on_costs(cost_reply([1.0] * right))
+    assert samples.on_costs(cost_reply([math.inf] * right)), "a target that nobody reaches any more"
     assert samples.costs_s == {}
 
 
@@ -140,7 +131,7 @@ def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:
         if isinstance(event, Asked):
             asked.append(len(event.request.cells))  # type: ignore[attr-defined]
             costs = [float(cell % 100) for cell in event.request.cells]  # type: ignore[attr-defined]
-            event.answer(answer(rig.service._ground.samples, "t0", costs), target="t0")
+            event.answer(cost_reply(costs), target="t0")
             event.end()
 
     planner.serve(COST, post, target="t0")

@@ -64,14 +64,12 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     assert not router.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert 364 <= (router.not_valid_after_utc - datetime.datetime.now(datetime.UTC)).days <= 365
     files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
-    assert files is not None
     scenario.write_text(
         scenario.read_text() + f'tls = {{ca = "{files.ca}", certificate = "certs", key = "certs"}}\n'
     )
     loaded = load_scenario(scenario)
     for spec in processes_of(loaded):
         own = as_process(loaded, spec.role, spec.id).network.tls
-        assert own is not None
         assert common_name(certs, Path(own.certificate).stem) in names
         assert Path(own.key) == Path(own.certificate).with_suffix(".key")
     assert as_process(loaded, LAUNCHER, "0").network.tls != as_process(loaded, "keeper", "0").network.tls

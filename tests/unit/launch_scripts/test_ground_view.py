@@ -212,12 +212,6 @@ def hill(rows: int, cols: int, resolution_m: float = 10.0, top_m: float = 50.0) 
     return terrain_of_pace(np.ones((rows, cols), np.float32), resolution_m, elevation_m)
 
 
-def photo(terrain: Terrain, window: Window, now: Floats | None = None) -> Bytes:
-    """Photo of a window, the ground being this."""
-    ground = terrain.ground_s_per_m if now is None else now
-    return GroundColours(TerrainMesh(terrain), terrain, ground, None).photo_of(window)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (64, 64), (65, 65), (100, 151), (424, 400)])
 def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(shape: tuple[int, int]) -> None:
     rows, cols = shape
@@ -242,7 +236,7 @@ def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
     pace[130, 70] = np.inf
     (tile,) = mesh.tiles_touching(Window(130, 70, 131, 71))
     window = mesh.tile_window(tile)
-    marked, plain = photo(terrain, window, pace), photo(terrain, window)
+    marked, plain = colours_of(terrain, pace).photo_of(window), colours_of(terrain).photo_of(window)
     rows, cols = np.nonzero((marked != plain).any(axis=2))
     assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
 
@@ -275,10 +269,10 @@ def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_othe
     touched = mesh.tiles_touching(Window(64, 10, 65, 11))
     for tile in range(mesh.tile_rows * mesh.tile_cols):
         window = mesh.tile_window(tile)
-        before, after = photo(terrain, window), photo(terrain, window, pace)
+        before, after = colours_of(terrain).photo_of(window), colours_of(terrain, pace).photo_of(window)
         assert (tile in touched) == bool((before != after).any())
     window = mesh.tile_window(touched[-1])
-    texture = photo(terrain, window, pace)
+    texture = colours_of(terrain, pace).photo_of(window)
     mark = texture[64 - window.row0, 10 - window.col0].astype(int)
     assert np.abs(mark - np.array(LETHAL_MARK)).max() < 40
 
@@ -336,10 +330,6 @@ def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:
     return cost_map, sets
 
 
-def small() -> Scenario:
-    return parse_scenario('name = "s"\nseconds = 5\n[[targets]]\nname = "t"\n[[groups]]\nvehicles = 1\n')
-
-
 def test_the_picture_of_a_report_shows_factors_but_on_lethal_ground() -> None:
     cost_map, _ = learned(flat=3.0, steep=0.4)
     pixels = learned_pixels(GROUND, cost_map.factors)
@@ -364,7 +354,7 @@ def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again
 
 
 def test_everybody_who_shows_a_run_says_what_was_learned_and_nothing_while_nothing_is() -> None:
-    recorder = Recorder(small(), GROUND.grid)
+    recorder = Recorder(zoned(""), GROUND.grid)
     assert not any("learned" in line for line in facts.lines(recorder.summary(1)))
     recorder.heard(stats("planner", "t", gauges={"learned.grass": 2.853}), 1)
     assert "learned grass x 2.9" in facts.lines(recorder.summary(1))
@@ -373,7 +363,7 @@ def test_everybody_who_shows_a_run_says_what_was_learned_and_nothing_while_nothi
 
 def test_a_report_tells_each_kind_of_ground_and_has_a_picture(tmp_path: Path) -> None:
     _, sets = learned(flat=3.0, steep=1.0)
-    recorder = Recorder(small(), GROUND.grid)
+    recorder = Recorder(zoned(""), GROUND.grid)
     for each in sets:
         recorder.heard(each, 1)
     write_report(tmp_path, make_report(recorder, GROUND), recorder, GROUND)

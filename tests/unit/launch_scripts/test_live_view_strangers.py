@@ -123,7 +123,6 @@ def test_two_hosts_none_or_one_that_can_be_read_in_two_ways_are_no_host(sinks: S
 def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
     sinks: Sinks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert sinks.page is not None
     monkeypatch.setattr(sinks.page.server, "lasts_s", 1.5)
     port, before = sinks.web_port, threading.active_count()
     with contextlib.ExitStack() as stack:
@@ -173,7 +172,6 @@ def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -
 
 
 def test_rerun_itself_listens_where_nobody_looks(sinks: Sinks) -> None:
-    assert sinks.page is not None
     assert sinks.page.server.behind is not None
     host, port = sinks.page.server.behind
     assert host.startswith("127.")

@@ -108,7 +108,6 @@ def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     rig.turns(0.1)
     adapter = rig.shell._adapter
-    assert adapter._arming is not None
     adapter._arming.drive(adapter._beat, 0.0, rig.now_ns)  # type: ignore[arg-type]
     rig.session.ended = RunMismatchError("run a is over, and run b is in its namespace: connect again")
     rig.vehicle_says(12, 10, mission, base=1 | 128)

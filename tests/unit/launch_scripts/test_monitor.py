@@ -302,7 +302,6 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     terrain: Terrain, tmp_path: Path
 ) -> None:
     sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
-    assert sinks.page is not None
     url = sinks.page.server.url
     try:
         with urllib.request.urlopen(url, timeout=30) as reply:
@@ -387,7 +386,6 @@ print(child.pid, flush=True)
 time.sleep(60)
 """
     with subprocess.Popen([sys.executable, "-c", parent_script], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         child = Path(f"/proc/{int(parent.stdout.readline())}")
         eventually(lambda: b"sleep" in (child / "cmdline").read_bytes(), 10)
         parent.send_signal(signal.SIGKILL)

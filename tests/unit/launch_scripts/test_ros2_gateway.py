@@ -280,7 +280,6 @@ def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool)
             if action.channel.row == "map_updates":
                 m = action.message
                 heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
-        assert heard is not None
         assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
 
 

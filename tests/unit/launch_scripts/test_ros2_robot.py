@@ -79,7 +79,6 @@ class World:
 
     def follows(self, id: str) -> Any:
         vehicle = self.robots[id]._vehicle
-        assert vehicle is not None
         return vehicle._target
 
 

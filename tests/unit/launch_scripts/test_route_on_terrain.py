@@ -248,5 +248,4 @@ def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(hill:
     first, last = feature["geometry"]["coordinates"]
     assert first == last
     coordinates = ElementTree.parse(tmp_path / "way.kml").find(".//{*}coordinates")
-    assert coordinates is not None
     assert len((coordinates.text or "").split()) == 2

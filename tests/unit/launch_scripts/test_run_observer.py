@@ -46,7 +46,6 @@ def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None
     observer.take(Appeared(Peer("agent", "a0", 1)), 6)
     answered(observer, "r1")
     latest = observer.latest
-    assert latest is not None
     assert latest.grid.rows == 40
     assert latest.vehicles().ids == ["a0-00"]
     assert latest.up() == [("agent", "a0")]
@@ -59,7 +58,6 @@ def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None
 def test_the_run_of_most_answers_is_observed_and_the_others_are_strangers() -> None:
     observer = outside()
     answered(observer, "r1", "r2", "r2")
-    assert observer.run is not None
     assert observer.run.run_id == "r2"
     members, strangers = observer.members()
     assert [info.id for info in members] == ["a1", "a2"]
@@ -84,9 +82,7 @@ def test_one_that_follows_forgets_the_run_before_but_not_who_is_there() -> None:
     observer.take(Heard(STATS, {}, stats("a0")), 2)
     observer.take(Disappeared(Peer("agent", "a9", 1)), 3)
     answered(observer, "r2", now_ns=4)
-    assert observer.run is not None
     assert observer.run.run_id == "r2"
-    assert observer.latest is not None
     assert observer.latest.total("captures") is None
     assert observer.latest.up() == [("agent", "a0")]
     assert not observer.over

@@ -278,7 +278,6 @@ def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(record
         reader = make_reader(file)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary is not None
         assert summary.statistics is not None
         assert {each.topic for each in summary.channels.values()} == TOPICS
         assert {each.message_encoding for each in summary.channels.values()} == {"cdr"}
@@ -299,7 +298,6 @@ def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: S
     assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
     with (old / "export" / "old.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
-        assert summary is not None
         assert {each.topic for each in summary.channels.values()} == TOPICS - {"/map"}
 
 

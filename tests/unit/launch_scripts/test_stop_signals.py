@@ -121,7 +121,6 @@ def talker(report: Path, how: str, **streams: int) -> subprocess.Popen[bytes]:
 
 def test_a_broken_pipe_silences_the_output_and_ends_nothing(tmp_path: Path) -> None:
     with talker(tmp_path / "report", "plain", stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"a line\n"
         process.stdout.close()  # as `head -1`
         assert process.wait(20) == 7
@@ -170,7 +169,6 @@ time.sleep(60)
 def test_what_a_stopped_command_leaves_in_another_session_is_ended(number: signal.Signals) -> None:
     command = [sys.executable, str(Path(contained.__file__)), sys.executable, "-c", STARTS]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout is not None
         orphan = int(process.stdout.readline())
         process.send_signal(number)
         assert process.wait(30) != 0

@@ -225,7 +225,6 @@ def test_who_writes_a_file_is_found_and_who_reads_it_is_not(tmp_path: Path, mode
         with subprocess.Popen(
             [sys.executable, "-c", code, str(path), mode], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as other:
-            assert other.stdout is not None
             other.stdout.readline()
             assert sorted(writing(path)) == sorted([os.getpid(), *([other.pid] if mode == "a" else [])])
             other.communicate()

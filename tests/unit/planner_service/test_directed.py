@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from support.makers import route_reply
 from support.shard_tables import grants_of
 
 from planner_service.target_tree import TargetTree
@@ -23,7 +24,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.planning import RouteReply, TargetPose
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.traffic import Granted
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
@@ -111,9 +112,6 @@ def test_a_prepared_terrain_keeps_its_climb(tmp_path):
     terrain = build_terrain(scenario(slope_rule="tobler"))
     save_prepared(tmp_path, terrain, terrain.ground_s_per_m)
     loaded = load_prepared(tmp_path)
-    assert loaded is not None
-    assert loaded.climb is not None
-    assert terrain.climb is not None
     np.testing.assert_array_equal(loaded.climb.factors, terrain.climb.factors)
     assert loaded.climb.of_step(100, 101) == terrain.climb.of_step(100, 101)
 
@@ -171,17 +169,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
                 agent.assignment.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
                 agent.costs_ended(asked.request, now_ns)
             elif isinstance(asked, AskRoutes):
-                routes = tree.routes(asked.cells)
-                reply = RouteReply(
-                    target="t",
-                    incarnation=1,
-                    target_cell=target,
-                    map_version=0,
-                    tree_age_ms=0.0,
-                    rows=grid.rows,
-                    cols=grid.cols,
-                    routes=routes.columns(),
-                )
+                reply = route_reply(tree.routes(asked.cells), grid, target="t", target_cell=target)
                 agent.routes_given(asked.request, reply, now_ns)
     raise AssertionError("the vehicle never arrived")
 

@@ -100,9 +100,7 @@ def test_a_planner_that_begins_anew_searches_from_an_earlier_sighting_that_it_is
     world = World()
     world.run(7)
     search = world.service._planner.target_search
-    assert search is not None
     belief = search.searcher.belief
-    assert belief is not None
     assert (belief.reachable == belief.blocks.open).all(), "nothing is known yet"
     free = np.flatnonzero(np.isfinite(world.ground.pace_s_per_m))
     cell = int(free[len(free) // 2])

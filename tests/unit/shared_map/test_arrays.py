@@ -20,7 +20,6 @@ RNG = np.random.default_rng(1)
 def _digest_after_marks(folder: Path) -> tuple[float, bool]:
     """In another process: marks a cell, and returns the value before and whether the mark holds."""
     terrain = load_prepared(folder)
-    assert terrain is not None
     before = float(terrain.pace_s_per_m[3, 4])
     cost_map = CostMap(terrain)
     mark(cost_map, 3 * terrain.grid.cols + 4)

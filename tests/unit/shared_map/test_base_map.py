@@ -270,5 +270,4 @@ def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
         assert fetched_terrain.fetch_if_missing(scenario, tmp_path, [info], roles=["agent"])
         assert len(fetched) == expected
     found = load_prepared(tmp_path)
-    assert found is not None
     assert np.array_equal(found.pace_s_per_m, TERRAIN.pace_s_per_m)

@@ -155,9 +155,7 @@ capture_range_m = 10.0
 
 @pytest.mark.parametrize("writes", [["*"], []])
 def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str]) -> None:
-    world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(PRIOR), pace_of(TRUTH))
-    world.put_target("t", 1, 17)
-    world.start_all()
+    world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(PRIOR), pace_of(TRUTH)).begin(t=(1, 17))
     world.run(5.0)
     closed = np.isinf(pace_of(TRUTH)) & ~np.isinf(pace_of(PRIOR))
     red, blue = (service._maps.common.ground_s_per_m[closed] for service in world.agents.values())

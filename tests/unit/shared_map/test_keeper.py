@@ -296,7 +296,6 @@ def test_an_author_that_lives_is_never_taken_for_dead() -> None:
         each.sync.publish(each.replica.write([0], MarkKind.LETHAL, 0.0, swarm.now_ns))
     swarm.run(30)
     own = author.replica.held.get(0, "a1.1")
-    assert own is not None
     assert (own.epoch, len(own.cells)) == (1, 2)
     assert keeper.counters.counts["sets_folded"] == 0
 

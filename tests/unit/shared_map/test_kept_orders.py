@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.bus_world import answer_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import AskEnded, Event, Heard, Replied
+from swarm.bus.bus import Event, Heard
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -37,15 +38,10 @@ class BookWorld(SwarmModel):
 
     def give(self, keeper: str = "k", **fields: Any) -> list[Order] | str | None:
         """The book of the keeper after that, or its refusal."""
-        heard: list[Event] = []
-        self.person.ask(GIVE_ORDER, GiveOrder(**fields, stamp_ns=self.now_ns), heard.append, tag="o", keeper=keeper)
+        order = GiveOrder(**fields, stamp_ns=self.now_ns)
+        answer: Orders | str | None = answer_of(self, self.person, GIVE_ORDER, order, keeper=keeper)
         self.run(0.2)
-        for event in heard:
-            if isinstance(event, Replied):
-                assert isinstance(event.message, Orders)
-                return event.message.orders
-        (ended,) = (event for event in heard if isinstance(event, AskEnded))
-        return ended.failure
+        return answer.orders if isinstance(answer, Orders) else answer
 
 
 def test_an_acknowledged_order_is_on_the_disk(tmp_path: Path) -> None:
@@ -132,16 +128,10 @@ def test_a_target_is_put_at_a_place(place: str) -> None:
 
 def send(world: BookWorld, keeper: str = "k", **fields: Any) -> Goals | str | None:
     """The reply of the keeper, or its refusal."""
-    heard: list[Event] = []
     order = SendVehicle(**fields, stamp_ns=world.now_ns)
-    world.person.ask(SEND_VEHICLE, order, heard.append, tag="s", keeper=keeper)
+    answer: Goals | str | None = answer_of(world, world.person, SEND_VEHICLE, order, keeper=keeper)
     world.run(0.2)
-    for event in heard:
-        if isinstance(event, Replied):
-            assert isinstance(event.message, Goals)
-            return event.message
-    (ended,) = (event for event in heard if isinstance(event, AskEnded))
-    return ended.failure
+    return answer
 
 
 def test_acknowledged_goals_are_on_the_disk_and_so_is_what_the_vehicle_has_reached(tmp_path: Path) -> None:

@@ -174,7 +174,6 @@ def test_water_of_every_kind_of_model_is_found_and_dry_ground_is_left(name: str)
 def test_the_arms_of_norris_lake_are_water() -> None:
     """The reservoir in the east of the built-in terrain stands at 305 m, in whole metres."""
     heights = read_npz(_jacksboro_path(), "").numbers
-    assert heights is not None
     arms, _ = ndimage.label(heights[120:280, 270:] == 305, np.ones((3, 3)))
     lake = np.bincount(arms.ravel())[arms] >= 30
     lake &= arms > 0

@@ -128,6 +128,5 @@ def test_an_import_hands_on_what_its_photo_may_show() -> None:
     source = Source(GridSpec(40, 60, 10.0), level, np.zeros((40, 60), np.uint8))
     seen = np.ones((40, 60), np.bool_)
     found = with_photo(source, Photo(photo, seen, ()), TerrainConfig(), lambda what, share: None)
-    assert found.readings is not None
     assert (found.readings[5:35, 5:25] == BIT[TerrainClass.GRASS] | BIT[TerrainClass.FOREST]).mean() > 0.9
     assert not found.readings[5:35, 35:].any()

@@ -98,10 +98,8 @@ capture_range_m = 10.0
 
 
 def test_a_parked_vehicle_is_driven_around_without_a_stop() -> None:
-    world = AgentWorld(SCENARIO, pace_of(CORRIDOR))
-    world.put_target("t", 2, 22)
-    world.put_target("s", 2, 12)  # the other has arrived before it begins
-    world.start_all()
+    # The other has arrived before it begins.
+    world = AgentWorld(SCENARIO, pace_of(CORRIDOR)).begin(t=(2, 22), s=(2, 12))
     world.run(3.0)
     assert world.states()["a1-00"] is VehicleState.ARRIVED
     took_s = world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=60)

@@ -165,7 +165,6 @@ def test_targets_that_nobody_tracks_are_chased_by_what_vehicles_see() -> None:
     assert report["captures"] > 0
     assert laws.collisions == laws.lethal == []
     store = simulation.nodes["keeper-0"].store
-    assert store is not None
     assert {each.target for each in store.sightings()} <= {"lost0", "lost1"} != set()
 
 

@@ -128,7 +128,6 @@ def test_a_photo_on_another_grid_is_brought_onto_the_elevations(tmp_path: Path) 
     west = UTM.c + 20 * 25 - 10 * 50
     write(tmp_path / "photo.tif", photo, from_origin(west, UTM.f, 10, 10))
     source = load(tmp_path / "dem.tif", photo=str(tmp_path / "photo.tif"))
-    assert source.photo is not None
     assert source.photo.shape == (40, 50, 3)
     assert (source.photo[:, :24] == (0, 120, 0)).all()
     assert (source.photo[:, 26:] == (200, 60, 40)).all()
@@ -317,7 +316,6 @@ def test_real_pairs_come_onto_one_grid() -> None:
     assert davos.photo is not None
     rmnp = load(DATA / "dem/rmnp/rmnp-dem.tif", photo=str(DATA / "dem/rmnp/rmnp-rgb.tif"))
     assert 230 < rmnp.grid.resolution_m < 238
-    assert rmnp.photo is not None
     assert rmnp.photo.shape == (rmnp.grid.rows, rmnp.grid.cols, 3)
     assert not np.isnan(rmnp.elevation_m).any()
     tujunga = load(DATA / "dem/bigtujunga/bigtujunga_512.tif")

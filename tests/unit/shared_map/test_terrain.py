@@ -67,7 +67,6 @@ def test_a_prepared_terrain_is_the_same(tmp_path: Path) -> None:
     scenario = with_cost(vehicle_radius_m=40.0)
     terrain, truth = prepare(tmp_path / "run", scenario)
     again = load_prepared(tmp_path / "run", scenario_key(scenario))
-    assert again is not None
     assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
     for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(terrain, name))

@@ -125,7 +125,6 @@ def test_water_closes_a_road_and_a_bridge_opens_the_water(tmp_path: Path, resolu
         rows = np.flatnonzero(opened.any(axis=1))  # only beneath the road
         assert len(rows) <= max(3, 8 / resolution_m + 2)
         road = next(each for each in facts if each.kind == "road")
-        assert road.file is not None
         assert (road.file.bridges, road.opened) == (1, int(opened.sum()))
     for value in ("no", "F", "aqueduct"):
         pace, _ = painted(crossing(tmp_path / "c.geojson", {"bridge": value}, grid=grid), grid)
@@ -180,7 +179,6 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
         [0.05, 0.1, 0.1, 0.1, 0.1, 0.2, 0.1, 0.1, np.inf, np.inf, np.inf, 0.1],
         rtol=1e-6,
     )
-    assert roads.file is not None
     assert water.file is not None
     assert dict(roads.file.skipped) == {"of class steps": 1, "below the ground": 1, "without a class": 5}
     assert roads.file.named["of class steps"] == ["way/17"]
@@ -206,7 +204,6 @@ def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path)
     file = written(tmp_path / "a.gpkg", boxes, UTM.crs, columns)
     pace, (facts,) = painted([ZoneConfig(kind="factor", file=file, attribute="f")])
     np.testing.assert_allclose(pace[[3, 8, 12, 3, 3], [3, 8, 12, 22, 32]], [0.2, 0.3, 0.3, 0.1, 0.1])  # the slower
-    assert facts.file is not None
     assert sum(facts.file.skipped.values()) == 2
     assert "4 (-1.0)" in facts.sentence(UTM.cells)
     own = {"mud": WayConfig(factor=5.0), "ice": WayConfig(factor="lethal")}
@@ -302,7 +299,6 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
         pace, (facts,) = painted(
             [ZoneConfig(kind="factor", factor=2.0, file=str(tmp_path / f"{name}.geojson"))], grid
         )
-        assert facts.file is not None
         assert facts.file.used == 1
         found.append(pace > 0.1)
     cols, rows = np.meshgrid(np.arange(60) + 0.5, np.arange(40) + 0.5)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.bus_world import answer_of
 from support.map_strategies import set_of
 from support.swarm_model import SwarmModel
 
@@ -18,7 +19,6 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
@@ -51,15 +51,10 @@ class ZoneWorld(SwarmModel):
 
     def order(self, topic: Topic = ZONES, **fields: Any) -> Zones | str | None:
         """The keeper's answer: zones, or its refusal."""
-        heard: list[Event] = []
-        self.person.ask(topic, ZoneOrder(**fields, stamp_ns=self.now_ns), heard.append, tag="z", keeper="k")
+        order = ZoneOrder(**fields, stamp_ns=self.now_ns)
+        answer: Zones | str | None = answer_of(self, self.person, topic, order, keeper="k")
         self.run(0.3)
-        for event in heard:
-            if isinstance(event, Replied):
-                assert isinstance(event.message, Zones)
-                return event.message
-        (ended,) = (event for event in heard if isinstance(event, AskEnded))
-        return ended.failure
+        return answer
 
     def add(self, name: str = "z", polygon: list[tuple[float, float]] | None = None, **fields: Any) -> Zones:
         zones = self.order(action="add", name=name, polygon=polygon or SQUARE, **fields)

@@ -53,7 +53,6 @@ def test_processes_that_begin_at_once_share_one_secret_that_nobody_else_may_read
 
     def begin() -> None:
         authenticator = authenticator_of(NetworkConfig(), "run")
-        assert authenticator is not None
         made.append(authenticator.code("key", b"payload"))
 
     threads = [threading.Thread(target=begin) for _ in range(16)]

@@ -51,7 +51,6 @@ def test_no_more_have_a_turn_at_once_than_may_and_everybody_has_one(tmp_path: Pa
 
 def test_the_turn_of_a_process_that_is_killed_ends(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == b"mine\n"
         began_s = time.monotonic()
         threading.Timer(0.2, os.kill, (holder.pid, signal.SIGKILL)).start()

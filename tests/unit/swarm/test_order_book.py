@@ -103,7 +103,6 @@ def test_targets_come_move_and_go() -> None:
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"]
     assert keeper.give(subject="target", name="x", cell=9) is None
     moved = keeper.book.about("target", "x")
-    assert moved is not None
     assert (moved.cell, moved.walk) == (9, "still")
     assert keeper.give(subject="group", name="red", targets=["x"]) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["x"]

@@ -52,30 +52,7 @@ class Recording:
         self.log.append("stop")
 
 
-def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
-    clock, inbox = ManualClock(), Inbox()
-
-    def on_tick(ticks: list[int]) -> None:
-        if len(ticks) == 4:
-            process.stop()
-        clock.advance_to(clock.now_ns() + (350_000_000 if len(ticks) == 2 else 100_000_000))
-
-    service = Recording(on_tick)
-    process = Process(service, inbox, clock, tick_hz=10)
-    process.run()
-    assert [tick // 10**6 for tick in service.ticks] == [0, 100, 450, 550]
-    # Due at 200 and 300 and never taken; the one of 400 comes at 450, the next is in time again.
-    assert service.counters.counts == {
-        "ticks_dropped": 2,
-        "ticks_late": 2,
-        "first_uses": 0,
-        "events_dropped": 0,
-        "asks_expired": 0,
-    }
-    assert service.log == ["start", "stop"]
-
-
-@pytest.mark.parametrize(("took_ms", "late"), [(149, 0), (151, 1), (260, 2), (250, 1)])
+@pytest.mark.parametrize(("took_ms", "late"), [(149, 0), (151, 1), (250, 1), (260, 2), (360, 3)])
 def test_a_tick_is_late_which_comes_more_than_half_a_period_after_it_was_due_or_never(took_ms, late):
     clock, inbox = ManualClock(), Inbox()
 
@@ -273,7 +250,6 @@ process.run()
 
 def idle(how: str) -> subprocess.Popen[bytes]:
     process = subprocess.Popen([sys.executable, "-c", IDLE, how], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdout is not None
     assert process.stdout.readline() == b"up\n"
     return process
 
@@ -319,21 +295,14 @@ worker.close()
 
 def test_a_stop_waits_for_no_kernel():
     process = subprocess.Popen([sys.executable, "-c", WORKING], stdout=subprocess.PIPE)
-    assert process.stdout is not None
     assert process.stdout.readline() == b"up\n"
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=30)
     assert (out, process.returncode) == (b"stopped\n", 0)
 
 
-def test_a_process_ends_with_its_parent():
-    process = idle("parent")
-    out, _ = process.communicate(timeout=20)
-    assert out == b"stopped\n"
-    assert process.returncode == 0
-
-
-def test_a_process_that_hangs_at_its_end_is_ended():
-    process = idle("hang")
-    process.communicate(timeout=20)
-    assert process.returncode == 1
+@pytest.mark.parametrize(("how", "told", "code"), [("parent", b"stopped\n", 0), ("hang", b"", 1)])
+def test_a_process_ends_with_its_parent_and_is_ended_if_it_hangs_then(how, told, code):
+    process = idle(how)
+    assert process.communicate(timeout=20)[0] == told
+    assert process.returncode == code

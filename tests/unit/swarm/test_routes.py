@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.makers import route_reply
 from support.wire_strategies import routes
 
 from planner_service.kernels import route_walk
@@ -31,24 +32,11 @@ from swarm.wire.route_columns import (
 )
 
 
-def reply_of(batch: RouteBatch) -> RouteReply:
-    return RouteReply(
-        target="t",
-        incarnation=1,
-        target_cell=0,
-        map_version=0,
-        tree_age_ms=0.0,
-        rows=9,
-        cols=9,
-        routes=batch.columns(),
-    )
-
-
 @given(st.lists(routes, max_size=6))
 def test_routes_come_off_the_wire_as_they_were(some: list[Route]) -> None:
     batch = RouteBatch.of(some)
     assert list(batch) == some
-    reply = decode(encode(reply_of(batch)), RouteReply)
+    reply = decode(encode(route_reply(batch)), RouteReply)
     assert len(reply.routes) == len(some)
     assert list(reply.routes) == some
     assert [reply.routes[i - 1] for i in range(len(some))] == [some[i - 1] for i in range(len(some))]
@@ -73,7 +61,7 @@ def test_what_is_no_direction_is_not_packed() -> None:
 def test_a_thousand_routes_take_few_bytes() -> None:
     codes = np.arange(300, dtype=np.uint8) % 8
     some = RouteBatch.of([Route(status=RouteStatus.OK, start=7, cost_s=1.0, directions=codes.tobytes())] * 1000)
-    assert len(encode(reply_of(some))) < 1000 * (300 * 3 / 8 + 50)
+    assert len(encode(route_reply(some))) < 1000 * (300 * 3 / 8 + 50)
 
 
 def test_no_route_is_a_status_and_costs_nothing_finite() -> None:
@@ -114,7 +102,7 @@ COLUMNS = RouteBatch.of([Route(status=RouteStatus.OK, start=5, cost_s=1.0, direc
     ],
 )
 def test_columns_that_do_not_fit_each_other_are_refused_in_words(change: dict, complaint: str) -> None:
-    reply = msgspec.to_builtins(reply_of(RouteBatch.of([])), builtin_types=(bytes,))
+    reply = msgspec.to_builtins(route_reply(RouteBatch.of([])), builtin_types=(bytes,))
     reply["routes"] = msgspec.to_builtins(COLUMNS, builtin_types=(bytes,)) | change
     with pytest.raises(ProtocolError, match=complaint):
         decode(msgspec.msgpack.encode(reply), RouteReply)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.makers import route_reply
 from support.shard_tables import grants_of
 
 from shared_map.terrain.terrain import terrain_of_pace
@@ -22,7 +23,6 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.route_columns import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
@@ -124,17 +124,7 @@ def test_a_reply_too_short_for_its_request_makes_the_rest_ask_again(agent: Agent
     answer_costs(agent, asked, 0, t0=[5.0, 6.0])
     (routes,) = agent.decide(S // 10)
     assert isinstance(routes, AskRoutes)
-    empty = RouteReply(
-        target="t0",
-        incarnation=1,
-        target_cell=3,
-        map_version=0,
-        tree_age_ms=0.0,
-        rows=12,
-        cols=12,
-        routes=RouteBatch.of([]).columns(),
-    )
-    assert agent.routes_given(routes.request, empty, S // 5) == []
+    assert agent.routes_given(routes.request, route_reply(RouteBatch.of([]), GRID), S // 5) == []
     assert len(agent.decide(S)) == 1
 
 

@@ -13,14 +13,11 @@ from swarm.wire.topics import OBSTACLE, STATS
 
 
 def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() -> None:
-    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
-    world.put_target("t", 10, 12)
-    world.start_all()
-    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN)).begin(t=(10, 12))
+    took_s = world.arrive(30)
     # 9 cells of 10 m at 0.1 s/m to come within 10 m of the target, and at most a second to get going.
     assert 8.5 <= took_s <= 11.5  # with a second in which it listens for obstacles
     assert world.where() == {"a0-00": (10, 11)}
-    world.assert_lawful()
 
 
 # --- driving ------------------------------------------------------------------------------------------------
@@ -36,11 +33,8 @@ def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> No
     ]
     truth = list(prior)
     truth[1] = "#......#......#"
-    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior), pace_of(truth))
-    world.put_target("t", 1, 13)
-    world.start_all()
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
-    world.assert_lawful()
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior), pace_of(truth)).begin(t=(1, 13))
+    world.arrive(60)
     assert world.count("marks") == 1
     assert world.count("reroute_requests") >= 1
     assert not np.isfinite(world.planners["t"].pace[1, 7])
@@ -66,7 +60,7 @@ def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_
     world.until(alarms, within_s=10)
     assert alarms() == [("a0-00", 10, True)]
     tell(2, 0.0)
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    world.arrive(30)
     world.until(lambda: alarms() == [("a0-00", 10, False)])
     assert world.count("shut_in") == 1
 
@@ -82,11 +76,8 @@ def test_marks_of_one_agent_spare_another_the_detour() -> None:
     ]
     truth = list(prior)
     truth[1] = "#............#....#"
-    world = AgentWorld(scenario(2, [(1, 10), (1, 2)], per_agent=1), pace_of(prior), pace_of(truth))
-    world.put_target("t", 1, 17)
-    world.start_all()
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=90)
-    world.assert_lawful()
+    world = AgentWorld(scenario(2, [(1, 10), (1, 2)], per_agent=1), pace_of(prior), pace_of(truth)).begin(t=(1, 17))
+    world.arrive(90)
     # The second turned off at the branch: it never came within its sensor's three cells of the closure.
     assert [service.counters.counts["marks"] for service in world.agents.values()] == [1, 0]
 
@@ -94,10 +85,8 @@ def test_marks_of_one_agent_spare_another_the_detour() -> None:
 def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
     prior = ["." * 14]
     truth = [".....~~~~....."]
-    world = AgentWorld(scenario(1, [(0, 0)]), pace_of(prior), pace_of(truth))
-    world.put_target("t", 0, 13)
-    world.start_all()
-    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    world = AgentWorld(scenario(1, [(0, 0)]), pace_of(prior), pace_of(truth)).begin(t=(0, 13))
+    took_s = world.arrive(60)
     # 12 cells, four of them at three times the pace.
     assert 19.4 <= took_s <= 22.0
     assert world.count("marks") == 4
@@ -105,25 +94,21 @@ def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
 
 def test_routes_given_in_parts_are_driven_without_a_stop() -> None:
     text = scenario(1, [(10, 0)]) + "route_cells = 12\n"
-    world = AgentWorld(text, pace_of(["." * 60] * 20))
-    world.put_target("t", 10, 50)
-    world.start_all()
-    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=80)
+    world = AgentWorld(text, pace_of(["." * 60] * 20)).begin(t=(10, 50))
+    took_s = world.arrive(80)
     assert took_s <= 51.0
     assert world.count("reroute_requests") == 0
 
 
 def test_nothing_is_ever_forced_until_a_route_has_run_out() -> None:
-    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
-    world.put_target("t", 10, 12)
-    world.start_all()
+    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN)).begin(t=(10, 12))
     world.run(3.0)
     planner = world.planners["t"]
     assert [request.force for request in planner.requests] == [False]
     assert planner.requests[0].vehicles == ["a0-00"]
     # The target walks away and no planner pushes a newer route: the old one runs out.
     world.put_target("t", 2, 2)
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    world.arrive(60)
     assert any(request.force for request in planner.requests)
     assert world.count("reroute_requests") >= 1
 
@@ -134,10 +119,7 @@ TWO_TARGETS = scenario(1, [(10, 10)]).replace('name = "t"\n', 'name = "t"\ncount
 
 
 def test_each_vehicle_goes_for_the_cheapest_target_and_changes_only_for_a_better_one() -> None:
-    world = AgentWorld(TWO_TARGETS, pace_of(["." * 40] * 20))
-    world.put_target("t0", 10, 25)
-    world.put_target("t1", 10, 0)
-    world.start_all()
+    world = AgentWorld(TWO_TARGETS, pace_of(["." * 40] * 20)).begin(t0=(10, 25), t1=(10, 0))
     world.run(1.0)
     vehicle = world.agents["a0"].agent.vehicles["a0-00"]
     assert vehicle.target == "t1"
@@ -146,29 +128,25 @@ def test_each_vehicle_goes_for_the_cheapest_target_and_changes_only_for_a_better
     world.run(6.0)
     assert vehicle.target == "t1"
     world.put_target("t0", *world.where()["a0-00"])
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+    world.arrive(20)
     assert vehicle.target == "t0"
 
 
 def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() -> None:
     prior = ["." * 12] * 3 + ["#" * 12] + ["." * 12] * 4
-    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior))
-    world.put_target("t", 6, 6)
-    world.start_all()
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior)).begin(t=(6, 6))
     world.until(lambda: world.all_in(VehicleState.STRANDED), within_s=5)
     world.run(0.2)
     assert world.agents["a0"].counters.gauges["stranded"] == 1.0
     world.put_target("t", 1, 8)
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+    world.arrive(20)
 
 
 # --- planners come and go -----------------------------------------------------------------------------------
 
 
 def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
-    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN))
-    world.put_target("t", 10, 15)
-    world.start_all()
+    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN)).begin(t=(10, 15))
     world.run(3.0)
     world.stop_planner("t")
     world.run(0.5)
@@ -181,16 +159,14 @@ def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
     world.run(1.0)
     assert world.all_in(VehicleState.FOLLOWING)
     assert world.planners["t"].requests[0].vehicles == ["a0-00"]
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+    world.arrive(20)
 
 
 # --- crashes and bad links ----------------------------------------------------------------------------------
 
 
 def test_a_restarted_agent_goes_on_where_its_vehicles_last_stood() -> None:
-    world = AgentWorld(scenario(4), pace_of(OPEN))
-    world.put_target("t", 10, 10)
-    world.start_all()
+    world = AgentWorld(scenario(4), pace_of(OPEN)).begin(t=(10, 10))
     world.run(4.0)
     before = world.where()
     world.crash_agent("a1")
@@ -216,9 +192,7 @@ def test_the_first_to_start_does_not_wait_for_anybody() -> None:
 
 
 def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
-    world = AgentWorld(scenario(3, [(10, 2), (0, 0), (19, 0)], per_agent=1), pace_of(OPEN))
-    world.put_target("t", 10, 18)
-    world.start_all()
+    world = AgentWorld(scenario(3, [(10, 2), (0, 0), (19, 0)], per_agent=1), pace_of(OPEN)).begin(t=(10, 18))
     world.run(4.0)
     world.cut(world.buses["agent-a0"])
     world.run(1.0)

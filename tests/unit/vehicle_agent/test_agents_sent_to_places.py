@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
+from support.bus_world import answer_of
 
 from planner_service.place_planner import PlacesService
 from planner_service.planning_process import Planning
 from shared_map.keeper.mark_store import KeeperStore
-from swarm.bus.bus import Event, Heard, Replied
+from swarm.bus.bus import Event, Heard
 from swarm.bus.scheduler import InlineWorker
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, GoalState, GoalStates, SendVehicle, ZoneOrder
@@ -35,8 +36,7 @@ class SentWorld(AgentWorld):
         self.progress: dict[str, GoalState] = {}
         self.person = self.bus("person")
         self.person.subscribe(GOAL_STATES, self._told)
-        self.put_target("t", 1, 1)
-        self.start_all()
+        self.begin(t=(1, 1))
         self.until(lambda: len(self.vehicles()) == self.scenario.vehicle_count, within_s=20)
 
     def start_places(self) -> None:
@@ -59,12 +59,9 @@ class SentWorld(AgentWorld):
 
     def ask(self, topic: Topic, order: Message) -> None:
         """Gives an order, which the keeper acknowledges."""
-        heard: list[Event] = []
         if isinstance(order, ZoneOrder):
             order = replace(order, stamp_ns=self.now_ns)
-        self.person.ask(topic, order, heard.append, tag="o", keeper="k")
-        self.until(lambda: heard, within_s=1)
-        assert isinstance(heard[0], Replied), heard
+        assert isinstance(answer_of(self, self.person, topic, order, keeper="k"), Message)
 
     def states_of_goals(self) -> Counter[str]:
         return Counter(each.state for each in self.progress.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from dataclasses import replace
 
 import msgspec
@@ -43,10 +42,10 @@ PERIOD_NS = int(PERIOD_S * NS_PER_S)
 
 
 @st.composite
-def problems(draw: st.DrawFn, unreachable: bool = True) -> Problem:
+def problems(draw: st.DrawFn) -> Problem:
     targets, vehicles = draw(st.integers(1, 5)), draw(st.integers(1, 10))
     finite = st.integers(1, 40).map(float)
-    cost = finite | st.just(math.inf) if unreachable and draw(st.booleans()) else finite
+    cost = finite | st.just(math.inf) if draw(st.booleans()) else finite
     row = st.lists(cost, min_size=vehicles, max_size=vehicles)
     costs_s = np.array(draw(st.lists(row, min_size=targets, max_size=targets)))
     current = draw(st.lists(st.integers(-1, targets - 1), min_size=vehicles, max_size=vehicles))
@@ -101,36 +100,6 @@ def test_as_many_targets_as_can_be_get_each_of_their_pursuers_at_the_least_total
     assert [int((sizes > n).sum()) for n in range(each)] == counts
     assert sizes.max() <= each
     assert paid[chosen[at], at].sum() == pytest.approx(least_s, abs=1e-3 * len(at))
-
-
-@given(problems(unreachable=False))
-@settings(deadline=None)
-def test_where_all_can_be_reached_every_target_gets_its_pursuers_if_vehicles_suffice(problem: Problem) -> None:
-    costs_s, current, pursuers = problem
-    targets, vehicles = costs_s.shape
-    chosen = need_first(costs_s, current, pursuers)
-    sizes = np.bincount(chosen[chosen >= 0], minlength=targets)
-    if vehicles >= targets * pursuers:
-        assert (sizes == pursuers).all()
-    elif vehicles >= targets:
-        assert (sizes == vehicles // targets).all()
-    else:
-        assert (chosen >= 0).all()  # more targets than vehicles: each vehicle goes for another
-        assert sizes.max() == 1
-
-
-@given(st.integers(1, 4), st.integers(1, 3), st.integers(0, 6), st.randoms(use_true_random=False))
-@settings(deadline=None)
-def test_nobody_changes_for_less_than_15_percent(
-    targets: int, pursuers: int, more: int, chance: random.Random
-) -> None:
-    """Once every target has its pursuers, costs that differ by less than the hysteresis move no vehicle."""
-    vehicles = targets * pursuers + more
-    draw = np.random.default_rng(chance.getrandbits(32))
-    costs_s = draw.uniform(86.0, 100.0, (targets, vehicles))
-    current = [n % targets for n in range(vehicles)]
-    chosen = need_first(costs_s, current, pursuers)
-    assert all(new in (-1, old) for new, old in zip(chosen.tolist(), current, strict=True))
 
 
 def test_a_vehicle_changes_for_more_than_15_percent() -> None:
@@ -200,7 +169,6 @@ def test_an_assigner_from_outside_that_asks_for_shared_costs_sees_them() -> None
     assert not shares_costs(Cheapest())
     others = CostTable(("t0",), ("a1-00",), np.array([[7.0]]), (0,))
     assigner.assign(CostTable(("t0",), ("a0-00",), np.array([[3.0]]), (-1,), others))
-    assert seen[0].others is not None
     assert seen[0].others.vehicles == ("a1-00",)
     assert seen[0].others.costs_s.tolist() == [[7.0]]
     assert not faults
