@@ -211,9 +211,8 @@ _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.E
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
-    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",),
-    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",),
-    "terrain route": ("swarm route --terrain",), "orders": ("order ls",), "sweep": ("study run",),
+    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",), "terrain route": ("swarm route --terrain",),
+    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",), "sweep": ("study run",),
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
 """Word that other programs have, or we had, perhaps after its group -> our words, the first of which that a group
