@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from docs.generate import scenario_page, wire_page
-from docs.generate.__main__ import SWARM, command_line
+from docs.generate.__main__ import PROCESS, SWARM, command_line
 from launch_scripts import cli
 from launch_scripts.command_line import Family
 from swarm.config.scenario import Scenario
@@ -87,7 +87,11 @@ def test_the_schema_knows_every_key_of_a_shipped_scenario_and_no_other(scenario)
 
 
 def test_every_command_and_option_of_the_command_line_is_on_the_page():
-    page = command_line().replace("[the swarm](#shared-options)", SWARM)
+    page = (
+        command_line()
+        .replace("[the swarm](#shared-options)", SWARM)
+        .replace("[a process](#shared-options)", PROCESS)
+    )
     for name, command in cli.command().commands.items():
         section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
         assert section
