@@ -7,7 +7,7 @@ receiver's clock, from when a report was heard; nothing depends on what the send
 
 If reports contradict each other, all cells of both are closed: two senders under one id are two obstacles, and an
 obstacle that leaps keeps its old position closed until that report's lease ends. A report is refused, and changes
-nothing, if its id could then close more than a quarter of the cells that all obstacles may close.
+nothing, if its id could then close more than half of the cells that all obstacles may close.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ STANDS_NS = NS_PER_S
 MOST_OBSTACLES = 256
 MOST_CELLS = 100_000
 """Limit for all obstacles together: bounds time and memory, and the effect of false reports."""
-MOST_CELLS_OF_ONE = MOST_CELLS // 4
+MOST_CELLS_OF_ONE = MOST_CELLS // 2
 """Limit for one id: all its senders, and the places that it has leapt from. A larger obstacle is refused."""
 _FURTHEST_CELLS = 64
 """Largest number of cells ahead of an obstacle that are closed: a faster obstacle must look out itself."""

@@ -30,7 +30,7 @@ chasers                 a tree of another class                     classes of t
 pose, true-pose         trackers, poses of targets                  names of `runtime.tracking`
 sighted                 kept by planners and keepers                10,000; saved for targets that there are
 obstacle                cells closed                                256 obstacles, a radius of 100 m, a lease of 10
-                                                                    s; 25,000 cells an id
+                                                                    s; 50,000 cells an id
 believed, note          shown                                       the newest of each target; lines on show
 zones, give-order       zones, orders, processes                    1,000 zones, 1,999 orders
 run, asked              answers; strangers named                    one answer; 256 names

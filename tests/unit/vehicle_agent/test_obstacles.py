@@ -130,7 +130,7 @@ LIES = st.tuples(
 @given(st.sampled_from([0.5, 0.7, 1.0, 10.0]), st.booleans(), st.lists(LIES, max_size=60))
 @example(0.5, False, [(1, row, col, 25.0, 0.0, 10.0, None) for row in (60, 300) for col in (60, 300)])
 @settings(max_examples=50)
-def test_one_id_closes_a_quarter_of_the_cells_at_most_and_crowds_nobody_out(resolution_m, is_crowded, lies) -> None:
+def test_one_id_closes_half_of_the_cells_at_most_and_crowds_nobody_out(resolution_m, is_crowded, lies) -> None:
     """Also by the first report, by one that grows, and by leaps."""
     obstacles, now_ns = Obstacles(GridSpec(400, 400, resolution_m)), NOW
     everywhere = [(99 + n, n // 20 * 20.0, n % 20 * 20.0, 50.0, 0.0, 10.0, None) for n in range(400)]
