@@ -296,7 +296,7 @@ def test_marks_of_a_program_whose_clock_is_an_hour_off_count_and_end_as_those_of
     world.run(1.0)
     author.sync.publish(author.replica.write([3, 4], LETHAL, 0.0, world.now_ns))
     world.run(1.0)
-    rover.mark([3, 9], pace_s_per_m=0.5, for_s=5.0)
+    assert rover.mark([3, 9], pace_s_per_m=0.5, for_s=5.0) == 2
     world.run(1.0)
     kinds = ear.replica._cost_map.kinds
     assert [kinds[cell] for cell in (3, 4, 9)] == [PACE, LETHAL, PACE], "said later, so it counts"
