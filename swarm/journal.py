@@ -138,7 +138,6 @@ class Journal:
 
     kind      names the format; a file of another one is refused
     live      the bodies of the records that still count
-    older     reads the bodies from a file of the format before. Raises ValueError if it is none
     size      bytes of each of the two files at least; they have four times that of their live records
 
     found     bodies of the records of the file, in order
@@ -151,7 +150,6 @@ class Journal:
         path: Path,
         kind: FileKind,
         live: Callable[[], Iterable[bytes]],
-        older: Callable[[bytes], list[bytes]],
         *,
         size: int,
         in_use: str,
@@ -173,7 +171,7 @@ class Journal:
         self._lock = Lock(path, in_use, waits=waits)
         try:
             if path.exists():
-                self._read(older)
+                self._read()
         except SwarmError:
             self.close()
             raise
@@ -184,7 +182,7 @@ class Journal:
         return self._spare >= 0 or self._size - self._at >= self._size // 2
 
     def begin(self) -> None:
-        """Makes the file if there is none in this format, and the spare one if it can. Empties `found`."""
+        """Makes the file if there is none, and the spare one if it can. Empties `found`."""
         self.found = []
         if self._file < 0:
             self._switch()
@@ -245,20 +243,16 @@ class Journal:
         self._file = self._spare = -1
         self._lock.close()
 
-    def _read(self, older: Callable[[bytes], list[bytes]]) -> None:
+    def _read(self) -> None:
         """Reads the records of the file, and goes on behind them."""
         witness = witness_of(self._path, self._seal.kind)
         data = read_bytes(self._path, self._kind)
         seal = read_seal(data, self._seal.kind)
         if seal is None:
-            try:
-                self.found = older(data)
-            except ValueError as error:
-                raise DamagedError(
-                    f"{self._path} is damaged at byte 0: expected a seal of {self._seal.kind!r}, found {error}"
-                ) from error
-            check_witness(self._path, witness, self._seal, lambda _: None)
-            return
+            start = repr(data[:SEAL_BYTES].rstrip(b"\0")[:40])
+            raise DamagedError(
+                f"{self._path} is damaged at byte 0: expected a seal of {self._seal.kind!r}, found {start}"
+            )
         at, number, digest = SEAL_BYTES + DIGEST_BYTES, seal.first, data[SEAL_BYTES : SEAL_BYTES + DIGEST_BYTES]
         digests = {}
         while at + _RECORD.size <= len(data):

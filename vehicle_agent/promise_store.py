@@ -88,9 +88,7 @@ class FilePromiseStore(PromiseStore):
         self._network = network or NetworkConfig()
         self._encode = msgspec.msgpack.Encoder().encode
         in_use = "by the same agent, which runs here already: end it first"
-        self._journal = Journal(
-            path, FileKind.PROMISES, self._live, _older, size=_SIZE_BYTES, in_use=in_use, waits=waits
-        )
+        self._journal = Journal(path, FileKind.PROMISES, self._live, size=_SIZE_BYTES, in_use=in_use, waits=waits)
         try:
             for body in self._journal.found:
                 record = _decode(body)
@@ -133,17 +131,3 @@ class FilePromiseStore(PromiseStore):
         yield self._encode(_Record(own=self.own))
         for promised, table in self.saved.values():
             yield self._encode(_Record(promised=promised, table=table))
-
-
-def _older(data: bytes) -> list[bytes]:
-    """The records of a file from before journals: each behind its length, and a length of 0 behind the last."""
-    bodies = []
-    at = 0
-    while length := int.from_bytes(data[at : at + 4], "little"):
-        bodies.append(data[at + 4 : at + 4 + length])
-        at += 4 + length
-    if not bodies or at > len(data):
-        raise ValueError(repr(data[:16]))
-    if _decode(bodies[0]).own is None:  # a MsgspecError is a ValueError
-        raise ValueError("promises without their file's number")
-    return bodies

@@ -75,7 +75,6 @@ class GenerationFile(MemoryGenerations):
             path,
             FileKind.GENERATIONS,
             lambda: [_encoded(self.generations)],
-            _older,
             size=_SIZE_BYTES,
             in_use="by this vehicle, which has right of way here already",
         )
@@ -94,11 +93,3 @@ class GenerationFile(MemoryGenerations):
 
 def _encoded(generations: Sequence[int]) -> bytes:
     return b"".join(map(_GENERATION.pack, generations))
-
-
-def _older(data: bytes) -> list[bytes]:
-    """The generations in a file from before journals: one number a line."""
-    generations = [int(line) for line in data.decode("ascii").splitlines()]
-    if not generations or not all(0 < generation < 1 << 63 for generation in generations):
-        raise ValueError(repr(data[:40]))
-    return [_encoded(generations)]

@@ -229,12 +229,7 @@ def test_generations_are_on_file_before_they_speak_and_one_process_has_the_file(
     again = GenerationFile(tmp_path / "deep" / "rover")
     assert again.generations == [4, 9]
     again.close()
-    older = tmp_path / "older"
-    older.write_text("4\nnine\n")
-    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1'"):
-        GenerationFile(older)
-    older.write_text("4\n9\n")
-    for _ in range(2):
-        again = GenerationFile(older)
-        assert again.generations == [4, 9]
-        again.close()
+    other = tmp_path / "other"
+    other.write_text("4\nnine\n")
+    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1', found b'4"):
+        GenerationFile(other)

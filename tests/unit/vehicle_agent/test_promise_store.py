@@ -12,7 +12,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from msgspec.msgpack import encode
 from support.effort import few
 from support.simulated import agents
 
@@ -143,22 +142,6 @@ def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None
         path.write_bytes(content)
         with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'promises 1', found"):
             FilePromiseStore(path)
-
-
-def test_a_file_from_before_journals_is_read_once(tmp_path: Path) -> None:
-    path = tmp_path / "promises-a0"
-    own = OwnRecord(disk=7, generations=[5])
-    bodies = [encode([own]), encode([None, 3, table(0, 1)]), encode([None, 4, table(0, 2)])]
-    older = b"".join(len(body).to_bytes(4, "little") + body for body in bodies) + bytes(1000)
-    path.write_bytes(older)
-    for _ in range(2):
-        store = FilePromiseStore(path)
-        assert (store.own, store.saved) == (own, {0: (4, table(0, 2))})
-        store.close()
-        assert path.read_bytes()[:5] == b"swarm"
-    path.write_bytes(older)
-    with pytest.raises(DamagedError, match="is another file than the one that was written last"):
-        FilePromiseStore(path)
 
 
 def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
