@@ -1,4 +1,4 @@
-"""One factor per terrain class from the measurements of all authors, in integers: no step of `log_steps` depends on
+"""One factor per kind of ground (class and slope) from the measurements of all authors, in integers: no step of `log_steps` depends on
 a machine's rounding.
 
 The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
