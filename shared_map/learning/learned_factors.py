@@ -1,5 +1,5 @@
-"""One factor per kind of ground (class and slope) from the measurements of all authors, in integers: no step of `log_steps` depends on
-a machine's rounding.
+"""One factor per kind of ground (class and slope) from the measurements of all authors, in integers: no step of
+`log_steps` depends on a machine's rounding.
 
 The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
 """
