@@ -109,17 +109,6 @@ def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(member, "agreed", lambda tables: tables[0])
 
 
-def entries_of_bodies_are_disclaimed(patch: pytest.MonkeyPatch) -> None:
-    disclaim = HostEntries.disclaim
-
-    def at_once(self, *asked):  # type: ignore[no-untyped-def]
-        bodies, self.bodies = self.bodies, {}
-        disclaim(self, *asked)
-        self.bodies = bodies
-
-    patch.setattr(HostEntries, "disclaim", at_once)
-
-
 @pytest.mark.parametrize(
     ("broken", "first"),
     [
@@ -128,8 +117,7 @@ def entries_of_bodies_are_disclaimed(patch: pytest.MonkeyPatch) -> None:
         (two_of_four_are_enough, 0),
         (members_store_entries_of_hosts_that_never_spoke, 0),
         (members_hear_of_no_revoked_name, 0),
-        (a_leader_begins_with_its_own_table, 0),
-        (entries_of_bodies_are_disclaimed, 150),
+        (a_leader_begins_with_its_own_table, 160),
     ],
     ids=lambda rule: getattr(rule, "__name__", ""),
 )
@@ -138,3 +126,11 @@ def test_each_rule_is_needed(
 ) -> None:
     broken(monkeypatch)
     assert any(harm_done(seed) for seed in range(first, first + 100))
+
+
+def test_a_host_disclaims_no_entry_of_a_cell_on_which_its_body_is() -> None:
+    """A thief asks for it before a table has passed it to this generation: rare in histories."""
+    host = HostEntries(1, lambda cell: 0, lambda one, other: True)
+    host.enter("a0-00", 7)
+    host.disclaim(0, "thief", (3, 9), [(7, 3, 2), (8, 3, 2)])
+    assert host.never(0) == {(8, 3, 2)}
