@@ -236,7 +236,7 @@ def test_water_of_a_file_is_lethal_at_every_cell_size(
     source = load(written(tmp_path / "coast.tif", ground, dtype), resolution_m=resolution_m)
     assert is_water(source).mean() == pytest.approx(sea.mean(), abs=0.03)
     (told,) = [note for note in source.notes if note.startswith("level ground")]
-    assert "is taken for water" in told
+    assert "counts as water" in told
     assert "terrain.level_is = 'ground'" in told
     dry = load(tmp_path / "coast.tif", resolution_m=resolution_m, level_is="ground")
     assert not is_water(dry).any()
