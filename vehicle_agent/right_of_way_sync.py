@@ -81,6 +81,7 @@ _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _SLOW_FOR_NS = 5 * NS_PER_S
+"""A link is reported once it has been slow for so long: at a start all are, for a moment."""
 _WAITING_AGAIN_NS = 10 * NS_PER_S
 """Interval of repeated events: a late watcher receives them, and the log stays readable."""
 

@@ -6,10 +6,9 @@ ways leave it over the same cell, the *exit*, are a *piece*. A cell's cost is th
 exit to the root) plus its offset (from the cell to the exit). The piece that an exit leads into is its *successor*.
 A move evaluates the totals, some 2 % of the cells; what a cell costs inside its tile changes only where parents do.
 
-A piece is named by where on the tile's border its exit is, 0..251, or `ROOT_PIECE`; so the name
-stays when the tile changes. Costs are
-float64: stated costs are those driven, and all comparisons are of sums that differ by a few units in the last
-place. Tiles are numbered row by row, `across` in a row; n is the number of tiles.
+A piece is named by where on the tile's border its exit is, 0..251, or `ROOT_PIECE`; so the name stays when the
+tile changes. Costs are float64: stated costs are those driven, and all comparisons are of sums that differ by a few
+units in the last place. Tiles are numbered row by row, `across` in a row; n is the number of tiles.
 
 A move or a change of the map, step by step:
 1. `partition_search.merge_parents` takes over parents of a window, `cut_parents` takes parents away.

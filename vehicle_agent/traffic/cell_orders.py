@@ -260,7 +260,7 @@ class Orders:
         """Drops the entries that a host which knows a table does not hold any more."""
         for vehicle in list(self.by_host.get(host, ())):
             if vehicle in holds and holds[vehicle] == self._held.get(vehicle):
-                continue
+                continue  # it holds all, as most do: that is known without comparing each entry
             held, entries = [*holds.get(vehicle, ())], self.of[vehicle]
             kept = [entry for entry in entries if entry in held or entry[1:] > knows]
             if len(kept) < len(entries):
