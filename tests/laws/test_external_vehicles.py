@@ -74,17 +74,17 @@ def test_no_two_meet_where_two_robots_have_one_name(seed: int) -> None:
         assert world.collisions == []
 
 
-def test_cells_of_an_external_vehicle_that_is_gone_are_free_again() -> None:
-    for seed in range(4):
-        world = world_of(seed, twins=False)
-        world.run(QUIET_S)
-        world.end_robots()
-        world.run(12.0)
-        for process in world.processes:
-            for member in process.rights._members.values():
-                if member.leader is not None:
-                    held = [*member.stored.grants, *(each.agent for each in member.stored.fences)]
-                    assert not set(map(agent_of, held)).intersection(world.robots)
+@pytest.mark.seeds(4)
+def test_cells_of_an_external_vehicle_that_is_gone_are_free_again(seed: int) -> None:
+    world = world_of(seed, twins=False)
+    world.run(QUIET_S)
+    world.end_robots()
+    world.run(12.0)
+    for process in world.processes:
+        for member in process.rights._members.values():
+            if member.leader is not None:
+                held = [*member.stored.grants, *(each.agent for each in member.stored.fences)]
+                assert not set(map(agent_of, held)).intersection(world.robots)
 
 
 # --- the rules, each taken out ------------------------------------------------------------------------------

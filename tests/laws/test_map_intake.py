@@ -107,7 +107,7 @@ class Watched:
 
 def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() -> None:
     routes = waited = 0
-    for seed in range(few(72)):
+    for seed in range(few(96)):
         watched = Watched(seed)
         watched.tick()
         for _ in range(40):
@@ -161,7 +161,7 @@ class Searched(Watched):
 
 def test_nobody_is_sent_to_look_for_a_target_through_a_change_that_waits() -> None:
     routes = 0
-    for seed in range(few(24)):
+    for seed in range(few(33)):
         watched = Searched(seed)
         for _ in range(60):
             if watched.rng.integers(3):

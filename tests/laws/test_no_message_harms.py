@@ -341,12 +341,12 @@ def route_reply(payload: bytes) -> RouteReply | None:
     return None
 
 
-@pytest.mark.parametrize("run", TEXTS)
+@pytest.mark.parametrize("run", ["whole", pytest.param("plain", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("state", STATES)
 def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state: str) -> None:
     by_listening: dict[bool, int] = {}
     for altered in (False, True):
-        swarm = lied_to(run, state, 2, few(20), altered)
+        swarm = lied_to(run, state, 2, few(26), altered)
         assert swarm.liar.told > 250
         by_listening[altered] = swarm.liar.altered
         swarm.run(3)
@@ -357,13 +357,14 @@ def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state:
 @pytest.mark.parametrize(
     ("run", "state"),
     [
-        *[("plain", state) for state in STATES if state != "without target"],
-        *[pytest.param("whole", state, marks=pytest.mark.thorough) for state in ("fresh", "running")],
+        *[("plain", state) for state in ("fresh", "running")],
         *[("whole", state) for state in ("cut", "restarted")],
+        *[pytest.param("plain", state, marks=pytest.mark.thorough) for state in ("cut", "restarted")],
+        *[pytest.param("whole", state, marks=pytest.mark.thorough) for state in ("fresh", "running")],
     ],
 )
 def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -> None:
-    swarm = lied_to(run, state, 9, few(40), False)
+    swarm = lied_to(run, state, 9, few(53), False)
     swarm.take_back()
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]

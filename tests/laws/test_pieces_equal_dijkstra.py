@@ -246,7 +246,7 @@ def struck(seeds: range, most: int) -> int:
 
 def test_marks_of_every_kind_and_size() -> None:
     """Ways are lost and found, pieces rise and fall."""
-    seeds = few(40)
+    seeds = few(53)
     assert struck(range(20000, 20000 + seeds), 330) < 4 * seeds
 
 

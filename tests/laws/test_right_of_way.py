@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import broken_rules as rules
+from support.effort import few
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.holdings import Holdings
@@ -69,7 +70,7 @@ def test_no_two_meet_where_borders_are_crossed_all_the_time(seed: int) -> None:
     check(borders_of(seed), move_s=20.0)
 
 
-@settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=few(12), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(1000, 1 << 40), shape=st.sampled_from(SHAPES), data=st.data())
 def test_no_two_meet_under_any_mixture_of_faults(
     seed: int, shape: tuple[int, int, int, int], data: st.DataObject

@@ -12,7 +12,9 @@ from launch_scripts.simulation.worlds import world
 SECONDS = 8.0
 
 
-@pytest.mark.parametrize(("name", "seed"), [("small", 1), ("small", 4), ("rovers", 1)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("small", 1), ("small", 4), pytest.param("rovers", 1, marks=pytest.mark.thorough)]
+)
 def test_simulated_vehicles_make_no_transition_but_those_of_the_table(
     name: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

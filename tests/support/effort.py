@@ -4,8 +4,12 @@ all of them."""
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from typing import Any
 
-COMMIT_SHARE = 0.4
+import pytest
+
+COMMIT_SHARE = 0.3
 
 _share = COMMIT_SHARE
 
@@ -19,3 +23,13 @@ def try_all() -> None:
 def few(count: int) -> int:
     """The number to try now, of the number that a test names: at least one."""
     return max(1, math.ceil(count * _share))
+
+
+def paired(names: Iterable[object], ways: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Parameters of a test: every name with every way. Each commit tries every name with one way and every way with
+    some names; the other pairs are `thorough`."""
+    return [
+        pytest.param(name, *way, marks=[] if row % len(ways) == column else [pytest.mark.thorough])
+        for row, name in enumerate(names)
+        for column, way in enumerate(ways)
+    ]

@@ -403,20 +403,22 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     assert (np.diff(places[:, 0]) > 0).all()
 
 
-def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recorder) -> None:
+def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of a recorder by its own lists: captures, samples and places are all bounded."""
+    monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 512)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_SAMPLES", 512)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 2000)
+    recorder = Recorder(scenario(), GRID)
 
-    def record(from_s: int, until_s: int, step_s: int) -> int:
-        for at_s in range(from_s, until_s, step_s):
+    def record(from_s: int, until_s: int) -> int:
+        for at_s in range(from_s, until_s, 2):
             places = {f"a0-{n:02d}": (float(at_s % 900), 5.0) for n in range(4)}
             hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s), capture("t0", 7), at_s=at_s)
-        kept = [recorder.vehicle_tracks, recorder.target_tracks]
-        for each in kept:
-            each._limit = 2000
-        return len(pickle.dumps([recorder.captures, *(each.kept for each in (recorder.samples, *kept))]))
+        kept = [recorder.samples, recorder.vehicle_tracks, recorder.target_tracks]
+        return len(pickle.dumps([recorder.captures, *(each.kept for each in kept)]))
 
-    hour = record(0, 12_000, 2)
-    day = record(12_000, 20_000, 2)
+    hour = record(0, 1500)
+    day = record(1500, 6000)
     assert day < 1.5 * hour
     assert len(recorder.captures) == recorder.captures.maxlen
 

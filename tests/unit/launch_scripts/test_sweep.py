@@ -111,12 +111,12 @@ def test_the_modules_of_plug_ins_count_and_those_inside_of_packages(tmp_path):
 
 
 @pytest.mark.parametrize("name", study_names())
-def test_each_study_of_the_project_can_be_read_and_its_trials_run(name):
+def test_each_study_of_the_project_can_be_read_and_each_of_its_variants_runs(name):
     path = study_path(name)
     study = load_study(path)
-    planned = plan(study, path.parent, name)
+    planned = {each.label: each for each in plan(study, path.parent, name)}
     assert study.outcomes
-    for each in planned:
+    for each in planned.values():
         briefly = msgspec.structs.replace(each.trials[0], seconds=8.0 if study.faults else 1.0)
         result = run_trial(briefly)
         assert not result.broken or study.faults  # the quiet at the end of so short a run may be too short

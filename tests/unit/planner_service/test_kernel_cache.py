@@ -120,25 +120,19 @@ def _one_wrong_byte(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
 
 
-@pytest.mark.parametrize(
-    ("files", "damaged"),
-    [
+def test_files_that_are_not_as_they_were_written_are_written_anew(folder: Path) -> None:
+    damages: list[tuple[str, Callable[[bytes], bytes]]] = [
         ("*.nbi", lambda data: b""),
         ("*.nbi", lambda data: data[: len(data) // 2]),
         ("*.nbc", lambda data: data[: len(data) // 2]),
-        ("*.nbc", lambda data: bytes(len(data))),
         ("*.nbc", _one_wrong_byte),
-    ],
-    ids=["empty index", "half an index", "half the code", "code of zeros", "one wrong byte"],
-)
-def test_files_that_are_not_as_they_were_written_are_written_anew(
-    folder: Path, files: str, damaged: Callable[[bytes], bytes]
-) -> None:
+    ]
     assert call(folder) == (21, 0, 1)
-    for file in (folder.parent / "cache").rglob(files):
-        file.write_bytes(damaged(file.read_bytes()))
-    assert call(folder) == (21, 0, 1)
-    assert call(folder) == (21, 1, 0)
+    for files, damaged in damages:
+        for file in (folder.parent / "cache").rglob(files):
+            file.write_bytes(damaged(file.read_bytes()))
+        assert call(folder) == (21, 0, 1)
+        assert call(folder) == (21, 1, 0)
 
 
 def test_kernels_run_where_nothing_can_be_written(folder: Path) -> None:

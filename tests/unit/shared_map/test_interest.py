@@ -118,7 +118,7 @@ def check_interest(simulation: Simulation) -> tuple[int, int]:
     return held, there
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.seeds(2)
 def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> None:
     faults = random_plan(NEAR, seed, 20.0)
     simulation = Simulation(seeded(seed, NEAR), faults=faults)

@@ -98,7 +98,7 @@ def test_a_vehicle_goes_from_place_to_place_and_then_holds_chases_or_begins_agai
     world.assert_lawful()
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.seeds(2)
 def test_fifty_vehicles_that_are_sent_to_one_cell_all_get_there(seed: int) -> None:
     starts = [(2 + n // 10, 5 + n % 10) for n in range(50)]
     text = scenario(50, starts, per_agent=10).replace("seed = 3", f"seed = {seed}")
