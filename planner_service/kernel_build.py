@@ -44,7 +44,7 @@ from planner_service.kernels import (
 )
 from planner_service.kernels.compile import BEFORE_LOAD, StepKernel, cache_folder, is_loaded, is_on_disk, load
 from swarm.config.scenario import Scenario
-from swarm.config.vehicle_classes import aloft_classes
+from swarm.config.vehicle_classes import aloft_classes, first_classes
 from swarm.runtime.first_use import note
 
 BEFORE_LOAD.append(note)
@@ -105,8 +105,8 @@ _BUILDERS = "builders.lock"
 class NeededKernels:
     """Kernels that planners call, none of them twice. Builders and planners use the same list.
 
-    first  until the first route of the class "ground" is served
-    later  for other classes, and what saves growing whole trees
+    first  until the first route of each class in `first_classes` is served
+    later  for the other classes, and what saves growing whole trees
     """
 
     first: tuple[Kernel, ...]
@@ -138,9 +138,11 @@ def _needed(first: Iterable[Kernel], later: Iterable[Kernel]) -> NeededKernels:
 
 
 def _first_kernels(scenario: Scenario) -> tuple[list[Kernel], list[Kernel]]:
-    """Those that the first route of the ground needs, and that of a class."""
+    """The kernels for the first routes of `first_classes`, and of the other classes."""
     ground, pulled = scenario.cost.directional, scenario.planner.routes == "pulled"
-    first = _of_kind([*FIRST, PULL] if pulled and not ground else FIRST, ground)
+    # On a busy machine the later kernels may take longer than the run: no vehicle of it may wait for them.
+    flown = not first_classes(scenario).isdisjoint(aloft_classes(scenario))
+    first = _of_kind([*FIRST, PULL] if pulled and (flown or not ground) else FIRST, ground, ground or flown)
     return first, _of_kind([*FIRST, PULL] if pulled else FIRST, True) if aloft_classes(scenario) else []
 
 
@@ -150,9 +152,12 @@ def all_kernels() -> list[Kernel]:
     return list(dict.fromkeys(chain(*parts)))
 
 
-def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
+def _of_kind(kernels: Iterable[Kernel | StepKernel], *kinds: bool) -> list[Kernel]:
+    """Returns the kernels for ground of these kinds; True: where uphill is not as downhill."""
     found = [
-        (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
+        (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each
+        for each in kernels
+        for directed in kinds
     ]
     return [kernel for kernel in found if kernel is not None]
 

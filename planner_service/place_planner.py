@@ -265,7 +265,7 @@ class PlacesService(PlanningProcess):
             self._refuse(event, f"{event.asker} is of group {self._foreign[event.asker]}: ask its own places")
         elif len(request.cells) > MOST_ROUTES:
             self._refuse(event, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
-        elif name != GROUND and not self._all_kernels():
+        elif not self._has_kernels(name):
             self._refuse(event, f"the kernels for class {name} are still being compiled")
         else:
             self._wait(_Question(event, event.asker, request, now_ns))
@@ -387,7 +387,7 @@ class PlacesService(PlanningProcess):
                 self._trees(heard.message.vehicle_class).followers.on_chasers(heard.message, now_ns)
         for name, trees in self._classes.items():
             trees.followers.drop_silent(now_ns)
-            if not self._leads or (name != GROUND and not self._all_kernels()):
+            if not self._leads or not self._has_kernels(name):
                 continue
             if len(trees.followers) and trees.cost_map.dirty and not self._waiting:
                 self._wait(_Question(None, self._job, PlaceRouteRequest(to=0, vehicle_class=name), now_ns))

@@ -14,7 +14,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import ClassMaps, class_terrains
 from swarm.bus.bus import Asked, Bus, Event, Post, Worker
 from swarm.config.agents import agent_of
-from swarm.config.vehicle_classes import GROUND, class_numbers
+from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.liveness import job_of
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
@@ -41,8 +41,8 @@ class PlanningProcess:
 
     groups         those whose marks it may know; None if all
     served         topics that the leader serves, and the fields of their keys
-    all_kernels    whether all may be called by now, not only those for whole trees of "ground"; if not given, they
-                   may
+    all_kernels    whether all may be called by now, not only those for whole trees of `first_classes`; if not
+                   given, they may
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class PlanningProcess:
         self._bus, self._post, self._worker = bus, post, planning.worker
         self._served_topics = served
         self._all_kernels = all_kernels or (lambda: True)
+        self._first_classes = first_classes(scenario)
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
@@ -76,6 +77,10 @@ class PlanningProcess:
     def _obeys(self, order: Obey) -> bool:
         """Returns True if all that the process answers follows this order."""
         raise NotImplementedError
+
+    def _has_kernels(self, name: str) -> bool:
+        """Returns True if the trees of a class can be grown."""
+        return name in self._first_classes or self._all_kernels()
 
     def lacks(self) -> list[str]:
         return self._member.lacks()

@@ -101,7 +101,7 @@ class PlannerService(PlanningProcess):
         hidden = hidden_target(scenario, self._target, setup.incarnation)
         self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
         self._planner = self._new_planner(GROUND, self._cost_maps[GROUND], tree)
-        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._all_kernels)
+        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._has_kernels)
         self._obeyed_version = 0
         self._removed = False
         """True if its target was removed: then it serves no queries."""
@@ -111,7 +111,10 @@ class PlannerService(PlanningProcess):
         self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
         self.counters.count("marks_merged", 0)
-        self._member.needs(f"a tree of {self._target}", lambda: self._planner.tree.ready or self._served_by_search)
+        # A target that is searched for, or was removed, needs none.
+        self._member.needs(
+            f"a tree of {self._target}", lambda: self._untracked or self._removed or self._planner.tree.ready
+        )
 
     def _new_tree(self, cost_map: CostMap) -> TargetTree:
         return TargetTree(
@@ -150,11 +153,6 @@ class PlannerService(PlanningProcess):
         self._pace(planner)
         log.info("target %s: a tree for the class %s", self._target, name)
         return planner
-
-    @property
-    def _served_by_search(self) -> bool:
-        """Returns True if there need not be a tree: the target is searched for, or was removed."""
-        return self._untracked or self._removed
 
     def start(self, now_ns: int) -> None:
         if self._untracked:
@@ -285,7 +283,7 @@ class PlannerService(PlanningProcess):
         """
         held, self._held = self._held, []
         spent = 0
-        for n, (asked_ns, event) in enumerate(sorted(held, key=_is_of_others)):
+        for n, (asked_ns, event) in enumerate(sorted(held, key=lambda each: not is_own(each[1].asker))):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
@@ -381,7 +379,3 @@ class PlannerService(PlanningProcess):
                     self._tell_status(status)
                 case Believed() as believed:
                     self._bus.publish(BELIEVED, believed, target=self._target)
-
-
-def _is_of_others(held: tuple[int, Asked]) -> bool:
-    return not is_own(held[1].asker)

@@ -20,7 +20,7 @@ class ClassPlanners:
 
     make   makes the planner of a class
     known  the classes that there are, beside "ground"
-    ready  whether the kernels are there by which their trees are grown; once it says so, it is not asked again
+    ready  whether the kernels are there by which the trees of a class are grown
     """
 
     def __init__(
@@ -28,12 +28,11 @@ class ClassPlanners:
         ground: Planner,
         make: Callable[[str], Planner],
         known: Collection[str],
-        ready: Callable[[], bool] = lambda: True,
+        ready: Callable[[str], bool],
     ) -> None:
         self._make = make
         self._known = known
         self._ready = ready
-        self._may_begin = False
         self._by_class: dict[str, Planner] = {GROUND: ground}
         self._used_ns: dict[str, int] = {}
         self._begun_ns: dict[str, int] = {}
@@ -47,8 +46,7 @@ class ClassPlanners:
         if name == GROUND:
             return None
         if name in self._known:
-            self._may_begin = self._may_begin or self._ready()
-            return None if self._may_begin else f"the kernels for class {name} are still being compiled"
+            return None if self._ready(name) else f"the kernels for class {name} are still being compiled"
         known = [GROUND, *self._known]
         return f"there is no class {name!r}{choice(name, known, ' there are ')}"
 

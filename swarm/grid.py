@@ -136,12 +136,8 @@ class GridSpec:
         return -(-self.tile_cols // REGION_TILES)
 
     @property
-    def region_rows(self) -> int:
-        return -(-self.tile_rows // REGION_TILES)
-
-    @property
     def regions(self) -> int:
-        return self.region_rows * self.region_cols
+        return -(-self.tile_rows // REGION_TILES) * self.region_cols
 
     def inside(self, row: int, col: int) -> bool:
         return 0 <= row < self.rows and 0 <= col < self.cols

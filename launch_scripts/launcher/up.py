@@ -384,9 +384,10 @@ class _Run:
             self._show(known, watcher.now_ns(), self._missing(watcher))
 
     def _say_page(self, port: int) -> None:
-        """States the one address of the run's page. It shows the terrain first, then the swarm."""
+        """States the one address of the run's page. It shows the terrain first, and the live view once the monitor
+        has loaded it."""
         self._web_port = port
-        self._terminal.say(f"live view, at first the terrain alone: {page_of(port)}", "bold")
+        self._terminal.say(f"page of the run, the terrain first and then the live view: {page_of(port)}", "bold")
         self._terminal.say(f"from elsewhere: {tunnel(port)}, then the same address")
 
     def _register(self) -> None:
@@ -411,7 +412,7 @@ class _Run:
         seconds = self._scenario.seconds
         of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
-        live = f"{until}, live view {page_of(self._web_port)}" if self._web_port else ""
+        live = f"{until}, page {page_of(self._web_port)}" if self._web_port else ""
         return f"{self._scenario.name}: {elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
@@ -464,7 +465,9 @@ class _Run:
         scenario = self._scenario
         self._terminal.say(f"run {self._run_id}: scenario {scenario.name}, seed {scenario.seed}, {processes}")
         left = "logs, recording and report" if self._options.records else f"{_ELSEWHERE}; logs"
-        self._terminal.say(f"router at {scenario.network.connect[0]}; {left} in {self._run_dir}")
+        starts = "router" in self._options.roles and not self._options.joins
+        routers = scenario.network.listen if starts else scenario.network.connect[:1]
+        self._terminal.say(f"router at {', '.join(routers)}; {left} in {self._run_dir}")
 
     def _report(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> bool:
         """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""

@@ -137,10 +137,6 @@ def _shares(axes: Axes, plot: Plot, report: Report) -> bool:
     return drawn
 
 
-def _percent_above(gaps: Values) -> Values:
-    return np.maximum(gaps - 1, 0) * 100
-
-
 def _percent(value: float) -> str:
     return f"{value:g}%"
 
@@ -159,7 +155,7 @@ PLOTS = (
     Plot("gaps", "Certified gap",
          "How far above the optimum the routes that vehicles began can be at most: each comes with a proven lower "
          "bound.", {"certified_gap_p95": ("p95", palette.ORANGE), "certified_gap_mean": ("mean", palette.BLUE)},
-         _courses, _percent_above, _percent, least=0.1),
+         _courses, lambda gaps: np.maximum(gaps - 1, 0) * 100, _percent, least=0.1),
     Plot("waiting", "Waiting",
          "How many vehicles waited at the same time: for a route, or with one, as where others pass.",
          {"waiting_at_once": ("for a route", palette.ORANGE), "standing_at_once": ("with a route", palette.BLUE)},

@@ -216,10 +216,6 @@ class KeeperStore(SealedDatabase):
         self.close()
 
 
-def _bytes_of(of: MarkSet) -> int:
-    return 200 + sum(len(column) for column in (of.cells, of.kinds, of.paces, of.stamps_ns, of.untils_ns))
-
-
 def _row(of: MarkSet) -> tuple[object, ...]:
     return tuple(getattr(of, field) for field in _FIELDS)
 
@@ -272,7 +268,7 @@ class Keeper:
         held = 0
         for each in list(self._waiting.values()):
             batch.append(each)
-            held += _bytes_of(each)
+            held += 200 + sum(map(len, (each.cells, each.kinds, each.paces, each.stamps_ns, each.untils_ns)))
             if held >= BATCH_BYTES:
                 yield batch
                 batch, held = [], 0

@@ -32,7 +32,6 @@ from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
-from swarm.grid import GridSpec
 from swarm.places import corners_of
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, STAMP_LIMIT_NS, MarkKind, MarkSet
@@ -189,7 +188,8 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
         except ConfigError as error:
             return str(error)
     if order.polygon_m:
-        corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
+        west_m, north_m, side_m = grid.west_m, grid.north_m, grid.resolution_m
+        corners = [((north_m - y_m) / side_m, (x_m - west_m) / side_m) for x_m, y_m in order.polygon_m]
     if not all(abs(part) <= _FURTHEST for ring in (corners, *order.holes) for corner in ring for part in corner):
         return "polygon: a corner is far from the terrain"
     side_m = grid.resolution_m
@@ -213,10 +213,6 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     if order.kind == "lethal" and not (np.isfinite(terrain.pace_s_per_m) & ~inside).any():
         return "polygon: a lethal zone that leaves no passable cell; pause the swarm instead"
     return inside
-
-
-def _row_col(x_m: float, y_m: float, grid: GridSpec) -> tuple[float, float]:
-    return (grid.north_m - y_m) / grid.resolution_m, (x_m - grid.west_m) / grid.resolution_m
 
 
 def _by_tile(

@@ -60,8 +60,7 @@ def read_scenario(
     settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
     try:
-        raw = _of_today(parse_toml(text, source, ConfigError))
-        raw = complete_costs(with_settings(raw, settings or {}, source))
+        raw = with_settings(_of_today(parse_toml(text, source, ConfigError)), settings or {}, source)
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []
@@ -82,6 +81,7 @@ def read_scenario(
                 break
     if scenario is None or faults:
         return None, faults
+    scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
     try:
         classes = tuple(
             msgspec.structs.replace(each, cost=with_slope_csv(each.cost, f"{source}: classes[{n}]", base))
@@ -119,7 +119,7 @@ def _of_today(raw: dict[str, Any]) -> dict[str, Any]:
             match former.get(path + key):
                 case str(new) if new not in table:
                     table[new] = table.pop(key)
-                case tuple(neutral) if not neutral or value in neutral:
+                case tuple(neutral) if not neutral or (value in neutral and not isinstance(value, bool)):
                     del table[key]
     return raw
 

@@ -101,15 +101,17 @@ def complete_costs(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """Returns the faults of a scenario's classes, one sentence each."""
+    """Returns the faults of a scenario's classes, one sentence each, without those that `[cost]` has, too."""
     names = [each.name for each in scenario.classes]
+    held = set(complaint(check_cost, scenario.cost, ""))
     if GROUND in names:
         yield f"{source}: classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
     for n, each in enumerate(scenario.classes):
         for key in SHARED:
             if getattr(each.cost, key) != getattr(scenario.cost, key):
                 yield f"{source}: classes[{n}].cost.{key} is for all classes alike: give it in [cost] instead"
-        yield from complaint(check_cost, each.cost, f"{source}: classes[{n}]")
+        own = complaint(check_cost, each.cost, "")
+        yield from (f"{source}: classes[{n}]{fault}" for fault in own if fault not in held)
         if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
             yield (
                 f"{source}: classes[{n}].air.speed_m_per_s: expected more than wind.speed_m_per_s,"
@@ -149,6 +151,14 @@ def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
 def aloft_classes(scenario: Scenario) -> list[str]:
     """The classes that fly."""
     return [each.name for each in scenario.classes if each.air is not None]
+
+
+def first_classes(scenario: Scenario) -> frozenset[str]:
+    """Returns the classes which planners serve from the beginning: all that drive, and those that fly if a group
+    does. The others need compiled code that no vehicle of the scenario needs, so it is compiled later."""
+    aloft = frozenset(aloft_classes(scenario))
+    later = aloft if aloft.isdisjoint(driven_classes(scenario)) else frozenset()
+    return frozenset({GROUND, *(each.name for each in scenario.classes)}) - later
 
 
 def flies(scenario: Scenario, name: str) -> bool:

@@ -63,11 +63,9 @@ class Answers:
             by_run[known.shard_cells, tuple(known.agents)].append(known)
         is_alone = len(self._known) == 1 and self._queries >= _QUERIES_ALONE
         enough = 2 if self._proven and not is_alone else 1
-        return max((of for of in by_run.values() if len(of) >= enough), key=_side_of, default=[])
-
-
-def _side_of(agreed: Sequence[Known]) -> int:
-    return agreed[0].shard_cells
+        return max(
+            (of for of in by_run.values() if len(of) >= enough), key=lambda of: of[0].shard_cells, default=[]
+        )
 
 
 ExternalAction = AskKnown | SaveGenerations | Tell | Left

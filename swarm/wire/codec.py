@@ -94,7 +94,8 @@ def _read(payload: bytes, message_type: type[M]) -> M:
     refuses, to name the wrong field and its value; and one that does not begin with its schema, as msgspec accepts
     a missing tag as the right one.
     """
-    if len(payload) <= MAX_ITEMS and _begins_with_schema(payload):
+    # The first key of the map is "schema", as `encode` writes it.
+    if len(payload) <= MAX_ITEMS and payload.startswith(_SCHEMA, 1 if payload[:1] < b"\x90" else 3):
         decoder = _DECODERS.get(message_type) or _DECODERS.setdefault(
             message_type, msgspec.msgpack.Decoder(message_type)
         )
@@ -104,11 +105,6 @@ def _read(payload: bytes, message_type: type[M]) -> M:
         except Exception:  # its own errors, those of our rules, RecursionError
             pass
     return _converted(_unpacked(payload), message_type)
-
-
-def _begins_with_schema(payload: bytes) -> bool:
-    """Returns True if it is a map whose first key is "schema", as `encode` writes it."""
-    return payload.startswith(_SCHEMA, 1 if payload[:1] < b"\x90" else 3)
 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:

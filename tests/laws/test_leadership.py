@@ -164,10 +164,6 @@ class World:
     def note(self) -> None:
         self.changes.append((self.now_ns, tuple(each.rank for each in self.leaders())))
 
-    @property
-    def quiet_ns(self) -> int:
-        return self.now_ns - self.disturbed_ns
-
     def check(self) -> None:
         """The laws, of candidates that hear each other and with which nothing has happened for long enough."""
         for side in (True, False):
@@ -178,7 +174,7 @@ class World:
             else:
                 several_ns = self.now_ns - self.several_since_ns.setdefault(side, self.now_ns)
                 assert several_ns <= HANDOVER_NS, (self.now_ns, self.changes[-5:])
-            soon = self.quiet_ns > SOON_NS
+            soon = self.now_ns - self.disturbed_ns > SOON_NS
             assert leaders or not side_of or not soon, (self.now_ns, self.changes[-5:])
 
 

@@ -221,11 +221,6 @@ def rows_in(text: str) -> list[list[str]]:
     return [row for row in obstacle if not set(row[0]) <= set("-─")]
 
 
-def alarms_in(text: str, state: RunState) -> set[str]:
-    """The lasting alarms that are shown."""
-    return {line for line in (alarm.line(state.grid) for alarm in state.standing_alarms) if line in text}
-
-
 def table_of(state: RunState) -> str:
     console = Console(file=io.StringIO(), width=250, height=80)
     console.print(live_table(state, f"time {facts.fact('elapsed_s').shown(state)}", console))
@@ -270,7 +265,8 @@ def test_no_fact_that_is_shown_in_two_places_differs(
                 continue
             assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.shown(state)), (place, fact)
     assert rows_in(texts["view"]) == rows_in(texts["table"]) == rows_in(texts["status"])
-    alarms = {place: alarms_in(text, state) for place, text in texts.items()}
+    lasting = [alarm.line(state.grid) for alarm in state.standing_alarms]
+    alarms = {place: {line for line in lasting if line in text} for place, text in texts.items()}
     assert (
         alarms["view"]
         == alarms["table"]

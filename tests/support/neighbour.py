@@ -20,11 +20,6 @@ NAMED_IN = ROOT / "tests" / "live" / "neighbour_version.txt"
 """Changed when a version is tagged, with the specimens of its messages (`tests/support/wire_specimens.py`)."""
 
 
-def neighbour_commit() -> str:
-    """The commit of the version before."""
-    return NAMED_IN.read_text(encoding="ascii").strip()
-
-
 @cache
 def _archive(commit: str) -> bytes | None:
     command = ["git", "-C", str(ROOT), "archive", "--format=tar", commit]
@@ -38,7 +33,7 @@ def _archive(commit: str) -> bytes | None:
 def neighbour_tree(folder: Path) -> Path:
     """The files of the version before, below `folder`. Skips the test where git has not got them, or the two share
     no run."""
-    commit = neighbour_commit()
+    commit = NAMED_IN.read_text(encoding="ascii").strip()
     archive = _archive(commit)
     if archive is None:
         pytest.skip(f"git has no commit {commit[:8]} here: the version before this one cannot be run")

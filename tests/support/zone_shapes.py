@@ -29,13 +29,9 @@ def in_crs(shape: Any, grid: GridSpec, crs: str) -> Any:
 
     def moved(points: np.ndarray) -> np.ndarray:
         xs, ys = grid.west_m + points[:, 0] * grid.resolution_m, grid.north_m - points[:, 1] * grid.resolution_m
-        return np.array(xs_ys(grid.crs, crs, xs, ys)).T
+        return np.array((xs, ys) if grid.crs == crs else to_crs(grid.crs, crs, xs, ys)).T
 
     return shapely.transform(shape, moved)
-
-
-def xs_ys(source: str, target: str, xs: Any, ys: Any) -> Any:
-    return (xs, ys) if source == target else to_crs(source, target, xs, ys)
 
 
 def geojson(path: Path, features: list[dict[str, Any]], grid: GridSpec = UTM, crs: str = "EPSG:4326") -> str:

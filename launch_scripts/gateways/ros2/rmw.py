@@ -99,20 +99,15 @@ class Endpoint:
     @property
     def token(self) -> str:
         node = self.node
-        return (
+        return (  # in a token a slash of the topic is '%'
             f"{TOKEN_SPACE}/{node.domain}/{node.zid}/0/{self.number}/{self.kind}/{node.tail}/"
-            f"{mangled(self.topic)}/{dds_name(self.type_name)}/{self.type_hash}/{self.qos}"
+            f"{self.topic.replace('/', '%') or '%'}/{dds_name(self.type_name)}/{self.type_hash}/{self.qos}"
         )
 
     @property
     def gid(self) -> bytes:
         """16 bytes that name it in attachments: XXH3-128 of the token, low half first."""
         return xxhash.xxh3_128_digest(self.token.encode())[::-1]
-
-
-def mangled(name: str) -> str:
-    """A name as a part of a token: slashes are '%'."""
-    return name.replace("/", "%") or "%"
 
 
 def dds_name(type_name: str) -> str:

@@ -92,7 +92,7 @@ class Rovers:
         for rover in self.all.values():
             if time_scale > 0.0:
                 self._move(rover, min(passed_s, _LONGEST_TICK_S))
-            speed = self._speed(rover) if self._goes(rover) else 0.0
+            speed = self._speed(rover) if rover.turns or rover.rests_s <= 0.0 else 0.0
             state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
             if state == rover.published and 0 <= now_ns - rover.published_ns < _PUBLISHED_AGAIN_NS:
                 continue
@@ -118,9 +118,6 @@ class Rovers:
     def _speed(self, rover: Rover) -> float:
         """By the wall clock; none is quicker than what vehicles believe."""
         return min(rover.config.speed_m_per_s * self._time_scale, MOST_M_PER_S)
-
-    def _goes(self, rover: Rover) -> bool:
-        return rover.turns or rover.rests_s <= 0.0
 
     def _move(self, rover: Rover, seconds: float) -> None:
         if rover.rests_s > 0.0:

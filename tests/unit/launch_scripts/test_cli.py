@@ -30,8 +30,9 @@ from swarm.wire.messages.processes import RunInfo
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 
-def test_the_version_is_the_packages(swarm: Swarm) -> None:
-    assert swarm("--version") == (0, f"swarm {version('terrain-swarm')}\n", "")
+def test_the_version_is_the_packages_with_the_commit_of_a_checkout(swarm: Swarm) -> None:
+    code, said, errors = swarm("--version")
+    assert (code, errors, said.partition("+")[0].strip()) == (0, "", f"swarm {version('terrain-swarm')}")
 
 
 def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:

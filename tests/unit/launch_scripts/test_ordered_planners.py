@@ -50,10 +50,9 @@ def planners(
     stands_for: Any = swarm
     own = [running.spec for running in swarm.running]
 
-    def no_room(planners: int) -> str | None:
-        return why_no_room(SCENARIO, 10_000, planners, here)
-
-    return OrderedPlanners(SCENARIO, stands_for, ranks, own, whole, said.append, no_room), said
+    return OrderedPlanners(
+        SCENARIO, stands_for, ranks, own, whole, said.append, lambda n: why_no_room(SCENARIO, 10_000, n, here)
+    ), said
 
 
 def book(*orders: tuple[str, int, bool]) -> OrderBook:

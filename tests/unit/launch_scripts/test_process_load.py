@@ -79,7 +79,7 @@ def drawn(what: object, columns: int, lines: int) -> list[str]:
 
 def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
     state, _, _ = large_run()
-    title = "a long name: 12 of 60 s, live view http://127.0.0.1:39177/"
+    title = "a long name: 12 of 60 s, page http://127.0.0.1:39177/"
     told = (
         "agent 36/36",
         "keeper 0/1",

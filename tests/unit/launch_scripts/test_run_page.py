@@ -168,10 +168,6 @@ def heard(recording: Path) -> dict[str, list[tuple[int, Any]]]:
     return topics
 
 
-def in_map(xy_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[tuple[float, float]]:
-    return [RosMap(GRID).to_ros(x, y) for x, y in xy_m.tolist()]
-
-
 # --- values -------------------------------------------------------------------------------------------------------
 
 
@@ -179,9 +175,9 @@ def test_every_vehicle_is_at_every_time_where_its_track_says(
     heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
 ) -> None:
     expected = {
-        (f"{ros_name(each.id)}/base_link", int(time_ns)): place
+        (f"{ros_name(each.id)}/base_link", int(time_ns)): RosMap(GRID).to_ros(x_m, y_m)
         for each in tracks.vehicles
-        for time_ns, place in zip(each.time_ns, in_map(each.xy_m), strict=True)
+        for time_ns, (x_m, y_m) in zip(each.time_ns, each.xy_m.tolist(), strict=True)
     }
     found, turned = {}, defaultdict(list)
     for time_ns, told in heard["/tf"]:

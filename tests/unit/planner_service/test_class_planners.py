@@ -52,14 +52,19 @@ cost = { max_slope_deg = 15.0, vehicle_radius_m = 12.0 }
 [[classes]]
 name = "same"
 """
+_DRONE = """
+[[classes]]
+name = "drone"
+air = {}
+"""
 
 
 _NUMBERS = {"walker": 1, "low": 2, "same": 3}
 
 
 @cache
-def _made() -> tuple[Scenario, Terrain, dict[str, Terrain]]:
-    scenario = parse_scenario(_TEXT)
+def _made(more: str = "") -> tuple[Scenario, Terrain, dict[str, Terrain]]:
+    scenario = parse_scenario(_TEXT + more)
     terrain = build_terrain(scenario)
     return scenario, terrain, class_terrains(scenario, terrain)
 
@@ -140,7 +145,7 @@ def _apply(maps: ClassMaps, batch: list[Any], class_number: int = 0) -> None:
 
 class _World(SwarmModel):
     def __init__(self, all_kernels: Callable[[], bool] | None = None) -> None:
-        scenario, terrain, _ = _made()
+        scenario, terrain, _ = _made(_DRONE)
         super().__init__(terrain=terrain, scenario=scenario)
         self.ear = Ear(self)
         setup = self.setup("planner", "t", 1)
@@ -256,22 +261,23 @@ def test_no_route_of_a_class_enters_what_is_lethal_to_it(world: _World, name: st
     assert found > 5
 
 
-def test_while_the_kernels_of_classes_are_compiled_a_class_is_refused_at_once_and_the_ground_is_served() -> None:
+def test_while_its_kernels_are_compiled_a_class_is_refused_at_once_and_those_that_need_none_are_served() -> None:
     compiled = False
     world = _World(lambda: compiled)
     world.run(2.0)
     cells = np.array([world.target], "<u4").tobytes()
-    told = Chasers(target="t", author="a0", stamp_ns=0, ids=["a0.v0"], cells=cells, vehicle_class="walker")
+    told = Chasers(target="t", author="a0", stamp_ns=0, ids=["a0.v0"], cells=cells, vehicle_class="drone")
     world.ear.bus.publish(CHASERS, told, target="t", author="a0")
     began_ns = world.now_ns
-    assert world.ask(RouteRequest(cells=[world.target], vehicle_class="walker")) is None
-    assert "the kernels for class walker are still being compiled" in str(world.ear.ended[0].failure)
+    assert world.ask(RouteRequest(cells=[world.target], vehicle_class="drone")) is None
+    assert "the kernels for class drone are still being compiled" in str(world.ear.ended[0].failure)
     assert world.now_ns - began_ns < NS_PER_S / 2, "nobody behind it waits"
-    assert world.ask(RouteRequest(cells=[world.target])) is not None
-    assert world.trees() == ["ground"]
+    for name in ("ground", "walker"):
+        assert world.ask(RouteRequest(cells=[world.target], vehicle_class=name)) is not None
+    assert world.trees() == ["ground", "walker"]
     compiled = True
-    reply = world.ask(RouteRequest(cells=[world.target], vehicle_class="walker"))
-    assert (reply.vehicle_class, world.trees()) == ("walker", ["ground", "walker"])
+    reply = world.ask(RouteRequest(cells=[world.target], vehicle_class="drone"))
+    assert (reply.vehicle_class, world.trees()) == ("drone", ["ground", "walker", "drone"])
 
 
 def test_nobody_waits_for_the_tree_of_another_class() -> None:

@@ -19,7 +19,7 @@ from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.vehicle_classes import GROUND
+from swarm.config.vehicle_classes import GROUND, first_classes
 
 
 def test_every_kernel_of_a_planner_is_built() -> None:
@@ -27,8 +27,8 @@ def test_every_kernel_of_a_planner_is_built() -> None:
     assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})  # of a benchmark
 
 
-def scenario(*, directional: bool = False, aloft: bool = False, routes: str = "grid") -> Scenario:
-    """On any ground, with a class that drives and, if so, one that flies."""
+def scenario(*, directional: bool = False, aloft: int = 0, routes: str = "grid") -> Scenario:
+    """On any ground, with a class that drives; 1 aloft: with one that flies, 2: a group flies."""
     return parse_scenario(
         f"""
 terrain = {{ source = "synthetic", rows = 24, cols = 24, roads = 0 }}
@@ -38,15 +38,16 @@ planner = {{ routes = "{routes}" }}
 name = "truck"
 max_speed_m_per_s = 5.0
 """
-        + '[[classes]]\nname = "drone"\nair = {}\n' * aloft
+        + '[[classes]]\nname = "drone"\nair = {}\n' * min(aloft, 1)
+        + '[[groups]]\nclass = "drone"\n' * (aloft - 1)
     )
 
 
 @pytest.mark.parametrize("directional", [False, True])
-@pytest.mark.parametrize("aloft", [False, True])
+@pytest.mark.parametrize("aloft", [0, 1, 2])
 @pytest.mark.parametrize("routes", ["grid", "pulled"])
 def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(
-    directional: bool, aloft: bool, routes: str
+    directional: bool, aloft: int, routes: str
 ) -> None:
     """By the terrains themselves, as planners come by their kernels."""
     given = scenario(directional=directional, aloft=aloft, routes=routes)
@@ -57,18 +58,21 @@ def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(
     mends = {False: "mend", True: "mend_directed"}
     pulled = {False: "pull_routes", True: "pull_routes_directed"}
     first, later = set(map(name_of, needed.first)), set(map(name_of, needed.later))
-    assert first & set(growths.values()) == {growths[climbs[GROUND] is not None]}
+    assert first & set(growths.values()) == {growths[climbs[name] is not None] for name in first_classes(given)}
     assert (first | later) & set(growths.values()) == {growths[climb is not None] for climb in climbs.values()}
     assert later & set(mends.values()) == {mends[climb is not None] for climb in climbs.values()}
     straight = {name: climb for name, climb in climbs.items() if pulls(given.planner, climb)}
     assert (first | later) & set(pulled.values()) == {pulled[climb is not None] for climb in straight.values()}
+    at_first = {pulled[climb is not None] for name, climb in straight.items() if name in first_classes(given)}
+    assert first & set(pulled.values()) == at_first
     assert len(list(needed)) == len(set(map(name_of, needed)))
 
 
-def test_nothing_of_classes_keeps_the_first_route_of_the_ground_waiting() -> None:
-    plain, mixed = needed_kernels(scenario()), needed_kernels(scenario(aloft=True))
+def test_the_first_route_waits_for_the_kernels_of_classes_that_vehicles_belong_to_and_of_no_others() -> None:
+    plain, mixed = needed_kernels(scenario()), needed_kernels(scenario(aloft=1))
     assert mixed.first == plain.first
     assert set(mixed.later) > set(plain.later)
+    assert first_classes(scenario(aloft=2)) == {GROUND, "truck", "drone"} > first_classes(scenario(aloft=1))
 
 
 _KERNELS = "\n\n\n".join(f'@kernel("(i8,)")\ndef k{n}(x):\n    return x + {n}' for n in range(6))
@@ -174,7 +178,7 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     disk = Disk(monkeypatch)
-    needed = needed_kernels(scenario(aloft=True))
+    needed = needed_kernels(scenario(aloft=1))
     disk.coming = [name_of(kernel) for kernel in needed.first]
     loader = KernelLoader(needed, whole=False)
     loader.load_first()

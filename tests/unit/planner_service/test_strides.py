@@ -120,13 +120,9 @@ def test_each_cells_length_is_that_of_its_way(rules: dict, length_weight: float)
         if not math.isfinite(route.length_m):
             assert not route.directions
             continue
-        diagonal = math.sqrt(2) if config_octile(rules) else 1.0
+        diagonal = math.sqrt(2) if rules["edge"] == "octile" and rules["neighbours"] == 8 else 1.0
         steps = sum(diagonal if code & 1 else 1.0 for code in route.directions)
         assert route.length_m == pytest.approx(steps, rel=1e-5)
-
-
-def config_octile(rules: dict) -> bool:
-    return bool(rules["edge"] == "octile" and rules["neighbours"] == 8)
 
 
 def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:

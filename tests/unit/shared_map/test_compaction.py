@@ -250,12 +250,8 @@ def test_a_tile_is_due_when_an_author_dies_or_is_alive_after_all_or_an_earlier_o
 # --- services -----------------------------------------------------------------------------------------------
 
 
-def compacting_swarm() -> SwarmModel:
-    return SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
-
-
 def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
-    swarm = compacting_swarm()
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
     stores = [KeeperStore(":memory:") for _ in range(2)]
     keepers = [swarm.keeper(f"k{n}", store) for n, store in enumerate(stores)]
     listener = swarm.listener("p")

@@ -10,8 +10,6 @@ from support.effort import few
 
 from shared_map.importers.level_patches import labelled
 
-EIGHT = np.ones((3, 3), np.int8)
-
 
 def stairs(seed: int, rows: int, cols: int, steps: float) -> np.ndarray:
     """Whole numbers with wide steps, and some voids."""
@@ -31,7 +29,7 @@ def searched(heights: np.ndarray, least_cells: int) -> np.ndarray:
                 alike += padded[row : row + heights.shape[0], col : col + heights.shape[1]] == heights
     labels, count = np.zeros(heights.shape, np.int64), 0
     for height in np.unique(heights[~np.isnan(heights)]):
-        parts, many = ndimage.label((alike >= 2) & (heights == height), EIGHT)
+        parts, many = ndimage.label((alike >= 2) & (heights == height), np.ones((3, 3), np.int8))
         for number in range(1, many + 1):
             if (parts == number).sum() >= least_cells:
                 count += 1

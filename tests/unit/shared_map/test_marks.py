@@ -85,7 +85,8 @@ def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
     new: MarkSet, old: MarkSet | None, more: list[MarkSet]
 ) -> None:
     others = list({each.author: each for each in more if each.author != new.author}.values())
-    held = sorted([*others] + ([] if old is None else [_by(new.author, old)]), key=_author)
+    own = [] if old is None else [msgspec.structs.replace(old, author=new.author)]
+    held = sorted([*others, *own], key=_author)
     since = sorted([*others, new], key=_author)
     before, after = dense(winners(held, 0)), dense(winners(since, 0))
     differs = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
@@ -103,7 +104,3 @@ def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
 
 def _author(of: MarkSet) -> str:
     return of.author
-
-
-def _by(author: str, of: MarkSet) -> MarkSet:
-    return msgspec.structs.replace(of, author=author)

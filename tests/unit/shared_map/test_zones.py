@@ -140,16 +140,12 @@ def test_a_hole_of_a_zone_stays_open() -> None:
     world = ZoneWorld()
     world.add(holes=[[(3.0, 4.0), (3.0, 6.0), (5.0, 6.0), (5.0, 4.0)]])
     assert world.lethal() == SQUARE_CELLS - {row * COLS + col for row in (3, 4) for col in (4, 5)}
-    kept = outlines_of_kept([(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)])
+    kept = all_but([(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)], GridSpec(ROWS, COLS, 1.0), 256)
     assert len(kept) == 1
     world.add(polygon=kept[0][0], holes=kept[0][1:])
     assert world.lethal() == set(range(ROWS * COLS)) - SQUARE_CELLS
     outside = world.order(action="add", name="z", polygon=SQUARE, holes=[[(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]])
     assert "its edges cross or touch each other" in str(outside)
-
-
-def outlines_of_kept(corners: list[tuple[float, float]]) -> list[list[list[tuple[float, float]]]]:
-    return all_but(corners, GridSpec(ROWS, COLS, 1.0), 256)
 
 
 def test_a_zone_without_a_name_gets_one_that_was_never_used() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from swarm.config.agents import plan_agents
 from swarm.config.explain import meanings
-from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import Section
 from swarm.errors import ConfigError
@@ -54,6 +54,12 @@ def test_a_scenario_which_version_0_2_wrote_is_read_under_the_names_of_today():
     for preset, factor in (("hiker", 1.0), ("wheeled", 2.0), ("tracked", 1.5)):
         text = f"[cost]\npreset = '{preset}'\n"
         assert parse_scenario(f"{text}cross_slope_factor = {factor}") == parse_scenario(text)
+
+
+def test_a_fault_of_cost_is_said_once_however_many_classes_have_it_from_there():
+    for fault in ("frction = 1", "flat_speed_m_per_s = -1", "max_climb_deg = 9"):
+        text = f"[cost]\n{fault}\n[[classes]]\nname = 'a'\n[[classes]]\nname = 'b'\ncost.vehicle_radius_m = 2"
+        assert len(read_scenario(text, "s")[1]) == 1
 
 
 def test_relative_files_lie_beside_the_scenario(tmp_path):

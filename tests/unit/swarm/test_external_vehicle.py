@@ -20,13 +20,12 @@ from vehicle_agent.traffic.shard_leader import Leader
 
 GRID = GridSpec(64, 64, 1.0)
 SHARDS = Shards(GRID, ["a0", "a1", "a2"])
-FLEETS = {"a0": ["a0-00"], "a1": ["a1-00"], "a2": ["a2-00"]}
 
 
 def leader_of(**of: object) -> Leader:
     fields: dict[str, object] = {"hosts": {}, "grants": {}, **of}
     table = Table(shard=0, agent="a0", epoch=3, seq=1, **fields)  # type: ignore[arg-type]
-    return Leader(SHARDS, SHARDS.leader(0, 6), 6, table, FLEETS)
+    return Leader(SHARDS, SHARDS.leader(0, 6), 6, table, {"a0": ["a0-00"], "a1": ["a1-00"], "a2": ["a2-00"]})
 
 
 def entering(

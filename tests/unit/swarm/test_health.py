@@ -195,7 +195,7 @@ def test_a_manager_that_reads_nothing_holds_nobody_up_and_hears_of_the_start_lat
     for now_ns in range(1, 1000):
         supervisor.turned(now_ns)
     assert time.monotonic() - began_s < 5
-    while manager.recv(100) == b"x" and select_ready(manager):
+    while manager.recv(100) == b"x" and select.select([manager], [], [], 0)[0]:
         pass
     supervisor.turned(2000)
     assert told(manager)[0] == "READY=1"
@@ -218,11 +218,6 @@ def fill(manager: socket.socket) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
                 filler.sendto(b"x", manager.getsockname())
-
-
-def select_ready(manager: socket.socket) -> bool:
-    """True if more can be read."""
-    return bool(select.select([manager], [], [], 0)[0])
 
 
 def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:

@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
-from vehicle_agent.assignment import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
+from vehicle_agent.assignment import ASSIGNERS, HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
+from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.target_choice import Assignment
 
 
 @st.composite
@@ -62,6 +65,28 @@ def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
             those = np.flatnonzero(chosen == other)
             assert len(those) == share
             assert costs_s[other, those].max() <= costs_s[other, vehicle]
+
+
+@given(worlds(), st.sampled_from(sorted(ASSIGNERS)))
+@settings(deadline=None)
+def test_no_share_that_others_fill_keeps_a_vehicle_from_the_targets_it_can_reach_and_targets_soon_stay(
+    world: tuple[NDArray[np.float64], list[int]], name: str
+) -> None:
+    """Restrictions are random: of a target that a vehicle may not chase its agent knows no cost."""
+    costs_s, current = world
+    targets = [f"t{n}" for n in range(len(costs_s))]
+    vehicles = {f"a0-{n:02d}": Vehicle(f"a0-{n:02d}", GridSpec(4, 4, 10.0), n) for n in range(len(current))}
+    assignment = Assignment(vehicles, targets, ASSIGNERS[name](AssignmentWorld("a0", "all", (), 1)), 5.0, 1.0)
+    seen = []
+    for now_ns in range(len(vehicles) + 2):
+        assignment.ask(now_ns, now_ns)
+        for target, row in zip(targets, costs_s.astype(np.float32), strict=True):
+            assignment.costs_given(now_ns, target, row)
+        assignment.costs_ended(now_ns, dict.fromkeys(targets, 1), now_ns)
+        seen.append([vehicle.target for vehicle in vehicles.values()])
+        for chased, to_each_s in zip(seen[-1], costs_s.T, strict=True):
+            assert not np.isfinite(to_each_s).any() or np.isfinite(to_each_s[targets.index(str(chased))])
+    assert seen[-1] == seen[-2]
 
 
 def test_those_that_have_a_target_keep_it_and_count_for_its_share() -> None:

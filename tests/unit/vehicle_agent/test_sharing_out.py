@@ -224,12 +224,6 @@ def test_two_agents_share_out_the_targets_between_all_of_their_vehicles() -> Non
     assert two.chased("a1") == ["t1", "t1"]
 
 
-def test_an_agent_alone_sends_its_own_to_every_target() -> None:
-    two = Two(NEAR_T0)
-    two.reassign("a0", 0)
-    assert two.chased("a0") == ["t0", "t1"]
-
-
 def test_a_dead_agent_is_reckoned_with_for_three_periods_at_most() -> None:
     two = Two(NEAR_T0)
     two.reassign("a1", 0)
