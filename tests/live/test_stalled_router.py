@@ -12,6 +12,7 @@ from typing import Any
 
 import msgpack
 import pytest
+from support.effort import few
 from support.wire_strategies import BY_TYPE
 from support.zenoh_router import Router
 
@@ -25,7 +26,7 @@ from swarm.wire.topics import COST, NOTE, ROUTE, STATS, TOPICS, Topic
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-STALLS = 20
+STALLS = few(20)
 LEASE_S = 1.0
 CONFUSED = (NOTE, STATS, COST, ROUTE)
 """Topics of a session whose keys have the same form: each wrong key is heard."""

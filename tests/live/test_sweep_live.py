@@ -52,7 +52,8 @@ def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.thorough)]
+    "number",
+    [signal.SIGINT, *(pytest.param(each, marks=pytest.mark.thorough) for each in (signal.SIGTERM, signal.SIGKILL))],
 )
 def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_path: Path, number: signal.Signals):
     path, out = write_study(tmp_path, STUDY.replace('"0:3"', '"0:100"')), tmp_path / "out"
