@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import from_origin
-from support.live_swarm import Hands, ask, client, swarm, write_scenario
+from support.height_models import written
+from support.live_swarm import Hands, swarm, write_scenario
 from support.processes import eventually
 
 from swarm.config.load import load_scenario
-from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import ROUTE
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -27,11 +25,7 @@ def write_ridge(path: Path) -> None:
     """A hill of 300 m, as a GeoTIFF of 30 m cells."""
     south, east = np.mgrid[0:ROWS, 0:COLS].astype(np.float32)
     height_m = 300 * np.exp(-((south - 150) ** 2 + (east - 140) ** 2) / 2 / 60**2).astype(np.float32)
-    with rasterio.open(
-        path, "w", driver="GTiff", height=ROWS, width=COLS, count=1, dtype="float32", crs="EPSG:32632",
-        transform=from_origin(500_000, 5_000_000, 30, 30),
-    ) as out:  # fmt: skip
-        out.write(height_m, 1)
+    written(path, height_m, transform=from_origin(500_000, 5_000_000, 30, 30))
 
 
 def scenario_of_a_file(folder: Path) -> Path:
@@ -73,12 +67,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     assert "there is no file" in hands.logs()
     assert "terrain.json" in {path.name for path in (elsewhere / "far").iterdir()}
 
-    def is_served() -> bool:
-        with client(hands.network) as bus:
-            replies = ask(bus, ROUTE, RouteRequest(row=8, col=8), target="t0")
-        return bool(replies) and replies[0].routes[0].status is RouteStatus.OK
-
-    eventually(is_served, 60, "a route")
+    eventually(lambda: hands.route_status() is RouteStatus.OK, 60, "a route")
     status = json.loads(swarm("status", "--connect", endpoint, "--json").stdout)
     (agent,) = (process for process in status["processes"] if process["role"] == "agent")
     assert agent["counts"]["payloads_dropped"] == 0

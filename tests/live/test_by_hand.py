@@ -7,12 +7,10 @@ import signal
 import time
 
 import pytest
-from support.live_swarm import Hands, ask, client, swarm
+from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
-from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import ROUTE
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -30,12 +28,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
         ("router", ""), ("keeper", "by-hand"), ("targets", "by-hand"), ("planner", "by-hand"),
     }  # fmt: skip
 
-    def is_served() -> bool:
-        with client(hands.network) as bus:
-            replies = ask(bus, ROUTE, RouteRequest(row=8, col=8), target="t0")
-        return bool(replies) and replies[0].routes[0].status in (RouteStatus.OK, RouteStatus.LETHAL_START)
-
-    eventually(is_served, 30, "a route")
+    eventually(lambda: hands.route_status() in (RouteStatus.OK, RouteStatus.LETHAL_START), 30, "a route")
     part = hands.start("up", str(hands.path), "--connect", hands.network.connect[0], "--only", "agent", "--plain")
     eventually(lambda: ("agent", "a1", "by-hand") in hands.members(), 60, "the agents")
     told = swarm("role", "agent", "--id", "a1", *scenario, "--runs", hands.folder / "runs")

@@ -11,13 +11,14 @@ import os
 import re
 import shlex
 import subprocess
-import time
+from functools import partial
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 from support.installed import ROOT, environment
+from support.processes import eventually
 
 from launch_scripts.cli import command
 
@@ -122,11 +123,8 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        for _ in range(60):
-            time.sleep(1.0)
-            asked = subprocess.run(["swarm", "status"], cwd=bench.folder, env=bench.around, capture_output=True)
-            if asked.returncode == 0:
-                break
+        asks = partial(subprocess.run, ["swarm", "status"], cwd=bench.folder, env=bench.around, capture_output=True)
+        eventually(lambda: asks().returncode == 0, 60, "the demo")
         yield bench
     finally:
         demo.kill()  # its processes end with it

@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 FLEET = """
 name = "fleet"
 seed = 3
-seconds = 300
+seconds = 3600
 time_scale = 10
 
 [terrain]

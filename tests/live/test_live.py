@@ -19,6 +19,7 @@ from launch_scripts.simulation.replay import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.messages.processes import RunInfo
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, ROUTE, RUN, TOPICS
 
@@ -50,8 +51,20 @@ def incarnation(bus: ZenohBus, row: int, col: int) -> int | None:
     return None
 
 
+def everybody(bus: ZenohBus) -> list[RunInfo]:
+    """The answers of all processes, once none of them is late."""
+    found: list[RunInfo] = []
+
+    def all_answer() -> bool:
+        found[:] = ask(bus, RUN, Nothing())
+        return len(found) == 8
+
+    eventually(all_answer, 10, "everybody's answer")
+    return found
+
+
 def test_everybody_answers_with_the_same_run_and_terrain(live: LiveSwarm, bus: ZenohBus) -> None:
-    members = ask(bus, RUN, Nothing())
+    members = everybody(bus)
     roles = sorted((info.role, info.id) for info in members)
     assert roles == [
         *(("agent", "a0"), ("agent", "a1"), ("keeper", "0"), ("monitor", "0")),
@@ -103,7 +116,11 @@ def test_a_run_is_found_from_any_folder_with_its_page_logs_and_pids(live: LiveSw
 
 def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tmp_path: Path) -> None:
     first = live.run_dir.name
-    begun = swarm("up", live.path, "--port", 0, "--runs", tmp_path, "--no-live", "-d", timeout_s=90)
+    smaller = tmp_path / "smaller.toml"
+    smaller.write_text(
+        live.path.read_text().replace("count = 2", "count = 1").replace("vehicles = 12", "vehicles = 1")
+    )
+    begun = swarm("up", smaller, "--port", 0, "--runs", tmp_path, "--no-live", "-d", timeout_s=90)
     (second,) = {each["run"] for each in json.loads(swarm("ps", "--json").stdout)} - {first}
     told = swarm("down")
     ended = swarm("down", second, timeout_s=90)
@@ -116,7 +133,7 @@ def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tm
     assert f"{tmp_path / second / 'report.html'}\n" in ended.stdout
     assert swarm("open", second, "--print").stdout == (tmp_path / second / "report.html").as_uri() + "\n"
     told = swarm("logs", "launcher", "--run", second, "-f")  # over, so it returns
-    assert "agent-a0: " not in told.stdout
+    assert told.stdout == (tmp_path / second / "launcher.log").read_text()
     assert "stopping" in told.stdout
     states = {each["run"]: each["state"] for each in json.loads(swarm("ps", "-a", "--json").stdout)}
     assert (states[first], states[second]) == ("running", "ended")
@@ -156,9 +173,13 @@ def test_garbage_on_every_key_is_counted_and_dropped(live: LiveSwarm, bus: Zenoh
     token = bus.session.liveliness().declare_token("swarm/alive/agent/a9/yesterday")
     time.sleep(2.5)
     token.undeclare()
-    status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
-    dropped = {f"{p['role']}-{p['id']}": p["counts"]["payloads_dropped"] for p in status["processes"]}
-    assert all(count > 0 for count in dropped.values()), dropped
+
+    def all_have_dropped() -> bool:
+        """False while one has not told its counts, as on a machine that is busy."""
+        each = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)["processes"]
+        return len(each) == 8 and all(one["counts"]["payloads_dropped"] > 0 for one in each)
+
+    eventually(all_have_dropped, 20, "a payload that each process has dropped")
     assert live.said("restarts 0")
     assert not live.said("starts again")
 
@@ -196,13 +217,13 @@ def test_a_router_killed_with_9_comes_back_and_the_swarm_goes_on(live: LiveSwarm
     os.kill(live.pid_of("router-0"), signal.SIGKILL)
     eventually(lambda: live.said("router-0: killed by SIGKILL"), 5)
     eventually(lambda: incarnation(bus, row, col), 10, "a route through the new router")
-    eventually(lambda: len(ask(bus, RUN, Nothing())) == 8, 10, "everybody")
+    everybody(bus)
 
 
 def test_an_agent_killed_with_9_goes_on_with_its_vehicles(live: LiveSwarm, bus: ZenohBus) -> None:
     os.kill(live.pid_of("agent-a0"), signal.SIGKILL)
     eventually(lambda: live.said("agent-a0: killed by SIGKILL"), 5)
-    eventually(lambda: len(ask(bus, RUN, Nothing())) == 8, 10, "everybody")
+    everybody(bus)
 
 
 def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.height_models import written
 from support.live_swarm import SWARM, LiveSwarm, running
 from support.processes import eventually
 
@@ -27,7 +28,7 @@ ROWS, COLS, CELL_M = 60, 80, 30.0
 TARGET, START = (12, 70), (40, 10)
 _SCENARIO = """
 name = "with-mavlink"
-seconds = 300
+seconds = 3600
 
 [terrain]
 source = "ground.tif"
@@ -46,15 +47,10 @@ vehicles = 1
 
 
 def write_ground(path: Path) -> None:
-    import rasterio
     from rasterio.transform import from_origin
 
     heights = np.add.outer(np.sin(np.arange(ROWS) / 5), np.cos(np.arange(COLS) / 7)).astype(np.float32) * 3 + 400
-    shape = {"height": ROWS, "width": COLS, "count": 1, "dtype": "float32", "crs": "EPSG:32616"}
-    with rasterio.open(
-        path, "w", driver="GTiff", transform=from_origin(740_000, 4_030_000, CELL_M, CELL_M), **shape
-    ) as file:
-        file.write(heights, 1)
+    written(path, heights, crs="EPSG:32616", transform=from_origin(740_000, 4_030_000, CELL_M, CELL_M))
 
 
 class Child:

@@ -76,7 +76,7 @@ def test_two_versions_understand_each_other_and_one_takes_over_from_the_other(tm
 @pytest.mark.thorough
 def test_three_machines_are_upgraded_one_after_the_other(tmp_path: Path) -> None:
     old = older_tree(tmp_path)
-    with machines_of(THREE, dict.fromkeys(THREE, old), tmp_path, seconds=900) as (machines, routed, network):
+    with machines_of(THREE, dict.fromkeys(THREE, old), tmp_path) as (machines, routed, network):
         for machine in machines.values():
             take_over(machine, ROOT)
             routed.again(60)
@@ -95,7 +95,7 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         old = older_tree(folder)
-        with machines_of(THREE, dict.fromkeys(THREE, old), folder, seconds=900) as (machines, routed, _):
+        with machines_of(THREE, dict.fromkeys(THREE, old), folder) as (machines, routed, _):
             routed.begin()
             time.sleep(10)
             sys.stdout.write(f"nothing done: {routed.longest_s():.2f} s\n")

@@ -18,6 +18,7 @@ import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_world import Box, answering, asked, pose
 from support.makers import cost_reply, run_info
+from support.processes import eventually
 from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
@@ -65,10 +66,7 @@ class ZenohWorld:
         bus.session.put(topic.keyed(bus.namespace, **fields), payload, encoding=encoding)
 
     def until(self, true: Callable[[], object], within_s: float = 5.0) -> None:
-        deadline_s = time.monotonic() + within_s
-        while not true():
-            assert time.monotonic() < deadline_s, f"not within {within_s} s"
-            time.sleep(0.005)
+        eventually(true, within_s, every_s=0.005)
 
     def settle(self) -> None:
         """Waits until the router knows what all have declared, however busy the machine is: what a session declares

@@ -158,11 +158,10 @@ class Routed:
 
 @contextmanager
 def machines_of(
-    parts: Mapping[str, Part], trees: Mapping[str, Path], folder: Path, seconds: float = 300.0
+    parts: Mapping[str, Part], trees: Mapping[str, Path], folder: Path
 ) -> Iterator[tuple[dict[str, Machine], Routed, NetworkConfig]]:
     """Machines, each with the version in its tree, whose vehicles are all on routes."""
     path = write_scenario(folder, STANDBYS if parts is THREE else "")
-    path.write_text(path.read_text().replace("seconds = 300", f"seconds = {seconds:g}"))
     network = load_scenario(path).network
     machines = {name: Machine(part, folder / name, path) for name, part in parts.items()}
     first, *others = machines

@@ -22,7 +22,9 @@ from swarm.config.load import load_scenario
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages import Message, Nothing
-from swarm.wire.topics import RUN, Topic
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.route_columns import RouteStatus
+from swarm.wire.topics import ROUTE, RUN, Topic
 
 SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
@@ -48,7 +50,7 @@ vehicles = 12
 _SCENARIO = f"""
 name = "small"
 seed = 3
-seconds = 300
+seconds = 3600
 time_scale = 10
 {SMALL_WORLD}
 [vehicles]
@@ -76,7 +78,7 @@ def folders_of_runs(runs: Path) -> list[Path]:
     return [each for each in runs.resolve().iterdir() if not each.is_symlink()] if runs.exists() else []
 
 
-def swarm(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+def swarm(*arguments: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
     """Run the command `swarm` to its end."""
     command = [*SWARM, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
@@ -169,6 +171,12 @@ class Hands:
     def members(self) -> list[tuple[str, str, str]]:
         with client(self.network) as bus:
             return sorted((info.role, info.id, info.run_id) for info in ask(bus, RUN, Nothing(), timeout_s=1.0))
+
+    def route_status(self) -> RouteStatus | None:
+        """Status of a route that the planner of t0 answers with; None if it does not answer."""
+        with client(self.network) as bus:
+            replies = ask(bus, ROUTE, RouteRequest(row=8, col=8), target="t0")
+        return replies[0].routes[0].status if replies else None
 
     def logs(self) -> str:
         return "\n".join(f"{path.name}:\n{path.read_text()}" for path in self.folder.glob("*.log"))
