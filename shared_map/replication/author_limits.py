@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
@@ -18,6 +20,9 @@ _PART = 4
 _MAX_WAITING = 1 << 14
 """Sets of throttled processes that wait, in all. Sets without a place are requested again once a digest names them
 (docs/design/map-merge-law.md)."""
+
+_TURNS = 128
+"""Turns of waiting processes in one tick, some 10 ms: names cost a sender nothing."""
 
 _MOST_OWNERS = 4096
 """Processes with a budget of their own; all later ones share one, as names cost a sender nothing."""
@@ -104,7 +109,7 @@ class Quota:
         self._total = _Bucket(total_marks_per_s * _BURST_S, 0)
         self._owners: dict[str, _Budget] = {}
         # Process -> (tile, author) -> newest set; the process whose turn is next comes first.
-        self._waiting: dict[str, dict[tuple[int, str], MarkSet]] = {}
+        self.waiting: OrderedDict[str, dict[tuple[int, str], MarkSet]] = OrderedDict()
         self._waiting_sets = 0
         self._speaking = 1  # authors heard lately, counted at `_counted_ns`
         self._counted_ns = -NS_PER_S
@@ -112,9 +117,9 @@ class Quota:
     def admits(self, mark_set: MarkSet, now_ns: int) -> bool:
         """Returns True if a set may be merged now; if not, it waits here, while there is a place for it."""
         owner = owner_of(mark_set.author)
-        if owner not in self._waiting and self._may(owner, now_ns):
+        if owner not in self.waiting and self._may(owner, now_ns):
             return True
-        waiting = self._waiting.get(owner, {})
+        waiting = self.waiting.get(owner, {})
         at = (mark_set.tile, mark_set.author)
         held = waiting.get(at)
         if held is None and (len(waiting) >= _MAX_WAITING // _PART or self._waiting_sets >= _MAX_WAITING):
@@ -122,7 +127,7 @@ class Quota:
         if held is None or (mark_set.epoch, mark_set.seq) >= (held.epoch, held.seq):
             self._waiting_sets += held is None
             waiting[at] = mark_set
-            self._waiting[owner] = waiting
+            self.waiting[owner] = waiting
         return False
 
     def charge(self, author: str, marks: int, now_ns: int) -> None:
@@ -132,32 +137,34 @@ class Quota:
         each = self._filled(owner_of(author), now_ns)
         each.heard_ns = now_ns
         each.own.left -= cost
-        if self._total_rate < math.inf:
-            each.share.left -= cost
-            # Authors within their shares cannot be refused: what they overdraw must not keep others out for ever.
-            self._total.left = max(self._total.left - cost, -self._total_rate * _BURST_S)
+        each.share.left -= cost
+        # Authors within their shares cannot be refused: what they overdraw must not keep others out for ever.
+        self._total.left = max(self._total.left - cost, -self._total_rate * _BURST_S)
 
-    def due(self, now_ns: int) -> MarkSet | None:
-        """A set which has waited long enough; None if there is none. Waiting authors take turns."""
-        for owner, waiting in self._waiting.items():
+    def due(self, now_ns: int) -> Iterator[MarkSet]:
+        """Sets which have waited long enough. Waiting processes take turns, of which a tick has `_TURNS`. The
+        caller charges for each set before it takes the next."""
+        for _ in range(_TURNS):
+            if not self.waiting:
+                return
+            owner, waiting = next(iter(self.waiting.items()))
+            self.waiting.move_to_end(owner)
             if self._may(owner, now_ns):
                 mark_set = waiting.pop(next(iter(waiting)))
                 self._waiting_sets -= 1
-                del self._waiting[owner]
-                if waiting:
-                    self._waiting[owner] = waiting  # to the end of the queue
-                return mark_set
-        return None
+                if not waiting:
+                    del self.waiting[owner]
+                yield mark_set
 
     @property
     def throttled(self) -> list[str]:
         """Processes whose sets wait now."""
-        return sorted(self._waiting)
+        return sorted(self.waiting)
 
     def forget(self, now_ns: int) -> None:
         """Drops the buckets of those that were silent for a minute: they are full again."""
         for owner, each in list(self._owners.items()):
-            if now_ns - each.heard_ns > _FORGET_NS and owner not in self._waiting:
+            if now_ns - each.heard_ns > _FORGET_NS and owner not in self.waiting:
                 del self._owners[owner]
 
     def _may(self, owner: str, now_ns: int) -> bool:
@@ -172,9 +179,8 @@ class Quota:
             own, share = self._author_rate * _BURST_S, self._share(now_ns) * _BURST_S
             each = self._owners[owner] = _Budget(_Bucket(own, now_ns), _Bucket(share, now_ns), now_ns)
         each.own.fill(self._author_rate, now_ns)
-        if self._total_rate < math.inf:
-            each.share.fill(self._share(now_ns), now_ns)
-            self._total.fill(self._total_rate, now_ns)
+        each.share.fill(self._share(now_ns), now_ns)
+        self._total.fill(self._total_rate, now_ns)
         return each
 
     def _share(self, now_ns: int) -> float:

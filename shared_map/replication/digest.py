@@ -7,6 +7,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,10 @@ class Ledger:
     def authors(self) -> list[str]:
         """Authors of whom a set is held, in order."""
         return sorted(self._numbers)
+
+    def authors_from(self, place: int, most: int) -> list[str]:
+        """Authors of whom a set is held, in order of their first one, from a place in that order on."""
+        return list(islice(self._numbers, place, place + most))
 
     def held(self, authors: list[str] | None = None) -> dict[str, bytes]:
         """Rows in order of author and tile: equal holdings give equal bytes."""

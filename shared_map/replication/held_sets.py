@@ -34,8 +34,6 @@ class Tombstones:
     def covers(self, received: MarkSet) -> bool:
         """Returns True if a set was deleted already. Drops the tombstone of an author that states something
         newer."""
-        if not self._deleted:
-            return False
         tombstone = self._deleted.get((received.tile, received.author))
         if tombstone is None:
             return False
@@ -92,9 +90,7 @@ class HeldSets:
 
     def of_tile(self, tile: int) -> list[MarkSet]:
         """The sets about a tile, in order of author."""
-        sets = self._tiles.get(tile)
-        if sets is None:
-            return []
+        sets = self._tiles.get(tile, {})
         return list(sets.values()) if len(sets) == 1 else [sets[name] for name in sorted(sets)]
 
     @property
@@ -121,13 +117,9 @@ class HeldSets:
         own  capacity does not matter
         """
         tile, author = new.tile, new.author
-        sets = self._tiles.get(tile)
-        if not self.capacity.take(new, None if sets is None else sets.get(author), own=own):
+        if not self.capacity.take(new, self.get(tile, author), own=own):
             return False
-        if sets is None:
-            self._tiles[tile] = {author: new}
-        else:
-            sets[author] = new
+        self._tiles.setdefault(tile, {})[author] = new
         self.ledger.record(author, tile, new.epoch, new.seq)
         return True
 

@@ -78,9 +78,7 @@ class MarkFilter:
 
     def accepts_author(self, author: str, group: str) -> bool:
         """Returns True if the policy of groups lets us read this author, which states to be of this group."""
-        if self.groups is None:
-            return True
-        return group in self.groups and author.startswith(f"{group}.")
+        return self.groups is None or (group in self.groups and author.startswith(f"{group}."))
 
     def accepts_tile(self, tile: int) -> bool:
         """Returns True if a tile is in the regions of interest, or beyond the map: measurements concern all."""
@@ -91,10 +89,7 @@ class MarkFilter:
         of_authors = sets
         if self._prefixes is not None:
             of_authors = [(author, tiles) for author, tiles in sets if author.startswith(self._prefixes)]
-        if self._tiles is None:
-            return list(of_authors)
-        near = self._tiles
-        inside = ((author, [tile for tile in tiles if tile in near]) for author, tiles in of_authors)
+        inside = ((author, [tile for tile in tiles if self.accepts_tile(tile)]) for author, tiles in of_authors)
         return [(author, tiles) for author, tiles in inside if tiles]
 
 

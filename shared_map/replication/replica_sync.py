@@ -54,6 +54,8 @@ _CHANGES_FOR_NS = 2 * NS_PER_S
 """A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
+_LOOKS_PER_TICK = 1024
+"""Authors whose sets are compared for offers in one tick, some 15 ms: names cost a sender nothing."""
 _TILES_AT_ONCE = MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
 _ANSWERS_PER_TICK, _TURN = 8192, 1024
@@ -136,6 +138,7 @@ class MapSync:
         self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
+        self._looks_left = self._offer_place = 0  # authors to compare in this tick; the place of the next
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
@@ -225,6 +228,7 @@ class MapSync:
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
             self._join()
+        self._looks_left = _LOOKS_PER_TICK
         for pending in self._digests.due(now_ns):
             self._compare(pending, now_ns)
         self._send_digest(now_ns)
@@ -317,7 +321,7 @@ class MapSync:
             self.replica.over_capacity = None
 
     def _merge_waiting(self, now_ns: int) -> None:
-        while (mark_set := self._quota.due(now_ns)) is not None:
+        for mark_set in self._quota.due(now_ns):
             merged = self._merge([mark_set], measured=False)
             self._quota.charge(mark_set.author, sum(merged.changed), now_ns)
         self._quota.forget(now_ns)
@@ -453,9 +457,8 @@ class MapSync:
         """Asks for what they hold and we miss; give a keeper what it misses of authors that are gone."""
         digest = pending.digest
         missing = self.replica.missing(digest.held)
-        throttled = self.throttled
         for author, tiles in missing:
-            if owner_of(author) not in throttled:  # else its sets wait here already
+            if owner_of(author) not in self._quota.waiting:  # else its sets wait here already
                 self._fetch(author, tiles, now_ns)
         if is_keeper(digest.author) and digest.complete and not self._serves_all and pending.tries == 0:
             self._offer(digest, now_ns)
@@ -473,15 +476,24 @@ class MapSync:
 
     def _offer(self, kept: Digest, now_ns: int) -> None:
         """Puts again what a keeper never got, and its author, being gone, cannot put again."""
-        silent = [author for author in self.replica.held.ledger.authors if self._silent(author, now_ns)]
         if now_ns >= self._offers_due_ns:
             self._offers_left, self._offers_due_ns = _OFFERS_AT_ONCE, now_ns + self._digest_ns
+        silent = self._next_silent(now_ns)
         lost = self.replica.held.ahead_of(kept.held, silent, kept.after, kept.until)[: self._offers_left]
         self._offers_left -= len(lost)
         for mark_set in lost:
             self._put(mark_set)
         if lost:
             log.info("gave the keeper %d sets of authors that are gone", len(lost))
+
+    def _next_silent(self, now_ns: int) -> list[str]:
+        """Authors that are gone, for one digest: all, unless this tick's work is done before. The next digest then
+        goes on behind them."""
+        most = self._looks_left if self._offers_left else 0
+        authors = self.replica.held.ledger.authors_from(self._offer_place, most)
+        self._looks_left -= len(authors)
+        self._offer_place = 0 if len(authors) < most else self._offer_place + most
+        return [author for author in authors if self._silent(author, now_ns)]
 
     def _silent(self, author: str, now_ns: int) -> bool:
         since_ns = self._digest_interest.since_ns(author)

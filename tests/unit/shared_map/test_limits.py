@@ -9,7 +9,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import THROTTLED
-from shared_map.replication.author_limits import _MAX_WAITING, Capacity, Quota
+from shared_map.replication.author_limits import _MAX_WAITING, _TURNS, Capacity, Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
@@ -28,9 +28,9 @@ def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_ot
     assert not quota.admits(loud, NS_PER_S)
     assert quota.admits(calm, NS_PER_S)
     assert quota.throttled == ["loud"]
-    assert quota.due(5 * NS_PER_S) is None
-    assert quota.due(6 * NS_PER_S) == loud
-    assert quota.due(6 * NS_PER_S) is None
+    assert next(quota.due(5 * NS_PER_S), None) is None
+    assert next(quota.due(6 * NS_PER_S)) == loud
+    assert next(quota.due(6 * NS_PER_S), None) is None
     assert quota.throttled == []
 
 
@@ -61,8 +61,7 @@ def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
     quota.charge("loud", 100, 0)
     for seq in (3, 9, 5):
         assert not quota.admits(set_of("loud", 0, seq, {}), 0)
-    assert quota.due(1000 * NS_PER_S) == set_of("loud", 0, 9, {})
-    assert quota.due(1000 * NS_PER_S) is None
+    assert list(quota.due(1000 * NS_PER_S)) == [set_of("loud", 0, 9, {})]
 
 
 def test_budgets_that_are_full_again_are_forgotten() -> None:
@@ -83,10 +82,7 @@ def test_a_process_gains_nothing_by_writing_under_many_generations() -> None:
     assert not quota.admits(set_of("all.a0.8", 0, 1, {}), 0)
     assert quota.throttled == ["all.a0"]
     assert quota.admits(set_of("all.a1.9", 0, 1, {}), 0)
-    later_ns = 100 * NS_PER_S
-    assert [quota.due(later_ns), quota.due(later_ns), quota.due(later_ns)] == [
-        set_of("all.a0.9", 0, 1, {}), set_of("all.a0.8", 0, 1, {}), None,
-    ]  # fmt: skip
+    assert list(quota.due(100 * NS_PER_S)) == [set_of("all.a0.9", 0, 1, {}), set_of("all.a0.8", 0, 1, {})]
     capacity = Capacity(max_sets=8, max_marks=100)
     taken = [capacity.take(set_of(f"all.a0.{generation}", generation, 1, {}), None) for generation in range(8)]
     assert taken == [True, True] + 6 * [False]
@@ -107,8 +103,8 @@ def test_what_waits_is_bounded_for_one_process_and_for_all(owners: int) -> None:
         for owner in range(owners):
             assert not quota.admits(MarkSet(**_EMPTY | {"author": f"all.a{owner}.1", "tile": tile}), 0)
     waited = 0
-    while quota.due(10_000 * NS_PER_S) is not None:
-        waited += 1
+    while more := sum(1 for _ in quota.due(10_000 * NS_PER_S)):
+        waited += more
     assert waited == at_most
     assert quota.throttled == []
 
@@ -142,10 +138,30 @@ def test_two_that_wait_take_turns() -> None:
         quota.charge(name, 101, 0)
         for tile in range(3):
             quota.admits(set_of(name, tile, 1, {}), 0)
-    let_in = []
-    while (each := quota.due(100 * NS_PER_S)) is not None:
-        let_in.append(each.author)
-    assert let_in == ["a", "b"] * 3
+    assert [each.author for each in quota.due(100 * NS_PER_S)] == ["a", "b"] * 3
+
+
+def test_many_invented_names_that_wait_are_looked_at_over_several_ticks_and_a_true_one_has_its_turn() -> None:
+    quota = Quota(author_marks_per_s=20_000)
+    for n in range(5000):
+        quota.charge(f"all.a{n}.1", 200_001, 0)
+    quota.charge("all.x.1", 10**9, 0)  # with all names that are new from now on
+    for name in (*(f"x{n}" for n in range(12_000)), "a0"):
+        assert not quota.admits(set_of(f"all.{name}.1", 0, 1, {}), 0)
+    assert [len(list(quota.due(NS_PER_S))) for _ in range(95)] == [0] * (12_000 // _TURNS) + [1, 0]
+
+
+def test_authors_that_are_gone_are_compared_with_digests_of_keepers_by_turns_over_several_ticks() -> None:
+    swarm = SwarmModel()
+    sync = swarm.listener("p").sync
+    sync.replica.merge([set_of(f"all.q{n}.1", n % 4, 1, {1: (1, 0.0, 1)}) for n in range(2500)])
+    swarm.run(20)
+    sync._offers_left, compared = 256, []
+    for most in (1024, 1024, 452, 1024):
+        compared.append(sync._next_silent(swarm.now_ns))
+        assert len(compared[-1]) == most
+        swarm.run(0.1)
+    assert [name for each in compared[:3] for name in each] == [f"all.q{n}.1" for n in range(2500)]
 
 
 def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
