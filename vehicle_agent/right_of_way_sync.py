@@ -124,7 +124,8 @@ class RightOfWaySync:
         """True if an agent has appeared that has not received our recovery query."""
         self._names = {f"agent.{plan.group.name}.{plan.id}": plan.id for plan in plan_agents(setup.scenario)}
         """Name in its certificate -> agent."""
-        self._revoked: set[str] = set()
+        self._revoked: dict[str, int] = {}
+        """Agent -> number of its newest revoked certificate."""
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Shard without a leader -> when that is said again."""
@@ -272,10 +273,14 @@ class RightOfWaySync:
 
     def _take_revoked(self, now_ns: int) -> None:
         """Tells the members of agents whose certificates were revoked since the last look."""
-        new = {*self._store.revoked()} - self._revoked
-        self._revoked |= new
-        known = [self._names.get(name.partition("~")[0]) for name in sorted(new)]  # a0~2 is the next one of a0
-        self.core.revoke([agent for agent in known if agent is not None], self._own_time.at(now_ns))
+        revoked: dict[str, int] = {}
+        for name in self._store.revoked():
+            base, _, number = name.partition("~")  # a0~2 is the next certificate of a0
+            if (agent := self._names.get(base)) is not None:
+                revoked[agent] = max(int(number or 1), revoked.get(agent, 0))
+        if revoked != self._revoked:
+            self._revoked = revoked
+            self.core.revoke(revoked, self._own_time.at(now_ns))
 
     def _ask_known(self, now_ns: int) -> None:
         """Asks all agents what they know of us, and schedules the next query: each after twice the delay, up to a

@@ -311,7 +311,10 @@ class Holdings:
         view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.shard])
-            self._entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), word.lacks)
+            # The table may give a vehicle without a place an entry to begin with, of which the grant is on its way.
+            known = self._entries.paths.keys() | self._entries.away
+            lacks = word.lacks if known.issuperset(self._vehicles or ()) else []
+            self._entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), lacks)
             view.same, view.told = False, None
         return self._take_agreed(view)
 

@@ -102,7 +102,7 @@ def heard_of_all(self: Witness, standing: HostState, now_ns: int) -> None:
 
 
 def members_hear_of_no_revoked_name(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Member, "revoke", lambda self, name, now_ns: None)
+    patch.setattr(Member, "revoke", lambda self, names, now_ns: None)
 
 
 def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,7 @@ def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(n
 def made_anew(leader: Leader) -> Leader:
     """The twin of a leader, which has read its table, and looks at all vehicles of the shard."""
     twin = copy.copy(leader)
-    twin._orders = Orders(leader._orders.table(leader._shard, "twin", (0, 0), {}))
+    twin._orders = Orders(leader._orders.table(leader._shard, "twin", (0, 0), {}, {}))
     twin._hosts = {
         name: dataclasses.replace(host, asking=list(host.stands.values())) for name, host in leader._hosts.items()
     }

@@ -227,7 +227,7 @@ class ThiefWorld(TrafficWorld):
         super().carry(source, to, lambda: None if is_denied and self.revoked else deliver())
 
     def tell_revoked(self, process: Process) -> None:
-        process.rights.revoke([self.stolen], process.now_ns)
+        process.rights.revoke({self.stolen: 1}, process.now_ns)
 
     def entries(self) -> list[Number]:
         """Some entries that members have on file."""

@@ -65,7 +65,7 @@ class Orders:
                 self._fences.add(number)
 
     def table(
-        self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int], without: str | None = None
+        self, shard: int, agent: str, stamp: Stamp, pushed: Mapping[str, int], without: Mapping[str, int]
     ) -> Table:
         """Returns the same as a message."""
         fences = [
@@ -82,7 +82,7 @@ class Orders:
             grants={vehicle: self._held_by(vehicle) for vehicle in self.of},
             fences=fences,
             pushed=dict(pushed),
-            without=without,
+            without=dict(without),
         )
 
     # --- what is so -----------------------------------------------------------------------------------------
@@ -207,10 +207,10 @@ class Orders:
         for vehicle in (
             {vehicle: None for of in earlier for vehicle in of} if begins and generation not in dead else ()
         ):
-            if vehicle not in self.of and vehicle not in bodies:
+            if vehicle not in self.of and vehicle not in bodies and not holds.get(vehicle):
                 self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
         for each in dead:
-            self._open(host, each, bodies)
+            self._open(host, each, bodies, holds)
         return begins or any(earlier)
 
     def _fence(self, host: str, generation: int) -> None:
@@ -222,13 +222,18 @@ class Orders:
                 fence[vehicle] = [*fence.get(vehicle, ()), *entries]
                 self._fences.update(entries)
 
-    def _open(self, host: str, generation: int, bodies: Mapping[str, int]) -> None:
-        """A generation has ended: its entries are over, except those on which bodies are.
+    def _open(
+        self, host: str, generation: int, bodies: Mapping[str, int], holds: Mapping[str, Iterable[Number]]
+    ) -> None:
+        """A generation has ended: its entries are over, except those on which bodies are, and those which a newer
+        generation has by another leader's table.
 
         Those of vehicles that are to begin from there must not wait: two such vehicles would wait for each other.
         """
         for vehicle, entries in self.fenced.pop((host, generation), {}).items():
-            here = [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
+            held = {*holds.get(vehicle, ())}
+            here = [entry for entry in entries if entry in held]
+            here = here or [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
             self._fences.difference_update(entries)
             for entry in entries:
                 if entry not in here:
@@ -253,7 +258,7 @@ class Orders:
     def end(self, host: str, generation: int) -> bool:
         """A generation that was replaced states that it drives no more. Returns whether that opens cells."""
         opens = (host, generation) in self.fenced
-        self._open(host, generation, {})
+        self._open(host, generation, {}, {})
         return opens
 
     def remove(self, host: str, holds: Mapping[str, Iterable[Number]], knows: Stamp) -> None:

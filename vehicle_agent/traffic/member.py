@@ -126,8 +126,8 @@ class Member:
         self._members = shards.members(self.shard)
         self._witness = Witness(me, fleets) if shards.proven else None
         self._others = tuple(member for member in self._members if member != me)
-        self._distrusted: set[str] = set()
-        """Revoked names, until members with others have agreed on what they have on file."""
+        self._revoked: dict[str, int] = {}
+        """Agent -> number of its newest revoked certificate."""
         self._rank = self._members.index(me)
         self._claimed = 0
         self._promises: dict[str, Table] = {}
@@ -151,8 +151,16 @@ class Member:
     # --- timeouts -------------------------------------------------------------------------------------------
 
     @property
+    def _distrusted(self) -> list[str]:
+        """The agent with a revoked name, until the table on file was agreed without it. At most one lies at a time:
+        of several the others have new certificates, and state what is on their files."""
+        without = self.stored.without
+        names = [name for name, number in self._revoked.items() if number > without.get(name, 0)]
+        return names[:0] if self._witness is None else names[-self._shards.liars :]
+
+    @property
     def _trusted(self) -> set[str]:
-        return {*self._others} - self._distrusted
+        return {*self._others}.difference(self._distrusted)
 
     @property
     def _lease_ns(self) -> int:
@@ -179,11 +187,12 @@ class Member:
         if asked_ns >= 0:
             self._trips.measure(member, now_ns - asked_ns)
 
-    def revoke(self, name: str, now_ns: int) -> None:
-        """A name is revoked: by what it said as a member or a host, others may have different tables on file."""
-        if self._witness is None or name == self._me:
+    def revoke(self, names: Mapping[str, int], now_ns: int) -> None:
+        """Certificates of these agents up to a number are revoked: by what they said as a member or a host, others
+        may have different tables on file."""
+        self._revoked.update((name, number) for name, number in names.items() if name != self._me)
+        if not self._distrusted:
             return
-        self._distrusted.add(name)
         self.leader = None  # all begin again with what they have
         self._led_until_ns, self._due_ns = now_ns, now_ns + self._turn_ns()
 
@@ -231,8 +240,6 @@ class Member:
                 return self._words(now_ns)
             self.promised = table.epoch
             self._store(table)
-            if table.without in self._distrusted:
-                self._distrusted.clear()
             actions.append(Save(self.promised, self.stored))
             actions += self._words(now_ns)
         if table.stamp == self.stored.stamp:
@@ -251,11 +258,23 @@ class Member:
         return self.on_file
 
     def _accepts(self, table: Table) -> bool:
-        """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are
-        trusted."""
-        if table.without in self._distrusted and table.agent not in self._distrusted:
+        """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are trusted,
+        but for what a host has said to us itself."""
+        if self._witness is None:
             return True
-        return self._witness is None or self._witness.accepts(self.stored, table)
+        before, distrusted = self.stored.without, self._distrusted
+        if any(table.without.get(name, 0) < number for name, number in before.items()):
+            return False
+        if table.without == before:
+            return self._witness.accepts(self.stored, table)
+        return (
+            all(
+                number <= max(before.get(name, 0), self._revoked.get(name, 0))
+                for name, number in table.without.items()
+            )
+            and table.agent not in distrusted
+            and not self._witness.contradicts(table, distrusted)
+        )
 
     def _words(self, now_ns: int) -> list[MemberAction]:
         """Returns our words to hosts, where these need more than the leader's."""
@@ -297,10 +316,6 @@ class Member:
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq), now_ns
-        if self.leader is not None and all(
-            member in self._has and self._has[member][0] > (self.leader.epoch, 0) for member in self._trusted
-        ):
-            self._distrusted.clear()
         self._other_said = max(self._other_said, (stored.epoch, stored.seq))
         if self.leader is None:
             return []
@@ -374,13 +389,13 @@ class Member:
         return self._bases.get(min(has)) if has else None
 
     def _take_charge(self, now_ns: int) -> None:
-        promises = [table for member, table in self._promises.items() if member not in self._distrusted]
+        distrusted = self._distrusted
+        promises = [table for member, table in self._promises.items() if member not in distrusted]
         if self.leader is not None or len(promises) < self._shards.majority:
             return
         known = sorted(promises, key=lambda table: table.stamp, reverse=True)
-        without = min(self._distrusted, default=None)
         found: Table | None = known[0]
-        if without is not None:
+        if distrusted:
             found = agreed(promises)
         elif self._witness is not None:
             # A table that a thief told one member comes last, but a host that lies must not rule out all. If none
@@ -388,7 +403,9 @@ class Member:
             known.sort(key=self._witness.contradicts)
             found = next(filter(self._accepts, [*known, known[0]]), None)
         if found is not None:
-            self.leader = Leader(self._shards, self._me, self._claimed, found, self._fleets, without)
+            self.leader = Leader(
+                self._shards, self._me, self._claimed, found, self._fleets, self._revoked if distrusted else None
+            )
             self._told = []
             self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.

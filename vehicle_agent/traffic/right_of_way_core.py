@@ -94,7 +94,7 @@ class RightOfWay:
         self._saved = dict(saved)
         self._members: dict[int, Member] = {}
         self.silent = False
-        self._revoked: set[str] = set()
+        self._revoked: dict[str, int] = {}
 
     # --- beginning a generation -----------------------------------------------------------------------------------
 
@@ -196,12 +196,11 @@ class RightOfWay:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def revoke(self, names: Collection[str], now_ns: int) -> None:
-        """The certificates of these agents are revoked: what they said as members may be false."""
-        for name in names:
-            self._revoked.add(name)
-            for member in self._members.values():
-                member.revoke(name, now_ns)
+    def revoke(self, names: Mapping[str, int], now_ns: int) -> None:
+        """Certificates of these agents up to a number are revoked: what they said as members may be false."""
+        self._revoked.update(names)
+        for member in self._members.values():
+            member.revoke(names, now_ns)
 
     def hear_host_state(self, standing: HostState, now_ns: int) -> None:
         member = self._member(standing.shard, now_ns)
@@ -253,15 +252,14 @@ class RightOfWay:
             return known
         members = self.shards.members(shard)
         noted = {self.agent, *self.own.noted_by}
-        honest = {*members} - self._revoked
+        honest = {*members} - self._revoked.keys()
         if self.agent not in members or not noted.issuperset(honest) or not self._has_quorum:
             return None
         promised, stored = self._saved.get(shard) or (0, self._at_start(shard))
         made = self._members[shard] = Member(
             self.shards, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
         )
-        for name in self._revoked:
-            made.revoke(name, now_ns)
+        made.revoke(self._revoked, now_ns)
         return made
 
     def _at_start(self, shard: int) -> Table:

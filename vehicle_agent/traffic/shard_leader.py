@@ -118,7 +118,7 @@ class Leader:
     fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
     (docs/design/external-vehicles.md): its vehicles are
             those that bear its name
-    without  a member with a revoked name, after which the table was agreed by the others
+    without  agent -> number of its newest revoked certificate, after which the table was agreed by the others
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Leader:
         epoch: int,
         table: Table,
         fleets: Mapping[str, Collection[str]],
-        without: str | None = None,
+        without: Mapping[str, int] | None = None,
     ) -> None:
         self.epoch = epoch
         self.seq = 0
@@ -137,7 +137,9 @@ class Leader:
         self._shard = table.shard
         self._me = me
         self._fleets = fleets
-        self._without = without or table.without
+        self._without = dict(table.without)
+        for name, number in (without or {}).items():
+            self._without[name] = max(number, self._without.get(name, 0))
         self._orders = Orders(table)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}

@@ -28,7 +28,10 @@ _MOST_LACKED = 64
 
 
 def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
-    """Returns number -> its vehicle, and the generation of its host; None if a number is there twice."""
+    """Returns number -> its vehicle, and the generation of its host; None if a number is there twice, or a fence of
+    one host has a vehicle of another."""
+    if any(agent_of(vehicle) != fence.agent for fence in table.fences for vehicle in fence.entries):
+        return None
     of = [(agent_of(vehicle), vehicle, numbers) for vehicle, numbers in table.grants.items()]
     each = [(table.hosts.get(host, BEFORE_ALL)[0], vehicle, numbers) for host, vehicle, numbers in of]
     each += [
@@ -86,15 +89,16 @@ class _Host:
     newest       (generation, sequence) of the newest
     generations  generation -> the newest table that it knows, the entries that it holds, and those that it never
                  takes
-    there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on
-    ended        generations that have ended
+    there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on; with
+                 whether it holds an entry there
+    ended        generations that have ended, the newest ones
     told         the last word to it, and its time
     """
 
     spoke_ns: int
     newest: Stamp = BEFORE_ALL
     generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
-    there: set[tuple[str, int]] = field(default_factory=set)
+    there: dict[tuple[str, int], bool] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
     told: object = None
     told_ns: int = 0
@@ -104,29 +108,36 @@ class _Host:
         self.ended.update(standing.dead)
         if standing.ended:
             self.ended.add(standing.generation)
+        self.ended.intersection_update(sorted(self.ended)[-2 * GENERATIONS_KEPT :])
         if (standing.generation, standing.seq) > self.newest:
             self.newest = standing.generation, standing.seq
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
             self.generations[standing.generation] = standing.knows, held, standing.never
-            entering = {(stand.vehicle, stand.cell) for stand in standing.vehicles if is_entering(stand)}
-            self.there = entering.union(
-                (each.vehicle, number[0]) for each in standing.vehicles for number in each.holds
+            self.there = {(stand.vehicle, stand.cell): False for stand in standing.vehicles if is_entering(stand)}
+            self.there.update(
+                ((each.vehicle, cell), True) for each in standing.vehicles for cell in each.holds.cells
             )
             for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
                 del self.generations[old]
 
-    def is_over(self, number: Number, generation: int) -> bool:
+    def is_over(self, number: Number, vehicle: str, generation: int, first: str | None, *, begins: bool) -> bool:
         """Returns True if this host said that an entry of a generation of it is over. Generation 0 is the run's
-        start, of which the entries belong to the first generation that a table counts."""
+        start, of which the entries belong to the first generation that a table counts.
+
+        An entry of an ended generation is over if the newest states the vehicle elsewhere, or the table has it
+        begin elsewhere. Where the newest has the vehicle, the entry passes to it, and only its word ends that; or,
+        before it holds any there, another entry of the vehicle which is the first of the cell.
+
+        first   the vehicle of the cell's first entry in the table which omits this one
+        begins  whether the vehicle has entries in that
+        """
         if generation in self.ended:
-            return True
-        generations = (
-            self.generations.values()
-            if not generation
-            else [self.generations[generation]]
-            if generation in self.generations
-            else ()
-        )
+            holds = self.there.get((vehicle, number[0]))
+            elsewhere = begins or self.newest[0] in self.ended or any(vehicle == of for of, _ in self.there)
+            if elsewhere if holds is None else not holds and first == vehicle:
+                return True
+        own = [generation, self.newest[0]] if generation in self.ended else [generation]
+        generations = [of for each, of in self.generations.items() if each in own or not generation]
         return any(
             (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
         )
@@ -165,15 +176,22 @@ class Witness:
         # A vehicle of which all generations have ended before a table counted one begins in its cell again.
         begins = {(number[0], each[0]): number for number, each in lists.items() if number not in was}
         last: dict[int, Number] = {}
+        first = {number[0]: lists[number][0] for number in sorted(lists, reverse=True)}
         for number, (vehicle, generation) in was.items():
             found, host = lists.get(number), agent_of(vehicle)
-            if found == (vehicle, generation) or (found is not None and not generation and found[0] == vehicle):
+            if found == (vehicle, generation) or (
+                found is not None
+                and self._passes((vehicle, generation), found[0], number)
+                and (not generation or generation in self._hosts[host].ended)
+            ):
                 last[number[0]] = max(number, last.get(number[0], number))
             elif host not in self._hosts:
                 self._lacks.setdefault(host, []).append(number)
             elif not generation and self._hosts[host].ended and (number[0], vehicle) in begins:
                 last[number[0]] = max(number, last.get(number[0], number))
-            elif not self._hosts[host].is_over(number, generation):
+            elif not self._hosts[host].is_over(
+                number, vehicle, generation, first.get(number[0]), begins=vehicle in new.grants
+            ):
                 self._lacks.setdefault(host, []).append(number)
         added = [(number, each) for number, each in lists.items() if was.get(number) != each]
         for _, (vehicle, _) in added:
@@ -199,15 +217,15 @@ class Witness:
         host = self._hosts.get(agent_of(vehicle))
         return not before[1] or (host is not None and (vehicle, number[0]) in host.there)
 
-    def contradicts(self, table: Table) -> bool:
-        """Returns True if a host held an entry which a table omits, by a statement no older than the one that the
-        table counts: no majority has it on file."""
+    def contradicts(self, table: Table, distrusted: Collection[str] = ()) -> bool:
+        """Returns True if a trusted host held an entry which a table omits, by a statement no older than the one
+        that the table counts: no majority has it on file."""
         lists = _listed(table) or {}
         return any(
             not held.issubset(lists)
             for name, host in self._hosts.items()
             for _, held, _ in [host.generations.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
-            if table.hosts.get(name, BEFORE_ALL) <= host.newest
+            if name not in distrusted and table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 
     def words(self, stored: Table, now_ns: int) -> Iterator[Word]:

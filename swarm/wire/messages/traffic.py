@@ -179,8 +179,8 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     grants  vehicle -> its entries in driving order
     fences  entries of generations that may still drive
     pushed  vehicle -> the age with which it is to make way into another shard
-    without name that was revoked: a leader began with what two of three other members had on file, or with a table
-            that followed from such a one
+    without agent -> number of its newest revoked certificate (a0~2 is the second of a0) after which a leader began
+            with what two of three other members had on file
     since   stamp of an earlier table of the same epoch: `hosts` and `grants` have only what differs from that, an
             empty one for a vehicle that has no entry any more. None if the table is whole
     """
@@ -193,7 +193,7 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
     grants: Annotated[dict[VehicleId, Held], LARGE]
     fences: Annotated[list[Fence], IDS] = []
     pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
-    without: Id | None = None
+    without: Annotated[dict[Id, Natural], IDS] = {}
     since: Stamp | None = None
 
     @property
