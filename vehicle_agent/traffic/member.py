@@ -258,8 +258,8 @@ class Member:
         return self.on_file
 
     def _accepts(self, table: Table) -> bool:
-        """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are trusted,
-        but for what a host has said to us itself."""
+        """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are
+        trusted, but for what a host has said to us itself."""
         if self._witness is None:
             return True
         before, distrusted = self.stored.without, self._distrusted
