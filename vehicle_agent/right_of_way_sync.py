@@ -76,7 +76,7 @@ _PROMISE_TIMEOUT_S = 10.0
 _MOST_REFUSALS_TOLD = 100
 """Liars may say as many different things as they like."""
 _MOST_DIGITS = 9
-"""Digits of a shard's number in a key."""
+"""Digits of a shard's number in a key, and of a certificate's."""
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
@@ -118,6 +118,9 @@ class RightOfWaySync:
         """Time for the core. When to ask, and when to tell people, goes by the time of the wall."""
         self._asked_ns: int | None = None
         """Time of the last recovery query of this generation."""
+        self._known_tag = ""
+        """Tag of this generation's recovery queries: what answers an earlier one is older than the shards into
+        which its successor drove."""
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._unasked = False
@@ -167,19 +170,19 @@ class RightOfWaySync:
                 event.end()
             case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
                 core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, own_ns)
-            case Replied(message=Known() as known, took_s=took_s):
+            case Replied(message=Known() as known, took_s=took_s, tag=tag):
                 if known.agent in core.shards.agents:
                     core.trips.measure(known.agent, int(took_s * NS_PER_S))
-                self._perform(core.hear_known(known))
+                if tag == self._known_tag:
+                    self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
                 core.host.hear_token(peer, up=True)
                 self._unasked = True
             case Disappeared(peer=Peer(role="agent") as peer):
                 core.host.hear_token(peer, up=False)
-            case AskEnded(topic=topic) if topic is KNOWN:
-                self._begin()
-            case AskEnded(topic=topic) if topic is TABLE:
-                pass
+            case AskEnded(topic=topic, tag=tag) if topic is KNOWN or topic is TABLE:
+                if tag == self._known_tag:
+                    self._begin()
             case _:
                 return False
         return True
@@ -275,9 +278,10 @@ class RightOfWaySync:
         """Tells the members of agents whose certificates were revoked since the last look."""
         revoked: dict[str, int] = {}
         for name in self._store.revoked():
-            base, _, number = name.partition("~")  # a0~2 is the next certificate of a0
-            if (agent := self._names.get(base)) is not None:
-                revoked[agent] = max(int(number or 1), revoked.get(agent, 0))
+            base, _, number = name.partition("~")  # a0~2 is the second certificate of a0
+            agent, number = self._names.get(base), number or "1"
+            if agent is not None and number.isdecimal() and len(number) <= _MOST_DIGITS:
+                revoked[agent] = max(int(number), revoked.get(agent, 0))
         if revoked != self._revoked:
             self._revoked = revoked
             self.core.revoke(revoked, self._own_time.at(now_ns))
@@ -289,10 +293,11 @@ class RightOfWaySync:
         request = KnownRequest(
             agent=self._id, disk=self._store.own.disk, layer=shards.layer, shard_cells=shards.side
         )
+        self._known_tag = self._known_tag or f"known-{now_ns}"
         self._asked_ns, self._unasked = now_ns, False
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
-        self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_LATE_ANSWERS_S)
+        self._bus.ask(KNOWN, request, self._post, tag=self._known_tag, timeout_s=_LATE_ANSWERS_S)
 
     def _begin(self) -> None:
         """Begins a generation if there is none, once those who could be asked had time to answer and the promise
@@ -340,7 +345,7 @@ class RightOfWaySync:
         for action in actions:
             match action:
                 case AskKnown():
-                    self._asked_ns, self._unasked = None, True  # at the next tick
+                    self._asked_ns, self._unasked, self._known_tag = None, True, ""  # at the next tick
                 case Tell(members, standing):
                     for member in members:
                         self._bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)

@@ -114,7 +114,9 @@ class HostEntries:
                     index = at[entry.number]
                     path[index] = self._waiting(entry, path[index].after)
                 elif (
-                    entry.number[1:] > known and entry.number not in no_more and self._follows(vehicle, path, entry)
+                    known < entry.number[1:] <= stamp
+                    and entry.number not in no_more
+                    and self._follows(vehicle, path, entry)
                 ):
                     path.append(self._waiting(entry, entry.after))
                     longer.add(vehicle)

@@ -74,7 +74,7 @@ class ExternalService:
         self._post = post
         self._warn = warn
         self._warned: set[str] = set()
-        self._tag = f"known-{name}"
+        self._tag = ""
         self._answers = Answers(proven=bus.proves_names)
         self._asking = False
         self._ask_due_ns = 0
@@ -181,7 +181,7 @@ class ExternalService:
             self.external.hear_token(peer, up=up)
 
     def _ask(self, now_ns: int) -> None:
-        self._asking = True
+        self._asking, self._tag = True, f"known-{self.name}-{now_ns}"  # what answers an earlier query is too old
         request = KnownRequest(agent=self.name, disk=0)
         self._bus.ask(KNOWN, request, self._post, tag=self._tag, timeout_s=_ANSWERS_S)
 

@@ -311,10 +311,11 @@ class Holdings:
         view.words[word.agent] = word.epoch, word.part
         if word.asks:
             self.watch([word.shard])
-            # The table may give a vehicle without a place an entry to begin with, of which the grant is on its way.
-            known = self._entries.paths.keys() | self._entries.away
-            lacks = word.lacks if known.issuperset(self._vehicles or ()) else []
-            self._entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), lacks)
+            # A table may give a vehicle that is nowhere an entry to begin with, of which the grant is on its way.
+            entries = self._entries
+            begun = entries.paths.keys() | entries.bodies.keys() | entries.away
+            if begun.issuperset(self._vehicles or ()):
+                entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), word.lacks)
             view.same, view.told = False, None
         return self._take_agreed(view)
 

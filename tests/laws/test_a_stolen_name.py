@@ -28,15 +28,17 @@ SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))
 
 
 def world_of(seed: int) -> ThiefWorld:
-    """Half of the histories have no other fault, as those lie most."""
+    """A third of the histories have no other fault, as those lie most, and a third have crashes only."""
     chance = random.Random(f"thief/{seed}")
-    faults = random_faults(chance, LIES_S) if chance.random() < 0.5 else Faults(quiet_s=LIES_S)
+    crashes = Faults(quiet_s=LIES_S, crashes=chance.choice((0.5, 2)))
+    faults = chance.choice((random_faults(chance, LIES_S), Faults(quiet_s=LIES_S), crashes))
     return ThiefWorld(seed, *chance.choice(SHAPES), replace(faults, twins=0))
 
 
 def harm_done(seed: int) -> list[str]:
     """Harm that remains of a history: vehicles of others met, members of a shard do not agree some time after the
-    name is revoked, or cells are closed for a vehicle that does not exist."""
+    name is revoked, cells are closed for a vehicle that does not exist or a start that has ended, or a vehicle has
+    no entry."""
     world = world_of(seed)
     world.run(LIES_S)
     world.revoke()
@@ -46,6 +48,9 @@ def harm_done(seed: int) -> list[str]:
         at_odds = {shard for shard in at_odds if not world.is_of_one_mind(shard)}
         world.run(0.07)
     ghosts = [id for each in world.files() for id in each.grants if id not in world.goals]
+    ghosts += [str(fence) for each in world.files() for fence in each.fences if fence.agent != world.stolen]
+    hosts = [(process.vehicles, process.rights.holdings._entries.paths) for process in world.processes]
+    ghosts += [f"{id} is nowhere" for vehicles, paths in hosts for id in vehicles if id not in paths]
     return [*map(str, world.collisions), *(f"shard {shard} does not agree" for shard in at_odds), *ghosts]
 
 

@@ -12,7 +12,7 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.holdings import Tell, part_of
-from swarm.wire.messages.traffic import Granted, Held, HostState, Left, Number, Stored, Table, Word
+from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Left, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.member import AskPromises
 from vehicle_agent.traffic.right_of_way_core import Action
@@ -30,21 +30,24 @@ class Thief(Process):
 
     def __init__(self, world: ThiefWorld, agent: str, disk: Disk) -> None:
         self.past = []
+        self.lies_often = world.chance.choice((0.1, 0.4, 1.0))
         super().__init__(world, agent, disk)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
             if isinstance(action, Table):
                 self.past = [*self.past[-20:], action]
-            if isinstance(action, Table) and self.chance.random() < 0.5:
+            if not self.lies(0.4):
+                super().perform([action])
+            elif isinstance(action, Table):
                 self.tell(self.lied_about(action))
-            elif isinstance(action, Tell) and self.chance.random() < 0.3:
+            elif isinstance(action, Tell):
                 super().perform([Tell((member,), self.misstated(action.standing)) for member in action.members])
-            elif isinstance(action, Left) and self.chance.random() < 0.3:
+            elif isinstance(action, Left):
                 super().perform([replace(action, entries=[*action.entries, *self.world.entries()][:16])])
-            elif isinstance(action, Stored) and self.chance.random() < 0.3:
+            elif isinstance(action, Stored):
                 super().perform([replace(action, seq=action.seq + self.chance.choice((-1, 1, 100)))])
-            elif isinstance(action, Word) and self.chance.random() < 0.3:
+            elif isinstance(action, Word):
                 super().perform([replace(action, seq=action.seq + 5, asks=True, lacks=self.any_of(action))])
             else:
                 super().perform([action])
@@ -53,10 +56,13 @@ class Thief(Process):
     def chance(self) -> random.Random:
         return self.world.chance
 
+    def lies(self, share: float) -> bool:
+        return self.chance.random() < share * self.lies_often
+
     def tick(self) -> None:
         super().tick()
         for shard, member in self.rights._members.items():
-            if self.chance.random() < 0.5:
+            if self.lies(0.5):
                 epochs = range(member.promised + 1, member.promised + 1 + len(self.world.shards.members(shard)))
                 ours = next(epoch for epoch in epochs if self.world.shards.leader(shard, epoch) == self.agent)
                 epoch = ours + self.chance.choice(_EPOCHS) * len(epochs)
@@ -71,7 +77,7 @@ class Thief(Process):
     def hear_claim(self, shard: int, epoch: int) -> list[Action]:
         """Votes for all, twice, and for a table of its own."""
         actions = super().hear_claim(shard, epoch)
-        if self.chance.random() < 0.5:
+        if not self.lies(0.5):
             return actions
         stored = self.rights._members[shard].stored if shard in self.rights._members else None
         return actions if stored is None else [replace(self.lied_about(stored), epoch=max(epoch - 4, 1), seq=9)]
@@ -81,22 +87,46 @@ class Thief(Process):
         member = self.rights._members.get(table.shard)
         if table.since is not None and member is not None:
             table = member.stored
-        lie = self.chance.choice(
-            (self.stolen_from, self.stolen_from, self.added_to, self.dropped_from, self.reordered, self.replayed)
-        )
+        lies = (self.stolen_from, self.stolen_from, self.added_to, self.dropped_from, self.reordered, self.replayed)
+        lie = self.chance.choice((*lies, self.fenced, self.renamed))
         told, bases = lie(table), [] if member is None else [*member._bases.values()]
         bases = [base for base in bases if base.epoch == told.epoch]
         return told.changes(self.chance.choice(bases)) if bases and self.chance.random() < 0.5 else told
 
     def added_to(self, table: Table) -> Table:
-        """Free cells are given to a vehicle of its own, of another, or to one that does not exist."""
+        """Cells are given to a vehicle of its own, of another, or to one that does not exist: free ones, any, those
+        that it has already, or entries that it has left; after those that it has, or before."""
         taken = {number[0] for path in table.grants.values() for number in path}
-        free = [cell for cell in range(self.world.grid.cells) if self.world.shards.of(cell) == table.shard]
-        free = [cell for cell in free if cell not in taken]
+        cells = range(self.world.grid.cells)
+        free = [cell for cell in cells if self.world.shards.of(cell) == table.shard and cell not in taken]
         vehicle = self.chance.choice((f"{self.agent}-00", f"{self.agent}-77", "ghost-00", *table.grants))
-        more = self.chance.sample(free, min(self.chance.choice((1, 2, 20)), len(free)))
-        path = [*table.grants.get(vehicle, ()), *((cell, table.epoch, table.seq) for cell in more)]
+        path = [*table.grants.get(vehicle, ())]
+        left = [number for old in self.past for number in old.grants.get(vehicle, ())]
+        fresh = [(cell, table.epoch, table.seq) for cell in self.chance.choice((free, cells, [*taken]))]
+        fresh = self.chance.choice((fresh, fresh, fresh, left))
+        more = self.chance.sample(fresh, min(self.chance.choice((1, 2, 20)), len(fresh)))
+        path = self.chance.choice(([*path, *more], [*more, *path]))[:64]
         return replace(table, grants={**table.grants, vehicle: Held.of(path)}) if path else table
+
+    def fenced(self, table: Table) -> Table:
+        """Entries of a vehicle are those of an earlier generation of a host, which may be another's, or never
+        was."""
+        if not table.grants or not table.hosts:
+            return table
+        vehicle = self.chance.choice(sorted(table.grants))
+        host = self.chance.choice((agent_of(vehicle), agent_of(vehicle), *sorted(table.hosts)))
+        generation = max(table.hosts.get(host, (1, 1))[0] - self.chance.choice((0, 1, 1 << 32)), 0)
+        dead = [*(process.disk.own.generations for process in self.world.processes if process.agent == host), []][0]
+        fence = Fence(host, self.chance.choice((generation, *dead)), {vehicle: table.grants[vehicle]})
+        kept = {id: path for id, path in table.grants.items() if id != vehicle}
+        return replace(table, grants=kept, fences=[*table.fences, fence])
+
+    def renamed(self, table: Table) -> Table:
+        """Other statements count, or none; or it was agreed after a certificate which is not revoked."""
+        if self.chance.random() < 0.5:
+            hosts = {name: (generation, 1) for name, (generation, _) in table.hosts.items()}
+            return replace(table, hosts=self.chance.choice((hosts, {})))
+        return replace(table, without={self.chance.choice([*self.world.spawns]): self.chance.choice((0, 1))})
 
     def dropped_from(self, table: Table) -> Table:
         """Some vehicles have no entry."""
@@ -130,7 +160,7 @@ class Thief(Process):
 
     def stolen_from(self, table: Table) -> Table:
         """The table, in which a vehicle of one host is given a cell of another."""
-        shards, free = self.world.shards, Orders(table)
+        free = Orders(table)
         thefts: list[tuple[str, Number]] = []
         for vehicle, path in table.grants.items():
             for cell in self.world.next_to([*path.cells][-1]):
@@ -153,7 +183,6 @@ class Thief(Process):
             hosts[agent_of(owner)] = hosts[agent_of(owner)][0], 1 << 40
         first = (stolen[0], 0, 0) if how == 0 else (stolen[0], table.epoch, table.seq)  # before it, or after it
         grants[vehicle] = [*grants[vehicle], first]
-        assert shards.of(stolen[0]) == table.shard
         return replace(table, grants={id: Held.of(path) for id, path in grants.items() if path}, hosts=hosts)
 
     def any_of(self, word: Word) -> list[Number]:
@@ -181,7 +210,7 @@ class Thief(Process):
         (grants, waits), generation = Orders(table).granted(host), table.hosts.get(host, (0, 0))[0]
         if self.chance.random() < 0.2:
             waits = {}
-        stamp = {"epoch": table.epoch, "seq": table.seq}
+        stamp = {"epoch": table.epoch, "seq": max(table.seq + self.chance.choice((0, 0, 0, -1, -5, 100)), 1)}
         yield Granted(
             shard=table.shard,
             host=host,

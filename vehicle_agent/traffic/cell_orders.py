@@ -203,12 +203,11 @@ class Orders:
         if begins and known:
             self._fence(host, known)
         self.remove(host, holds, knows)
-        earlier = [of for (of_host, _), of in reversed(self.fenced.items()) if of_host == host]
-        for vehicle in (
-            {vehicle: None for of in earlier for vehicle in of} if begins and generation not in dead else ()
-        ):
+        earlier = [(each, of) for (of_host, each), of in reversed(self.fenced.items()) if of_host == host]
+        anew = [of for each, of in earlier if begins or each in dead] if generation not in dead else []
+        for vehicle in {vehicle: None for of in anew for vehicle in of}:
             if vehicle not in self.of and vehicle not in bodies and not holds.get(vehicle):
-                self._begin(vehicle, next(of[vehicle] for of in earlier if vehicle in of), fresh)
+                self._begin(vehicle, next(of[vehicle] for of in anew if vehicle in of), fresh)
         for each in dead:
             self._open(host, each, bodies, holds)
         return begins or any(earlier)
@@ -231,9 +230,8 @@ class Orders:
         Those of vehicles that are to begin from there must not wait: two such vehicles would wait for each other.
         """
         for vehicle, entries in self.fenced.pop((host, generation), {}).items():
-            held = {*holds.get(vehicle, ())}
-            here = [entry for entry in entries if entry in held]
-            here = here or [entry for entry in entries if entry[0] == bodies.get(vehicle)][:1]
+            held, body = {*holds.get(vehicle, ())}, bodies.get(vehicle)
+            here = [entry for entry in entries if entry in held or entry[0] == body]
             self._fences.difference_update(entries)
             for entry in entries:
                 if entry not in here:

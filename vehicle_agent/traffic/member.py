@@ -124,7 +124,7 @@ class Member:
         self._me = me
         self._fleets = fleets
         self._members = shards.members(self.shard)
-        self._witness = Witness(me, fleets) if shards.proven else None
+        self._witness = Witness(me, shards, fleets) if shards.proven else None
         self._others = tuple(member for member in self._members if member != me)
         self._revoked: dict[str, int] = {}
         """Agent -> number of its newest revoked certificate."""
@@ -150,17 +150,16 @@ class Member:
 
     # --- timeouts -------------------------------------------------------------------------------------------
 
-    @property
-    def _distrusted(self) -> list[str]:
-        """The agent with a revoked name, until the table on file was agreed without it. At most one lies at a time:
+    def _distrusts(self, table: Table) -> list[str]:
+        """Returns the agent with a revoked name, if a table was not agreed without it. At most one lies at a time:
         of several the others have new certificates, and state what is on their files."""
-        without = self.stored.without
-        names = [name for name, number in self._revoked.items() if number > without.get(name, 0)]
+        without = table.without
+        names = [id for id, number in self._revoked.items() if number > without.get(id, 0) and id != self._me]
         return names[:0] if self._witness is None else names[-self._shards.liars :]
 
     @property
     def _trusted(self) -> set[str]:
-        return {*self._others}.difference(self._distrusted)
+        return {*self._others}.difference(self._distrusts(self.stored))
 
     @property
     def _lease_ns(self) -> int:
@@ -190,8 +189,8 @@ class Member:
     def revoke(self, names: Mapping[str, int], now_ns: int) -> None:
         """Certificates of these agents up to a number are revoked: by what they said as a member or a host, others
         may have different tables on file."""
-        self._revoked.update((name, number) for name, number in names.items() if name != self._me)
-        if not self._distrusted:
+        self._revoked.update(names)
+        if not self._distrusts(self.stored):
             return
         self.leader = None  # all begin again with what they have
         self._led_until_ns, self._due_ns = now_ns, now_ns + self._turn_ns()
@@ -260,21 +259,17 @@ class Member:
     def _accepts(self, table: Table) -> bool:
         """Returns True if a leader's table may replace ours. At most one lies: once it is known, others are
         trusted, but for what a host has said to us itself."""
+        before, without = self.stored.without, table.without
         if self._witness is None:
             return True
-        before, distrusted = self.stored.without, self._distrusted
-        if any(table.without.get(name, 0) < number for name, number in before.items()):
+        if any(without.get(name, 0) < number for name, number in before.items()):
             return False
-        if table.without == before:
+        new = [name for name, number in without.items() if number > before.get(name, 0)]
+        if not new:
             return self._witness.accepts(self.stored, table)
-        return (
-            all(
-                number <= max(before.get(name, 0), self._revoked.get(name, 0))
-                for name, number in table.without.items()
-            )
-            and table.agent not in distrusted
-            and not self._witness.contradicts(table, distrusted)
-        )
+        known = all(without[name] <= self._revoked.get(name, 0) for name in new)
+        distrusted = self._distrusts(self.stored)
+        return known and table.agent not in distrusted and not self._witness.contradicts(table, distrusted)
 
     def _words(self, now_ns: int) -> list[MemberAction]:
         """Returns our words to hosts, where these need more than the leader's."""
@@ -389,14 +384,15 @@ class Member:
         return self._bases.get(min(has)) if has else None
 
     def _take_charge(self, now_ns: int) -> None:
-        distrusted = self._distrusted
+        distrusted = self._distrusts(self.stored)
         promises = [table for member, table in self._promises.items() if member not in distrusted]
         if self.leader is not None or len(promises) < self._shards.majority:
             return
         known = sorted(promises, key=lambda table: table.stamp, reverse=True)
         found: Table | None = known[0]
         if distrusted:
-            found = agreed(promises)
+            # If none has a later table than one that was agreed, others go on from that, and some have it on file.
+            found = agreed(promises) if self._distrusts(known[0]) else known[0]
         elif self._witness is not None:
             # A table that a thief told one member comes last, but a host that lies must not rule out all. If none
             # is accepted, hosts are asked for what the first lacks.

@@ -44,8 +44,8 @@ _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
 TABLES_KEPT = 16
 """More than may be on the way at once: an older one is never asked for."""
-MOST_CELLS = 64
-"""Limit for one vehicle: the largest `Grant`."""
+MOST_CELLS = 42
+"""Limit for one vehicle. Entries on two of three files are at most 63 then, as many as a `Held` takes."""
 
 
 def _turn(stand: Stand) -> tuple[int, int, str]:

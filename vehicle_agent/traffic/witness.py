@@ -8,7 +8,7 @@ tables agree again once its name is revoked (docs/design/right-of-way.md).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 
@@ -19,26 +19,33 @@ from swarm.right_of_way.entries import BEFORE_ALL
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.incarnations import is_said
+from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import MOST_CELLS, SILENT_NS, exceeds_externals, is_entering
 
+_Entries = dict[Number, tuple[str, int]]
 _MOST_LACKED = 64
 """Entries that one word asks for; the next asks for more."""
 
 
-def _listed(table: Table) -> dict[Number, tuple[str, int]] | None:
-    """Returns number -> its vehicle, and the generation of its host; None if a number is there twice, or a fence of
-    one host has a vehicle of another."""
-    if any(agent_of(vehicle) != fence.agent for fence in table.fences for vehicle in fence.entries):
-        return None
-    of = [(agent_of(vehicle), vehicle, numbers) for vehicle, numbers in table.grants.items()]
-    each = [(table.hosts.get(host, BEFORE_ALL)[0], vehicle, numbers) for host, vehicle, numbers in of]
-    each += [
-        (fence.generation, vehicle, numbers) for fence in table.fences for vehicle, numbers in fence.entries.items()
-    ]
-    found = {number: (vehicle, generation) for generation, vehicle, numbers in each for number in numbers}
-    return found if len(found) == sum(len(numbers) for _, _, numbers in each) else None
+def _listed(table: Table) -> _Entries | None:
+    """Returns number -> its vehicle, and the generation of its host. None if no leader makes such a table: a number
+    is there twice, a vehicle has two entries of one cell, or a fence is not of an earlier generation of the host of
+    its vehicles, or not the only one of it."""
+    counted = {host: generation for host, (generation, _) in table.hosts.items()}
+    fences = {(fence.agent, fence.generation): fence.entries for fence in table.fences}
+    each = [(id, counted.get(agent_of(id), 0), of) for id, of in table.grants.items()]
+    each += [(id, generation, of) for (_, generation), entries in fences.items() for id, of in entries.items()]
+    found = {number: (id, generation) for id, generation, of in each for number in of}
+    places = {(*of, number[0]) for number, of in found.items()}
+    is_made = (
+        len(places) == len(found) == sum(len(of) for *_, of in each)
+        and len(fences) == len(table.fences)
+        and all(0 < generation < counted.get(host, 0) for host, generation in fences)
+        and all(agent_of(id) == host for (host, _), entries in fences.items() for id in entries)
+    )
+    return found if is_made else None
 
 
 def agreed(tables: Collection[Table]) -> Table:
@@ -71,8 +78,7 @@ def agreed(tables: Collection[Table]) -> Table:
     fences: list[Fence] = []
     for (host, generation), of_vehicles in entries.items():
         ordered = {
-            id: Held.of(sorted(numbers, key=lambda number: number[1:])[-MOST_CELLS:])
-            for id, numbers in of_vehicles.items()
+            id: Held.of(sorted(numbers, key=lambda number: number[1:])) for id, numbers in of_vehicles.items()
         }
         if generation == hosts.get(host, BEFORE_ALL)[0]:
             grants.update(ordered)
@@ -89,8 +95,8 @@ class _Host:
     newest       (generation, sequence) of the newest
     generations  generation -> the newest table that it knows, the entries that it holds, and those that it never
                  takes
-    there        (vehicle, cell) of the cells that its newest generation holds, or states a vehicle to be on; with
-                 whether it holds an entry there
+    there        (vehicle, cell) that its newest generation holds, or states a vehicle to be on -> whether it holds
+                 an entry there
     ended        generations that have ended, the newest ones
     told         the last word to it, and its time
     """
@@ -114,32 +120,35 @@ class _Host:
             held = frozenset(number for stand in standing.vehicles for number in stand.holds)
             self.generations[standing.generation] = standing.knows, held, standing.never
             self.there = {(stand.vehicle, stand.cell): False for stand in standing.vehicles if is_entering(stand)}
-            self.there.update(
-                ((each.vehicle, cell), True) for each in standing.vehicles for cell in each.holds.cells
-            )
+            held_cells = ((each.vehicle, cell) for each in standing.vehicles for cell in each.holds.cells)
+            self.there.update(dict.fromkeys(held_cells, True))
             for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
                 del self.generations[old]
 
-    def is_over(self, number: Number, vehicle: str, generation: int, first: str | None, *, begins: bool) -> bool:
+    @property
+    def held(self) -> frozenset[Number]:
+        """The entries that its newest generation holds."""
+        return self.generations[self.newest[0]][1] if self.generations else frozenset()
+
+    def is_over(self, number: Number, vehicle: str, generation: int, *, begins: bool) -> bool:
         """Returns True if this host said that an entry of a generation of it is over. Generation 0 is the run's
         start, of which the entries belong to the first generation that a table counts.
 
-        An entry of an ended generation is over if the newest states the vehicle elsewhere, or the table has it
-        begin elsewhere. Where the newest has the vehicle, the entry passes to it, and only its word ends that; or,
-        before it holds any there, another entry of the vehicle which is the first of the cell.
+        An entry of an ended generation passes to the newest if that states the vehicle to be on the cell: only its
+        word ends it then, once it holds an entry there. Otherwise it is over once the vehicle is elsewhere, or
+        begins again.
 
-        first   the vehicle of the cell's first entry in the table which omits this one
-        begins  whether the vehicle has entries in that
+        begins  whether the vehicle has entries in the table that omits this one
         """
-        if generation in self.ended:
-            holds = self.there.get((vehicle, number[0]))
-            elsewhere = begins or self.newest[0] in self.ended or any(vehicle == of for of, _ in self.there)
-            if elsewhere if holds is None else not holds and first == vehicle:
-                return True
-        own = [generation, self.newest[0]] if generation in self.ended else [generation]
-        generations = [of for each, of in self.generations.items() if each in own or not generation]
+        is_ended, holds = generation in self.ended, self.there.get((vehicle, number[0]))
+        begins = begins or self.newest[0] in self.ended or any(vehicle == of for of, _ in self.there)
+        if is_ended and begins and holds is None:
+            return True
+        own = {generation, self.newest[0]} if is_ended and holds is not False else {generation}
         return any(
-            (number[1:] <= knows and number not in held) or number in never for knows, held, never in generations
+            (number[1:] <= knows and number not in held) or number in never
+            for of, (knows, held, never) in self.generations.items()
+            if of in own or not generation
         )
 
 
@@ -149,8 +158,9 @@ class Witness:
     fleets  agent -> its vehicles, all of the scenario's
     """
 
-    def __init__(self, me: str, fleets: Mapping[str, Collection[str]]) -> None:
+    def __init__(self, me: str, shards: Shards, fleets: Mapping[str, Collection[str]]) -> None:
         self._me = me
+        self._shards = shards
         self._fleets = fleets
         self._hosts: dict[str, _Host] = {}
         self._of: Table | None = None
@@ -168,6 +178,9 @@ class Witness:
         was, lists = _listed(old), _listed(new)
         if was is None or lists is None:
             return False
+        added = [(number, each) for number, each in lists.items() if was.get(number) != each]
+        if not self._may_follow(old, new) or (added and not self._may_have(added, lists, new)):
+            return False
         self._lacks = {
             host: []
             for host, said in new.hosts.items()
@@ -176,55 +189,78 @@ class Witness:
         # A vehicle of which all generations have ended before a table counted one begins in its cell again.
         begins = {(number[0], each[0]): number for number, each in lists.items() if number not in was}
         last: dict[int, Number] = {}
-        first = {number[0]: lists[number][0] for number in sorted(lists, reverse=True)}
         for number, (vehicle, generation) in was.items():
             found, host = lists.get(number), agent_of(vehicle)
-            if found == (vehicle, generation) or (
-                found is not None
-                and self._passes((vehicle, generation), found[0], number)
-                and (not generation or generation in self._hosts[host].ended)
-            ):
+            if found == (vehicle, generation) or self._passes((vehicle, generation), found, number):
                 last[number[0]] = max(number, last.get(number[0], number))
             elif host not in self._hosts:
                 self._lacks.setdefault(host, []).append(number)
             elif not generation and self._hosts[host].ended and (number[0], vehicle) in begins:
                 last[number[0]] = max(number, last.get(number[0], number))
-            elif not self._hosts[host].is_over(
-                number, vehicle, generation, first.get(number[0]), begins=vehicle in new.grants
-            ):
+            elif not self._hosts[host].is_over(number, vehicle, generation, begins=vehicle in new.grants):
                 self._lacks.setdefault(host, []).append(number)
-        added = [(number, each) for number, each in lists.items() if was.get(number) != each]
-        for _, (vehicle, _) in added:
+        for _, (vehicle, generation) in added:
             host = agent_of(vehicle)
-            if vehicle not in self._fleets.get(host, (vehicle,)):
-                return False
-            if host not in self._hosts or self._hosts[host].newest == BEFORE_ALL:
+            known = self._hosts.get(host)
+            if known is None or known.newest == BEFORE_ALL or generation not in self._generations(host, old, new):
                 self._lacks.setdefault(host, [])  # not which cells it requested: it gives others back by itself
-        if added and exceeds_externals(new, self._fleets):
-            return False
-        ordered = all(
-            (number > last.get(number[0], ()) and number[1:] <= new.stamp)
-            or self._passes(was.get(number), vehicle, number)
-            for number, (vehicle, _) in added
+        # An earlier number that is new here was left, and its host has told others so, unless it still holds it.
+        return not self._lacks and all(
+            (
+                number > last.get(number[0], ())
+                and number[1:] <= new.stamp
+                and (old.stamp < number[1:] or number in self._hosts[agent_of(each[0])].held)
+            )
+            or self._passes(was.get(number), each, number)
+            for number, each in added
         )
-        return ordered and not self._lacks
 
-    def _passes(self, before: tuple[str, int] | None, vehicle: str, number: Number) -> bool:
+    def _may_follow(self, old: Table, new: Table) -> bool:
+        """Returns True if a table counts no earlier generations than the one before it, and where it counts another
+        one, has no fence of a generation which that says to have ended: such entries pass, or are over."""
+        before = {host: generation for host, (generation, _) in old.hosts.items()}
+        after = {host: generation for host, (generation, _) in new.hosts.items()}
+        return all(generation <= after.get(host, 0) for host, generation in before.items()) and not any(
+            before.get(fence.agent) != after[fence.agent]
+            and fence.agent in self._hosts
+            and fence.generation in self._hosts[fence.agent].ended
+            for fence in new.fences
+        )
+
+    def _may_have(self, added: Iterable[tuple[Number, tuple[str, int]]], lists: _Entries, new: Table) -> bool:
+        """Returns True if additions are cells of the shard, for vehicles that there are, and no more than leaders
+        grant."""
+        counts = Counter(lists.values())
+        return not exceeds_externals(new, self._fleets) and all(
+            self._shards.of(number[0]) == new.shard
+            and each[0] in self._fleets.get(agent_of(each[0]), each)
+            and counts[each] <= MOST_CELLS
+            for number, each in added
+        )
+
+    def _generations(self, host: str, *tables: Table) -> set[int]:
+        """Returns the generations that a host is known to have had."""
+        known = self._hosts[host]
+        counted = {table.hosts.get(host, BEFORE_ALL)[0] for table in tables}
+        return counted.union(known.ended, known.generations)
+
+    def _passes(self, before: tuple[str, int] | None, after: tuple[str, int] | None, number: Number) -> bool:
         """Returns True if an entry may pass to a newer generation of its host at its place in the order: the run's
-        first, or one that states the vehicle to be on the cell. All others may have been left."""
-        if before is None or before[0] != vehicle:
+        first, or one of an ended generation where the newest states the vehicle to be on the cell. All others may
+        have been left."""
+        if before is None or after is None or before[0] != after[0]:
             return False
-        host = self._hosts.get(agent_of(vehicle))
-        return not before[1] or (host is not None and (vehicle, number[0]) in host.there)
+        host = self._hosts.get(agent_of(before[0]))
+        is_there = host is not None and before[1] in host.ended and (before[0], number[0]) in host.there
+        return is_there or not before[1]
 
     def contradicts(self, table: Table, distrusted: Collection[str] = ()) -> bool:
         """Returns True if a trusted host held an entry which a table omits, by a statement no older than the one
         that the table counts: no majority has it on file."""
         lists = _listed(table) or {}
         return any(
-            not held.issubset(lists)
+            not host.held <= lists.keys()
             for name, host in self._hosts.items()
-            for _, held, _ in [host.generations.get(host.newest[0], (BEFORE_ALL, frozenset(), []))]
             if name not in distrusted and table.hosts.get(name, BEFORE_ALL) <= host.newest
         )
 
