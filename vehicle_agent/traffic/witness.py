@@ -140,15 +140,16 @@ class _Host:
 
         begins  whether the vehicle has entries in the table that omits this one
         """
-        is_ended, holds = generation in self.ended, self.there.get((vehicle, number[0]))
+        is_ended = generation in self.ended or (not generation and bool(self.ended))
+        holds = self.there.get((vehicle, number[0]))
         begins = begins or self.newest[0] in self.ended or any(vehicle == of for of, _ in self.there)
         if is_ended and begins and holds is None:
             return True
-        own = {generation, self.newest[0]} if is_ended and holds is not False else {generation}
+        own = {generation, self.newest[0]} if is_ended else {generation}
         return any(
             (number[1:] <= knows and number not in held) or number in never
             for of, (knows, held, never) in self.generations.items()
-            if of in own or not generation
+            if (of in own or not generation) and not (is_ended and holds is False and of == self.newest[0])
         )
 
 
@@ -186,23 +187,20 @@ class Witness:
             for host, said in new.hosts.items()
             if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
         }
-        # A vehicle of which all generations have ended before a table counted one begins in its cell again.
-        begins = {(number[0], each[0]): number for number, each in lists.items() if number not in was}
         last: dict[int, Number] = {}
         for number, (vehicle, generation) in was.items():
             found, host = lists.get(number), agent_of(vehicle)
             if found == (vehicle, generation) or self._passes((vehicle, generation), found, number):
                 last[number[0]] = max(number, last.get(number[0], number))
-            elif host not in self._hosts:
-                self._lacks.setdefault(host, []).append(number)
-            elif not generation and self._hosts[host].ended and (number[0], vehicle) in begins:
-                last[number[0]] = max(number, last.get(number[0], number))
-            elif not self._hosts[host].is_over(number, vehicle, generation, begins=vehicle in new.grants):
+            elif (known := self._hosts.get(host)) is None or not known.is_over(
+                number, vehicle, generation, begins=vehicle in new.grants
+            ):
                 self._lacks.setdefault(host, []).append(number)
         for _, (vehicle, generation) in added:
             host = agent_of(vehicle)
             known = self._hosts.get(host)
-            if known is None or known.newest == BEFORE_ALL or generation not in self._generations(host, old, new):
+            counted = old.hosts.get(host, BEFORE_ALL)[0], new.hosts.get(host, BEFORE_ALL)[0]
+            if not known or not known.generations or generation not in {*counted, *known.ended, *known.generations}:
                 self._lacks.setdefault(host, [])  # not which cells it requested: it gives others back by itself
         # An earlier number that is new here was left, and its host has told others so, unless it still holds it.
         return not self._lacks and all(
@@ -237,12 +235,6 @@ class Witness:
             and counts[each] <= MOST_CELLS
             for number, each in added
         )
-
-    def _generations(self, host: str, *tables: Table) -> set[int]:
-        """Returns the generations that a host is known to have had."""
-        known = self._hosts[host]
-        counted = {table.hosts.get(host, BEFORE_ALL)[0] for table in tables}
-        return counted.union(known.ended, known.generations)
 
     def _passes(self, before: tuple[str, int] | None, after: tuple[str, int] | None, number: Number) -> bool:
         """Returns True if an entry may pass to a newer generation of its host at its place in the order: the run's
