@@ -140,8 +140,7 @@ class _Host:
 
         begins  whether the vehicle has entries in the table that omits this one
         """
-        is_ended = generation in self.ended or (not generation and bool(self.ended))
-        holds = self.there.get((vehicle, number[0]))
+        is_ended, holds = generation in self.ended, self.there.get((vehicle, number[0]))
         begins = begins or self.newest[0] in self.ended or any(vehicle == of for of, _ in self.there)
         if is_ended and begins and holds is None:
             return True
@@ -149,7 +148,7 @@ class _Host:
         return any(
             (number[1:] <= knows and number not in held) or number in never
             for of, (knows, held, never) in self.generations.items()
-            if (of in own or not generation) and not (is_ended and holds is False and of == self.newest[0])
+            if (of in own or not generation) and not (self.ended and holds is False and of == self.newest[0])
         )
 
 
@@ -187,14 +186,16 @@ class Witness:
             for host, said in new.hosts.items()
             if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
         }
+        # A vehicle of which all generations have ended before a table counted one begins in its cell again.
+        begins = {(number[0], each[0]) for number, each in added if number not in was}
         last: dict[int, Number] = {}
         for number, (vehicle, generation) in was.items():
             found, host = lists.get(number), agent_of(vehicle)
-            if found == (vehicle, generation) or self._passes((vehicle, generation), found, number):
+            known = self._hosts.get(host)
+            anew = not generation and known is not None and known.ended and (number[0], vehicle) in begins
+            if anew or found == (vehicle, generation) or self._passes((vehicle, generation), found, number):
                 last[number[0]] = max(number, last.get(number[0], number))
-            elif (known := self._hosts.get(host)) is None or not known.is_over(
-                number, vehicle, generation, begins=vehicle in new.grants
-            ):
+            elif known is None or not known.is_over(number, vehicle, generation, begins=vehicle in new.grants):
                 self._lacks.setdefault(host, []).append(number)
         for _, (vehicle, generation) in added:
             host = agent_of(vehicle)
@@ -205,7 +206,8 @@ class Witness:
         # An earlier number that is new here was left, and its host has told others so, unless it still holds it.
         return not self._lacks and all(
             (
-                number > last.get(number[0], ())
+                number not in was
+                and number > last.get(number[0], ())
                 and number[1:] <= new.stamp
                 and (old.stamp < number[1:] or number in self._hosts[agent_of(each[0])].held)
             )

@@ -120,7 +120,7 @@ def test_no_external_vehicle_and_not_all_together_take_all_cells(monkeypatch: py
         )
         leader.tick(0)
     table = leader.tick(1 << 40)
-    assert len(table.grants["rover-00"]) == 64
+    assert len(table.grants["rover-00"]) == leaders.MOST_CELLS
     decode(encode(table), Table)
 
     monkeypatch.setattr(leaders, "MOST_CELLS_OF_EXTERNAL", 3)
