@@ -10,14 +10,16 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 
+import msgspec
 import pytest
+from support.shard_tables import GRID, MEMBERS, holdings_of, standing
 from support.thief import ThiefWorld
 from support.traffic_world import Faults, TrafficWorld, random_faults
 
 from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.traffic import HostState
+from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
 from vehicle_agent.traffic import member
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.witness import Witness, _Host
@@ -139,3 +141,53 @@ def test_a_host_disclaims_no_entry_of_a_cell_on_which_its_body_is() -> None:
     host.enter("a0-00", 7)
     host.disclaim(0, "thief", (3, 9), [(7, 3, 2), (8, 3, 2)])
     assert host.never(0) == {(8, 3, 2)}
+
+
+FIRST, SECOND, MANY = 1 << 32, 2 << 32, [(cell, 1, 6) for cell in range(21, 63)]
+OLD = Table(
+    shard=0, agent="a3", epoch=1, seq=5, hosts={"a0": (FIRST, 1), "a1": (FIRST, 1)},
+    grants={"a0-00": Held.of([(9, 1, 1)]), "a1-00": Held.of([(20, 1, 1)])},
+)  # fmt: skip
+"""a0 has started again, and a0-00 is on cell 9; a1 holds cell 20."""
+LIES: dict[str, dict[str, object]] = {
+    "an entry on which a body is passes": {"a0-00": [(12, 1, 6)]},
+    "a number stays with its vehicle": {"a0-00": [(9, 1, 1), (20, 1, 1)], "a1-00": [(21, 1, 6)]},
+    "one entry of a cell": {"a1-00": [(20, 1, 1), (20, 1, 6)]},
+    "cells of the shard": {"a1-00": [(20, 1, 1), (64, 1, 6)]},
+    "no number that was left": {"a1-00": [(20, 1, 1), (21, 1, 4)]},
+    "as many as fit": {"a1-00": [(20, 1, 1), *MANY]},
+    "no entry of a fence is left": {"a0-00": [], "fences": [Fence("a0", FIRST, OLD.grants)]},
+    "a fence is of one host": {"a0-00": [], "fences": [Fence("a1", 1, {"a0-00": OLD.grants["a0-00"]})]},
+    "a fence is of a start that was": {"fences": [Fence("a1", 1, {"a1-00": Held.of([(21, 1, 6)])})]},
+    "one fence of a start": {"fences": [Fence("a1", 1, {}), Fence("a1", 1, {})]},
+    "starts count on": {"hosts": {"a0": (SECOND, 1)}},
+}
+
+
+@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+def test_a_member_stores_no_table_that_breaks_a_rule(lie: dict[str, object]) -> None:
+    shards = Shards(GRID, ["a0", "a1", "a2", "a3"], proven=True)
+    witness = Witness("a2", shards, {f"a{n}": [f"a{n}-00"] for n in range(4)})
+    entering = Stand("a0-00", 9, 9, Held(), [9], [], 0, 0)
+    witness.hear_host_state(standing("a1", [(20, 1, 1)], 1, generation=FIRST, knows=(1, 5)), 0)
+    witness.hear_host_state(standing("a0", [(9, 1, 1)], 1, generation=SECOND, vehicles=[entering], dead=[FIRST]), 0)
+    true = msgspec.structs.replace(OLD, seq=6, hosts={"a0": (SECOND, 1), "a1": (FIRST, 1)})
+    assert witness.accepts(OLD, true)
+    told = {id: Held.of(numbers) for id, numbers in lie.items() if id in OLD.grants}  # type: ignore[arg-type]
+    said = {name: value for name, value in lie.items() if name not in OLD.grants}
+    grants = {id: held for id, held in {**OLD.grants, **told}.items() if held}
+    assert not witness.accepts(OLD, msgspec.structs.replace(true, grants=grants, **said))  # type: ignore[arg-type]
+
+
+def test_a_host_disclaims_nothing_while_a_vehicle_is_nowhere() -> None:
+    """A liar may ask before the grant of the entry by which it begins: it would not take that."""
+    holdings = holdings_of()
+    holdings.hear_word(
+        Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
+    )
+    assert not holdings._entries.never(0)
+    holdings.enter("a0-00", 9)
+    holdings.hear_word(
+        Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
+    )
+    assert holdings._entries.never(0) == {(7, 3, 2)}
