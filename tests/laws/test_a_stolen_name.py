@@ -145,10 +145,11 @@ def test_a_host_disclaims_no_entry_of_a_cell_on_which_its_body_is() -> None:
 
 FIRST, SECOND, MANY = 1 << 32, 2 << 32, [(cell, 1, 6) for cell in range(21, 63)]
 OLD = Table(
-    shard=0, agent="a3", epoch=1, seq=5, hosts={"a0": (FIRST, 1), "a1": (FIRST, 1)},
+    shard=0, agent="a3", epoch=1, seq=5, hosts={"a0": (FIRST, 1), "a1": (SECOND, 1), "a2": (FIRST, 1)},
     grants={"a0-00": Held.of([(9, 1, 1)]), "a1-00": Held.of([(20, 1, 1)])},
 )  # fmt: skip
-"""a0 has started again, and a0-00 is on cell 9; a1 holds cell 20."""
+"""a0 has started again, and a0-00 is on cell 9; a1 holds cell 20, and its first start may go on."""
+ON_9, ON_21 = {"a0-00": OLD.grants["a0-00"]}, {"a1-00": Held.of([(21, 1, 6)])}
 LIES: dict[str, dict[str, object]] = {
     "an entry on which a body is passes": {"a0-00": [(12, 1, 6)]},
     "a number stays with its vehicle": {"a0-00": [(9, 1, 1), (20, 1, 1)], "a1-00": [(21, 1, 6)]},
@@ -156,11 +157,13 @@ LIES: dict[str, dict[str, object]] = {
     "cells of the shard": {"a1-00": [(20, 1, 1), (64, 1, 6)]},
     "no number that was left": {"a1-00": [(20, 1, 1), (21, 1, 4)]},
     "as many as fit": {"a1-00": [(20, 1, 1), *MANY]},
-    "no entry of a fence is left": {"a0-00": [], "fences": [Fence("a0", FIRST, OLD.grants)]},
-    "a fence is of one host": {"a0-00": [], "fences": [Fence("a1", 1, {"a0-00": OLD.grants["a0-00"]})]},
-    "a fence is of a start that was": {"fences": [Fence("a1", 1, {"a1-00": Held.of([(21, 1, 6)])})]},
-    "one fence of a start": {"fences": [Fence("a1", 1, {}), Fence("a1", 1, {})]},
-    "starts count on": {"hosts": {"a0": (SECOND, 1)}},
+    "vehicles of the host": {"a1-07": [(21, 1, 6)]},
+    "entries of an ended start are in no fence": {"a0-00": [], "fences": [Fence("a0", FIRST, ON_9)]},
+    "a fence is of one host": {"a0-00": [], "fences": [Fence("a1", FIRST, ON_9)]},
+    "a fence is of a start that was": {"fences": [Fence("a1", 1, ON_21)]},
+    "a fence is of an earlier start": {"fences": [Fence("a1", SECOND, ON_21)]},
+    "one fence of a start": {"fences": [Fence("a1", FIRST, {}), Fence("a1", FIRST, {})]},
+    "starts count on": {"hosts": {"a0": (SECOND, 1), "a1": (SECOND, 1)}},
 }
 
 
@@ -169,12 +172,14 @@ def test_a_member_stores_no_table_that_breaks_a_rule(lie: dict[str, object]) -> 
     shards = Shards(GRID, ["a0", "a1", "a2", "a3"], proven=True)
     witness = Witness("a2", shards, {f"a{n}": [f"a{n}-00"] for n in range(4)})
     entering = Stand("a0-00", 9, 9, Held(), [9], [], 0, 0)
-    witness.hear_host_state(standing("a1", [(20, 1, 1)], 1, generation=FIRST, knows=(1, 5)), 0)
-    witness.hear_host_state(standing("a0", [(9, 1, 1)], 1, generation=SECOND, vehicles=[entering], dead=[FIRST]), 0)
-    true = msgspec.structs.replace(OLD, seq=6, hosts={"a0": (SECOND, 1), "a1": (FIRST, 1)})
+    for generation in (FIRST, SECOND):
+        witness.hear_host_state(standing("a1", [(20, 1, 1)], 1, (1, 5), generation=generation), 0)
+    again = {"generation": SECOND, "vehicles": [entering], "dead": [FIRST]}
+    witness.hear_host_state(standing("a0", [(9, 1, 1)], 1, (1, 5), **again), 0)
+    true = msgspec.structs.replace(OLD, seq=6, hosts={**OLD.hosts, "a0": (SECOND, 1)})
     assert witness.accepts(OLD, true)
-    told = {id: Held.of(numbers) for id, numbers in lie.items() if id in OLD.grants}  # type: ignore[arg-type]
-    said = {name: value for name, value in lie.items() if name not in OLD.grants}
+    told = {id: Held.of(numbers) for id, numbers in lie.items() if "-" in id}  # type: ignore[arg-type]
+    said = {name: value for name, value in lie.items() if "-" not in name}
     grants = {id: held for id, held in {**OLD.grants, **told}.items() if held}
     assert not witness.accepts(OLD, msgspec.structs.replace(true, grants=grants, **said))  # type: ignore[arg-type]
 
