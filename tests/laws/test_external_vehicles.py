@@ -135,7 +135,7 @@ def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
 
 def a_cell_that_was_shut_for_a_external_is_anybodys(patch: pytest.MonkeyPatch) -> None:
     opened = Orders._open
-    patch.setattr(Orders, "_open", lambda self, host, generation, bodies: opened(self, host, generation, {}))
+    patch.setattr(Orders, "_open", lambda self, host, each, bodies, holds: opened(self, host, each, {}, {}))
 
 
 def says_of_each_generation_before_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:

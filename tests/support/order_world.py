@@ -200,7 +200,7 @@ class OrderWorld:
                     cells = near or [c for c in range(SIDE * SIDE) if shard_of(c) == shard]
                     if near or chance.random() < 0.3:
                         orders.append(vehicle, chance.choice(cells), fresh)
-        told = orders.table(shard, "member", fresh, {})
+        told = orders.table(shard, "member", fresh, {}, {})
         seat.stamp = fresh
         seat.told = {stamp: table for stamp, table in seat.told.items() if stamp[0] == told.stamp[0]}
         seat.told[told.stamp] = told
