@@ -4,8 +4,6 @@ two vehicles of others meet, and once it is revoked members agree again; each ru
 More histories: `pytest tests/laws/test_a_stolen_name.py -m seeds --seeds 0:2000`.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,8 +3,6 @@ through cuts, false deaths, kills, restarts, rebuilt stores and compaction.
 
 By hand, with more examples: `PYTHONPATH=.:tests python tests/laws/test_acknowledged_marks.py 2000`"""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from typing import Any

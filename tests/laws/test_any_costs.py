@@ -1,7 +1,5 @@
 """Any costs of a map: a tree is exact on them, or the map is refused, and nothing overflows."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Iterator

@@ -1,8 +1,6 @@
 """Planners' claims about their routes hold under every rule, strategy and history; the checks find a false
 claim."""
 
-from __future__ import annotations
-
 import math
 import time
 

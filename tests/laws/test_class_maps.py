@@ -2,8 +2,6 @@
 factors may come, end and leave in any order: the map equals that of a replica which receives the held sets at
 once."""
 
-from __future__ import annotations
-
 import numpy as np
 from support.effort import few
 

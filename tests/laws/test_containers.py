@@ -1,8 +1,6 @@
 """Containers of a plan: each process once and by itself, none as root, keys with their owners. And the example for
 Kubernetes: pods as the standard "restricted" wants them, valid by its schemas."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import re

@@ -1,7 +1,5 @@
 """A deployment plan: every process runs once, standbys and keepers apart, and machines carry what they may."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Replicas that hold a part of the map hear few digests, and miss nothing."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

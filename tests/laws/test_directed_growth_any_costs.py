@@ -1,8 +1,6 @@
 """Uphill differs from downhill: for any cell costs, trees are exact to the last bit and grow in about the same
 time."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable

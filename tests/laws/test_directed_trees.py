@@ -1,7 +1,5 @@
 """Uphill differs from downhill, and some steps are too steep: the laws of the tree under every strategy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

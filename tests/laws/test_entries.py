@@ -2,8 +2,6 @@
 rule that is taken out is found. Every history has two shards with a seam, external vehicles, restarts and second
 lives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ docs/design/external-vehicles.md needs is taken out in turn, and the law must no
 More histories: `pytest tests/laws/test_external_vehicles.py -m seeds --seeds 0:2000`.
 """
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 

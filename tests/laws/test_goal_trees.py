@@ -1,7 +1,5 @@
 """Growths that stop and go on, and the trees kept of them, beside a Dijkstra that knows nothing of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support import slow_twins as naive

@@ -1,8 +1,6 @@
 """Goals of vehicles: every place is reached in its order and none is skipped, whatever is lost, repeated or
 restarted; vehicles which share a place have room around it."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """GRASS, a foreign engine, on the same ground: `r.cost` under its convention, `r.walk` beside Langmuir's rule."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Growth against an independent Dijkstra, on every rule; the same uncompiled and with bounds checks on."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

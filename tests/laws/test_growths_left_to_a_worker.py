@@ -1,8 +1,6 @@
 """On a large map a growth is a worker's. Until it is adopted, answers are of the older tree, keep every law and say
 where they lead."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The law of files: whatever lies in a file that a command reads, it is read, or refused in one sentence with an
 exit code; soon, and with little memory."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

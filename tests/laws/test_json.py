@@ -1,7 +1,5 @@
 """JSON of people and their tools: it says what MessagePack says, and is refused in a sentence where it does not."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json

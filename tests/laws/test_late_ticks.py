@@ -1,7 +1,5 @@
 """Right of way with late ticks: vehicles drive the same distance in a number of ticks, however long these take."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Ground and air vehicles never ask, hold or wait for each other: no process of one layer is in the other."""
 
-from __future__ import annotations
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few

@@ -1,8 +1,6 @@
 """Leadership: at most one leader among those who hear each other, soon one after every fault, no change without
 cause."""
 
-from __future__ import annotations
-
 import heapq
 import random
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 """A mark overrides a learned factor, which overrides the prior, and lethal ground stays lethal. Messages and marks
 may come in any order: all maps that hold the same sets equal the one that is made cell by cell."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,8 +1,6 @@
 """Lies that differ from the truth in one number: who may speak for all agents can stop vehicles, but only while it
 speaks."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

@@ -2,8 +2,6 @@
 
 By hand, as in docs/method/measurements.md: `PYTHONPATH=.:tests python tests/laws/test_map_convergence.py`"""
 
-from __future__ import annotations
-
 import json
 import random
 import sys

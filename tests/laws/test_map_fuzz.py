@@ -2,8 +2,6 @@
 
 By hand, more: MAP_MUTATIONS=1000000 pytest tests/laws/test_map_fuzz.py"""
 
-from __future__ import annotations
-
 import os
 import random
 

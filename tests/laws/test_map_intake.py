@@ -1,7 +1,5 @@
 """Changes of a map may wait for a tree, but no route leads through one that waits, and none waits for long."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest import mock
 

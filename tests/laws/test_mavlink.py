@@ -1,8 +1,6 @@
 """`gateway mavlink` under any events in any order: commands that are never sent to a vehicle, and those that always
 are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A tree made exact through its parents equals the one grown from scratch, whatever was done to it before."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest import mock
 

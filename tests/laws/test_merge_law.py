@@ -1,7 +1,5 @@
 """The merge law: marks come to the same map in any order, grouping and repetition."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 from support.map_strategies import GRID, held_winners, mark_sets, naive_winners, replica_of

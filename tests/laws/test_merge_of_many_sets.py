@@ -1,7 +1,5 @@
 """Many sets at once: the same map, digests and counts as one by one, and as the two rules taken by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

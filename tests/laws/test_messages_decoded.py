@@ -1,7 +1,5 @@
 """The wire: every message is decoded as it was encoded, and no payload at all becomes anything but a message."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

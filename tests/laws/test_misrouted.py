@@ -1,7 +1,5 @@
 """A key is a claim of the transport: a payload counts under the key for which it is meant, and under no other."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 

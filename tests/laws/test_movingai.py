@@ -1,7 +1,5 @@
 """Every problem of the MovingAI benchmarks, where the shared data is at hand: lengths equal the published ones."""
 
-from __future__ import annotations
-
 from decimal import Decimal
 from pathlib import Path
 

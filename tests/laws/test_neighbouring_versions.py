@@ -1,8 +1,6 @@
 """No message is unreadable for a live member of a run of two neighbouring versions, in whatever order all are
 started again (docs/design/wire-format.md)."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """No service raises on a message that `decode` accepts, in any state; after the lies each does its work again."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import random

@@ -1,7 +1,5 @@
 """Obstacles close what they say, as long as they say it: a slow twin knows every report that was ever heard."""
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import dataclass, field

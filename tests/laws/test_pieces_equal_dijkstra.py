@@ -1,8 +1,6 @@
 """A tree of pieces after any moves, jumps and marks: its costs equal scipy's and the cost of driving along the
 parents."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

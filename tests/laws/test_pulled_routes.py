@@ -1,7 +1,5 @@
 """Pulled routes against segments whose crossings are fractions: what they cost, and what they may not touch."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """A repaired tree is the one that would have grown on the new map: every cost, every parent, to the last bit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.kernel_oracle import inner

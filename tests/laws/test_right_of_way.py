@@ -5,8 +5,6 @@ must notice.
 More histories: `pytest tests/laws/test_right_of_way.py -m seeds --seeds 0:2000`.
 """
 
-from __future__ import annotations
-
 import random
 
 import msgspec

@@ -2,8 +2,6 @@
 
 By hand, with more files: `PYTHONPATH=.:tests python tests/laws/test_rotten_files.py 2000`"""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Invariants of a search, for any map, motion and reports of vehicles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

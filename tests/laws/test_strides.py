@@ -1,7 +1,5 @@
 """At every stride what single steps connect is connected, and nothing else is: walls are never jumped."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The laws of the tree under everything that happens to it, for every strategy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """While only the kernels of a first route are compiled, a tree keeps every law, and calls no other."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A monitor works as much as it draws, and a launcher as much as it records, however much is said meanwhile."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

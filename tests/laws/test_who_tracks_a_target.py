@@ -1,7 +1,5 @@
 """The owner of a target: the law of `swarm.runtime.tracking`, attacked with loss, delay, order and clocks."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass, field
 

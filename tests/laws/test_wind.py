@@ -1,8 +1,6 @@
 """Flight in a uniform wind: times against the wind triangle, trees against scipy over explicit edges, segments
 against crossings as fractions, and vehicles against the promises of their routes."""
 
-from __future__ import annotations
-
 import cmath
 import itertools
 import math

@@ -1,7 +1,5 @@
 """The longest message of each type that the door lets in costs each service little, whatever its shape."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """Vehicles that fly beside those that drive: each layer has its own right of way, and no law breaks in either."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import statistics

@@ -1,7 +1,5 @@
 """`swarm simulate --seeds`: what a seed does depends on its world and number alone, and each law can break."""
 
-from __future__ import annotations
-
 import json
 import re
 

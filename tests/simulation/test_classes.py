@@ -1,7 +1,5 @@
 """Vehicles of several classes in one swarm: each drives by its own map, and all share what they find."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

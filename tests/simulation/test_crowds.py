@@ -1,8 +1,6 @@
 """The whole swarm in dense traffic: no two vehicles meet and none waits for long, with crashes, cuts and double
 starts."""
 
-from __future__ import annotations
-
 import pytest
 from msgspec.structs import replace
 from support.simulated import cells

@@ -1,7 +1,5 @@
 """A vehicle that is not in the scenario, among the services of a whole swarm."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A whole swarm whose vehicles are sent to places: by the real planner of places, with crashes of all processes."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

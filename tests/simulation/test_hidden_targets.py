@@ -1,8 +1,6 @@
 """Targets that only vehicles see: a vehicle which stands at a target's old place and sees none there goes for
 another."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from launch_scripts.simulation.node import Node

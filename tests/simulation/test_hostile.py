@@ -1,7 +1,5 @@
 """One node that sends anything at all, on every key, harms no service: none raises, and the swarm does its work."""
 
-from __future__ import annotations
-
 import random
 
 from support.wire_strategies import BY_TYPE

@@ -1,8 +1,6 @@
 """A process's recorded inputs, fed to the same code, give the same outputs; other outputs are found at their
 event."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import itertools

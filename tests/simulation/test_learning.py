@@ -1,7 +1,5 @@
 """A swarm whose prior is wrong about a class of ground learns so, under faults, and all of its maps agree."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 

@@ -1,7 +1,5 @@
 """The laws on a map of several regions and many shards, the borders of which vehicles cross all the time."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from support.simulated import agents, vehicles

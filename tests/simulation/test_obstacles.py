@@ -1,7 +1,5 @@
 """Obstacles among the whole swarm: no vehicle drives into one, with faults and without, and work goes on."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec

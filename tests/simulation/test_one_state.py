@@ -1,7 +1,5 @@
 """No fact that is shown in two places differs: table, view, `swarm status` and report, over different runs."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

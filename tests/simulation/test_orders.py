@@ -1,7 +1,5 @@
 """Orders: what a keeper has acknowledged is obeyed by every process that starts later, until it is taken back."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

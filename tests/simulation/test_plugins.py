@@ -1,7 +1,5 @@
 """Plug-ins in a whole swarm: the examples of the pages, and what becomes of a swarm whose plug-ins fail."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from pathlib import Path

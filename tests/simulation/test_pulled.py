@@ -1,7 +1,5 @@
 """A whole swarm whose routes are pulled straight: it captures, keeps every law, and does drive straight."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec

@@ -1,7 +1,5 @@
 """A seed replays a run: the same events, byte for byte, and the same report."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

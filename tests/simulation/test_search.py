@@ -1,7 +1,5 @@
 """Targets that no vehicle sees are searched for: vehicles drive on, apart from each other, until one sees them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A group that shares out its targets, in a whole swarm: its messages, and the vehicles of each target."""
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 

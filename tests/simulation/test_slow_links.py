@@ -1,7 +1,5 @@
 """Vehicles drive although every message is late: slower, but they are granted cells at any delay to a second."""
 
-from __future__ import annotations
-
 import pytest
 from support.simulated import cells
 

@@ -1,7 +1,5 @@
 """Planners and the targets process die for good, and their standbys go on."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A swarm that starts waits for no process that is there already."""
 
-from __future__ import annotations
-
 import pytest
 
 from launch_scripts.simulation.node import Node

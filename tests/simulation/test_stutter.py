@@ -1,7 +1,5 @@
 """Processes that are stopped anywhere within a call: no vehicles meet, and no report says that they did."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import pytest

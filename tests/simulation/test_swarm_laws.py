@@ -1,7 +1,5 @@
 """The laws hold in the whole swarm, whatever the network and the processes do: a failing seed replays exactly."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Targets that the run does not move: trackers from outside come, die, meet a second one, and hand over."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Vehicles of simulated runs go from state to state as the table says."""
 
-from __future__ import annotations
-
 import pytest
 from support.vehicle_states import record, table
 

@@ -1,8 +1,6 @@
 """Agents think again only of vehicles about which something changed. No change may be missed: the kept value equals
 a recomputed one, in every tick, under faults, in crowds and among obstacles."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """The parts of `bench chaos`: faults by seed, hostile messages, recovery, and the laws of a run."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import pytest

@@ -1,7 +1,5 @@
 """The harness of benchmarks: each command is listed, and answers bad input with a sentence."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

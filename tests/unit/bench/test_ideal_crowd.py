@@ -1,7 +1,5 @@
 """The bound of crowds: who may follow drives faster, in every world, and none share a cell."""
 
-from __future__ import annotations
-
 import pytest
 from bench.whole_swarm.ideal_crowd import drive_ideal
 

@@ -1,7 +1,5 @@
 """Benchmarks of planning run small, and their figures keep what must hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`bench swarm` and `bench crowd`: sizes, figures from counters, tables."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

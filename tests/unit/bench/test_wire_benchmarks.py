@@ -1,7 +1,5 @@
 """`./launch_scripts/bench wire` runs small, and what must hold holds: nothing is lost, everything has its ratio."""
 
-from __future__ import annotations
-
 import pytest
 from bench.wire import codec, partition
 from support.benchmarks import bench

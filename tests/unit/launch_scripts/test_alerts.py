@@ -1,7 +1,5 @@
 """Each alert queries an exported metric, names a remedy, and fires on its condition."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Certificates: signed by the folder's authority, keys for their owner only, each fault a sentence."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

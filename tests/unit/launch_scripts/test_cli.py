@@ -1,7 +1,5 @@
 """The command line: valid input, and the answers to it. Mistakes get a sentence and an exit code."""
 
-from __future__ import annotations
-
 import csv
 import json
 import socket

@@ -1,7 +1,5 @@
 """Completion, help and exit codes of the whole command: every sub-command, found by walking its tree."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import signal

@@ -1,7 +1,5 @@
 """The differences between runs."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

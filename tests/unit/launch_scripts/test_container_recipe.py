@@ -1,8 +1,6 @@
 """The recipe of the image: linted, built from files that exist, no process is root, and its compiled kernels are
 found."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Layers of cost-to-go: whom the monitor asks, and what its pictures show of the answers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Access control on paper: what processes do is what the table grants them, and names are what they must be."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping
 from typing import Any

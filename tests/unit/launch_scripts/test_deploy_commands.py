@@ -1,8 +1,6 @@
 """`swarm deploy`: a certificate for each process of a scenario, a configuration for zenohd, a sentence per
 fault."""
 
-from __future__ import annotations
-
 import datetime
 import json
 from pathlib import Path

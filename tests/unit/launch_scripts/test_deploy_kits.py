@@ -1,7 +1,5 @@
 """The archives of `swarm deploy plan`: each machine gets its own files, and its start files are sound."""
 
-from __future__ import annotations
-
 import datetime
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`swarm deploy size`: what lies between measured swarms and beyond them, and what several machines carry."""
 
-from __future__ import annotations
-
 import json
 import math
 

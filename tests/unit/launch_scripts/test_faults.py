@@ -1,7 +1,5 @@
 """Faulty links do what their plan says, no more and no less."""
 
-from __future__ import annotations
-
 import random
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of

@@ -1,7 +1,5 @@
 """The swarm that a command asks by default: the newest that runs here."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """The ground of the live view and the layers of learned factors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Probes are answered from what processes said last: while a loop hangs, whatever else is asked, and in one
 sentence each."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

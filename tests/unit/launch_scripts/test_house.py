@@ -1,7 +1,5 @@
 """The order and the English of the house: each fault has a sentence, and none is here."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A later start has the higher incarnation, whatever the clock says."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The launcher with idle processes: starts, restarts, ordered ends, and no process left behind."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,8 +1,6 @@
 """Access to the live view: pages of this machine come in, those of other sites neither read nor connect; no client
 can keep it busy."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import socket

@@ -1,7 +1,5 @@
 """Logs carry dates, are bounded in size, and a full disk harms no writer."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

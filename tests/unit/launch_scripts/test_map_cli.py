@@ -1,7 +1,5 @@
 """`swarm marks`: an export has every set, and the bands of a GeoTIFF show the winners."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The core of `swarm gateway mavlink`: the commands of a vehicle, their times, and the reports to the swarm."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The shell of `gateway mavlink`, turn by turn, between a link of a test and a swarm on a memory network."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The links of `swarm gateway mavlink`: bytes become checked messages of one vehicle, and nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

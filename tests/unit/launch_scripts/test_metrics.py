@@ -1,7 +1,5 @@
 """Metrics are valid OpenMetrics whatever comes from the network, and give the figures of the processes."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import re

@@ -4,8 +4,6 @@ The table was written before anybody looked at the answers. A mistake is made in
 swarm may start because of one.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The monitor: listens, records, serves on loopback, and delays no other process."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import subprocess

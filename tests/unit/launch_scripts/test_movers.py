@@ -1,7 +1,5 @@
 """The moving parts of the live view: place, look and text; and places of alarms."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

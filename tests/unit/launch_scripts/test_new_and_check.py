@@ -1,7 +1,5 @@
 """`swarm new` and `swarm check`: what the one writes, the other accepts; what the other says, is so."""
 
-from __future__ import annotations
-
 import json
 import sys
 import typing

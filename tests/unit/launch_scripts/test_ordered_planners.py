@@ -1,7 +1,5 @@
 """Planners of targets that operators add: started where they are missing, ended where their target is removed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

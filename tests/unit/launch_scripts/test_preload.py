@@ -1,7 +1,5 @@
 """Modules that the processes of a run share are loaded before the fork, and the command starts that first."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Resource use of processes, from the figures of each, and the table that shows it."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

@@ -1,7 +1,5 @@
 """The processes that a launcher starts, their order, and the wait before a restart."""
 
-from __future__ import annotations
-
 import pytest
 
 from launch_scripts.launcher.local_swarm import Backoff

@@ -1,7 +1,5 @@
 """The recorder's figures for the messages that it heard."""
 
-from __future__ import annotations
-
 import pickle
 import random
 import re

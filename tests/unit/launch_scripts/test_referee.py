@@ -1,7 +1,5 @@
 """The referee: collisions, lethal entries and hits of obstacles, whatever reports are lost, late or repeated."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

@@ -1,7 +1,5 @@
 """The generated pages agree with the code; a setting without an explanation is refused."""
 
-from __future__ import annotations
-
 import doctest
 import json
 import re

@@ -1,7 +1,5 @@
 """The statements of docs/method/paper.md about the paper's printed rules hold."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The documentation builds: no dead link, no page outside of the navigation, nothing from other hosts."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

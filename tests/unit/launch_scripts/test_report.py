@@ -1,7 +1,5 @@
 """The results of a run: its folder, its numbers, which add up, and its picture."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """`swarm runs export`: what a run left, as another program reads it."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import datetime

@@ -1,7 +1,5 @@
 """The topics of ROS: they are declared, keep to their rates, and the map is whole."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping

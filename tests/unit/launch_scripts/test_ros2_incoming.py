@@ -1,7 +1,5 @@
 """Messages from ROS are hostile until they are read: none raises, and the results are always valid."""
 
-from __future__ import annotations
-
 import math
 import random
 import threading

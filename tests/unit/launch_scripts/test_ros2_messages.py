@@ -1,7 +1,5 @@
 """ROS messages of swarm state: headings, flipped rows and marker numbers are right, and every message packs."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A robot of ROS between both sides, without a network: whose goal it follows, and when it is none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from types import SimpleNamespace
 from typing import Any, cast

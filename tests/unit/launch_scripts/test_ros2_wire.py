@@ -1,7 +1,5 @@
 """The gateway's wire format as ROS 2 peers expect it: keys, tokens, attachments, hashes, CDR."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any, get_args

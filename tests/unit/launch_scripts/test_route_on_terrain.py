@@ -1,7 +1,5 @@
 """`swarm route --terrain`: a route without a swarm, its places, and what other programs get of it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """The door of a router: what is no handshake is never passed on, and who fails often costs others nothing."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import ssl

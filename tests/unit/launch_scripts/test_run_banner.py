@@ -1,8 +1,6 @@
 """The banner of the live page for a run that it lags behind, or that is over: our script in a real browser, beside
 a viewer whose answers are made here."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An observer from outside goes by the run that most of the answers name, and names those that do not fit."""
 
-from __future__ import annotations
-
 import io
 
 import msgspec

@@ -1,7 +1,5 @@
 """The page of a run and its recording for Foxglove."""
 
-from __future__ import annotations
-
 import dataclasses
 import html.parser
 import itertools

@@ -1,7 +1,5 @@
 """Signals that ask a launcher or a command to end, and output whose reader has gone."""
 
-from __future__ import annotations
-
 import os
 import pty
 import signal

@@ -1,8 +1,6 @@
 """`swarm study run` without a cluster: the meaning of a study, the work of a trial, the kept results and the
 messages."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -1,8 +1,6 @@
 """A launcher that takes over: successors are ready before anybody is asked to end; no two generations write one
 file."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

@@ -1,7 +1,5 @@
 """The commands that look at terrains, as a user runs them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Targets and rovers of the simulation."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random

@@ -1,8 +1,6 @@
 """The launcher's watcher hears positions at the pace at which it records them, and no more than it needs: one that
 records nothing hears its own processes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

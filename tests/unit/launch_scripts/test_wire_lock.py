@@ -1,7 +1,5 @@
 """The lock of the wire: what may change under the same version does, all else is refused with a sentence."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Planners with a scripted tree, before and after the first pose of their target."""
 
-from __future__ import annotations
-
 import pytest
 from support.scripted_planner import World
 

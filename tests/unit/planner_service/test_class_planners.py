@@ -1,7 +1,5 @@
 """One tree per class of vehicles: made when asked for, true to the class's own ground, dropped when unused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """The lowest and highest cell cost: an extreme cell that is another now leaves no trace."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

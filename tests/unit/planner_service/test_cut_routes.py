@@ -1,7 +1,5 @@
 """The cost of a route does not depend on the length of the part that is given."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

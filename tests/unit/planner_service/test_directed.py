@@ -1,7 +1,5 @@
 """Uphill is not downhill: the table of rises, trees on directed ground, and what vehicles drive on it."""
 
-from __future__ import annotations
-
 import math
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """Followers: the planner keeps a bounded number of them, each on the grid, whatever is asked from anywhere."""
 
-from __future__ import annotations
-
 import math
 import random
 

@@ -1,7 +1,5 @@
 """Builders share the work, planners find what they compiled, and no kernel is forgotten."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Compiled kernels are kept on disk for as long as no source of their folder changes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Routes to any place: as an oracle has them on the map of the moment, within bounds, and fair to agents."""
 
-from __future__ import annotations
-
 import math
 import random
 from typing import Any

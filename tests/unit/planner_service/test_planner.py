@@ -1,7 +1,5 @@
 """The planner without a bus or a worker: what it grows and when, and what it tells of that."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable

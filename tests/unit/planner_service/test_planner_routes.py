@@ -1,7 +1,5 @@
 """The planner without a bus or a worker: what it answers, and to whom it pushes routes."""
 
-from __future__ import annotations
-
 import numpy as np
 from support.scripted_planner import GRID, World
 

@@ -1,7 +1,5 @@
 """A planner on a bus: its routes keep the laws while target, map and followers change, and after restarts."""
 
-from __future__ import annotations
-
 import math
 import random
 

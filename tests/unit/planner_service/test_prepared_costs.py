@@ -1,7 +1,5 @@
 """Data that the planners of a machine share: the same as each would compute, and never another map's."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

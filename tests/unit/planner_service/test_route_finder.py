@@ -1,7 +1,5 @@
 """Planning without a network: the example of the docs, and that no cell, target or pace ends the interpreter."""
 
-from __future__ import annotations
-
 import doctest
 import math
 from typing import Any, get_args

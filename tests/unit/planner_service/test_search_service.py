@@ -1,7 +1,5 @@
 """A planner whose target only vehicles see: one search for all who chase it, whatever their class."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

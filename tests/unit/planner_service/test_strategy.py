@@ -1,7 +1,5 @@
 """The table of strategies: every name has a row, and the row alone says what a tree and its planner do."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """WindowSchedule and strides: growth near the target, and far from it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A planner's sentences about trackers: one for each oddity, all counted, none lost."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -1,7 +1,5 @@
 """Input that kernels could not survive is refused before the call: they check no index."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

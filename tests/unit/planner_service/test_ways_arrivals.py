@@ -1,7 +1,5 @@
 """The earliest arrivals at every cell, against scipy's Dijkstra over steps priced by the cell entered."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.sparse import csr_array

@@ -1,7 +1,5 @@
 """The surface on which air classes fly: its law, beside a slow twin."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import math

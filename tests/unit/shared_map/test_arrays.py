@@ -1,7 +1,5 @@
 """Arrays that processes share: no write of a process reaches the file, or another process."""
 
-from __future__ import annotations
-
 import multiprocessing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The base map: pieces in any order make the same terrain, and no false piece is taken."""
 
-from __future__ import annotations
-
 import contextlib
 import zlib
 from pathlib import Path

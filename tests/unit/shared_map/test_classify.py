@@ -1,7 +1,5 @@
 """Classes in a photo: rules without labels, learning from a few, and forbidden mistakes."""
 
-from __future__ import annotations
-
 import itertools
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Compaction changes no winner, in any order and with keepers that know different things."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

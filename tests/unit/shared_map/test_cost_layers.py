@@ -1,7 +1,5 @@
 """Cost layers of the user's own: where they stand among the other rules; all processes have the same map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

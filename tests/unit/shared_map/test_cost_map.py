@@ -1,7 +1,5 @@
 """The cost map: any sequence of marks equals the map made from scratch, and dirty windows cover the change."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of zones with any damage: all features close their ground, or the file is refused by name."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Digests: equal holdings give equal bytes, and a difference names exactly the newer sets."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest import mock
 

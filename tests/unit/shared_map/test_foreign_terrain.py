@@ -1,7 +1,5 @@
 """Files of others: systems, units, kinds of rasters, images. Unknown input is reported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

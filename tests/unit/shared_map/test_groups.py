@@ -1,7 +1,5 @@
 """Groups: who takes in whose marks and positions; what the policy refuses is counted and not asked for again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The hidden truth: seeded, as large as asked for, and never in the way of all paths."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

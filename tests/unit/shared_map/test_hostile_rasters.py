@@ -1,7 +1,5 @@
 """Rasters that would have ended in a traceback, at a web server, in a wait for ever, or as a lake that is none."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

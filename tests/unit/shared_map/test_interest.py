@@ -1,7 +1,5 @@
 """Interest: within its regions a replica that holds only those equals one that holds all."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

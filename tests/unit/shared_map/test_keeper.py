@@ -1,7 +1,5 @@
 """The keeper: what it acknowledges is on disk, and no other terrain's store is touched."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 

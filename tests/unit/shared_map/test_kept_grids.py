@@ -1,7 +1,5 @@
 """A grid comes in as it was written: every format, every cell size, every door."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable

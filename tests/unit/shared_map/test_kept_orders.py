@@ -1,7 +1,5 @@
 """The keeper's book of orders: what it acknowledges is on its disk, and every keeper comes to hold it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Land-cover maps: codes become classes by a table that is known, said, or asked for; never interpolated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Layers against independent derivatives and against numbers that one can check by eye."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import get_args

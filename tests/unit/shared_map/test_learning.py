@@ -1,7 +1,5 @@
 """Learned factors of kinds of ground: equal at every replica, bounded against lies, and never of lethal ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Water and undeclared voids in height models: found before any resampling, and never in silence."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

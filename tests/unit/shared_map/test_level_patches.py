@@ -1,7 +1,5 @@
 """Patches of equal height: what a plain search over heights finds."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

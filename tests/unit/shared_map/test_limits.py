@@ -1,7 +1,5 @@
 """Quotas: an author that exceeds its budget waits, loses nothing and delays no other author."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.map_strategies import set_of

@@ -1,7 +1,5 @@
 """Marks: which set and which statement win, and what a set changes."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

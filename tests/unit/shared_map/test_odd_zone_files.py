@@ -1,7 +1,5 @@
 """Files of zones that are damaged, odd or hostile are refused in one sentence; rasters of paces and factors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rules in place and in tiles say what the same rules say, written one by one; and what doubt costs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

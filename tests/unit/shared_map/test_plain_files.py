@@ -1,7 +1,5 @@
 """Plain formats: right files are read, and wrong ones are refused with the line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Grounds of classes of vehicles: prepared in a run's folder, mapped by every process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

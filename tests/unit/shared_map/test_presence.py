@@ -1,7 +1,5 @@
 """Presence: the newest word of each author and region, for as long as its lease lasts."""
 
-from __future__ import annotations
-
 from support.agent_world import AgentWorld, pace_of
 from support.makers import fleet_of
 

@@ -1,7 +1,5 @@
 """Levels of detail: a thin wall survives every level, a void spreads through none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

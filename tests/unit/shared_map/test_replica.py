@@ -1,7 +1,5 @@
 """One replica: what it merges, writes, publishes, answers and forgets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Target-sighted marks: set while a target is in sight; the newest wins, they end by themselves."""
 
-from __future__ import annotations
-
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,8 +1,6 @@
 """Slope rules beside what their sources say; limits of steps, slopes across the way, and settings that stand for
 others."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

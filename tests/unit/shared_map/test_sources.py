@@ -1,7 +1,5 @@
 """Every kind of file is read onto one metric grid; each fault of a file is one sentence."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Callable

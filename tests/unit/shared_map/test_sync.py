@@ -1,7 +1,5 @@
 """Sync: marks reach every replica once links are back, whatever was lost, and hostile digests cost little."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terrain: the same scenario gives the same digest, and a prepared terrain opens in a blink or is refused."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

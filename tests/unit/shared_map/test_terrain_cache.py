@@ -1,7 +1,5 @@
 """Built-in terrains that are kept from run to run: the right one or none."""
 
-from __future__ import annotations
-
 import logging
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Heights as text: points of a regular grid in any order and layout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Zones from files: shapes in any coordinate system become the cells that they cover; bridges cross water."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from itertools import pairwise

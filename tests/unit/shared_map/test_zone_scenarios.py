@@ -1,7 +1,5 @@
 """Files of zones in a scenario: checked when it is read, part of a terrain's identity, listed by `terrain info`."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Zones: an operator's word is in every map, above what vehicles find, until it is taken back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

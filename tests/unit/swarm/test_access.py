@@ -1,7 +1,5 @@
 """The column of who may do what: complete, and of roles and fields that there are."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm.wire.access import OPERATOR, ROLES, access

@@ -1,7 +1,5 @@
 """A code belongs to one secret, one run, one key, one question and one payload."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Classes of vehicles in a scenario: what each inherits, and the sentence for each fault."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

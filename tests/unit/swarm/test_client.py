@@ -1,7 +1,5 @@
 """The client library, on a simulated network with real planners, keepers and replicas."""
 
-from __future__ import annotations
-
 import math
 import threading
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The install of a robot: the client library imports little, quickly, and reads every message without NumPy."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Columns of numbers: whatever way is taken to check one, the verdict is the same."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Annotated

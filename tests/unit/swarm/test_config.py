@@ -1,7 +1,5 @@
 """A wrong scenario is refused with the file, the key, the found value, the allowed values and the nearest name."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import get_args, get_type_hints

@@ -1,7 +1,5 @@
 """Settings by dotted keys: their changes, and the answer to a key that leads nowhere."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

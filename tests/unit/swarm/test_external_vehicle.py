@@ -1,7 +1,5 @@
 """An external vehicle's side of right of way, and the bounds that leaders set to external vehicles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

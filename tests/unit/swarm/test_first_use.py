@@ -1,7 +1,5 @@
 """First use in a loop: an error in tests, counted live; beside the loop it is neither."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator

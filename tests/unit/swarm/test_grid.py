@@ -1,7 +1,5 @@
 """Cells, metres, tiles, regions and windows agree with each other on any grid."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """A loop's record is read whole at any moment, grows old when the loop hangs, and reaches a supervisor."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -1,7 +1,5 @@
 """The cells that a host holds by the grants of leaders, and its requests."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from support.shard_tables import (

@@ -1,7 +1,5 @@
 """Ids: each is matched once and then known, and no sender grows the memory of a process without bound."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """An inbox under overload: bounded, fair, and its answers go to those who still wait."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

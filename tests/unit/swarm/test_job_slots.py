@@ -1,7 +1,5 @@
 """Long jobs of one machine in turn."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The set of live processes does not depend on the order of the messages about it."""
 
-from __future__ import annotations
-
 import random
 
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Processes of different runs or terrains refuse each other with a sentence."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from support.makers import run_info

@@ -1,7 +1,5 @@
 """The simulated network does what every bus does, and what a link model says."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import pytest

@@ -1,7 +1,5 @@
 """The book of orders: the newest about each subject, whatever the order of arrival; what cannot be is refused."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

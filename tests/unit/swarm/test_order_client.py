@@ -1,7 +1,5 @@
 """Questions of a process that starts, and its answers to operators and to other processes."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest.mock import Mock
 

@@ -1,7 +1,5 @@
 """Places as people write them: each form leads to the cell that it names, on every kind of terrain."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

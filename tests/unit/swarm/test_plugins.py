@@ -1,7 +1,5 @@
 """The names and the discovery of plug-ins, and the guard through which they are called."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import signal

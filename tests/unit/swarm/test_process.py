@@ -1,7 +1,5 @@
 """The loop: late ticks are dropped, events and ticks share the thread, a failed worker ends the process."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Routes by the thousand: as arrays, as columns on the wire, and one by one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import chain, combinations

@@ -1,7 +1,5 @@
 """Histograms that merge by adding, and counters."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

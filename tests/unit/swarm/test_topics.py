@@ -1,7 +1,5 @@
 """Key expressions: a composed key comes apart again, and only a composed one."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 import sys

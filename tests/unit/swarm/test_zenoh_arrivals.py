@@ -1,7 +1,5 @@
 """The queue of a thread: in order, bounded, with an end."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

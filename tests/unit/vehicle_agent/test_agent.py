@@ -1,7 +1,5 @@
 """The agent's decisions without any bus: whom it asks, which target it takes, where it starts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import random

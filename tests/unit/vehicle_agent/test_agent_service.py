@@ -1,7 +1,5 @@
 """Agents end to end on a simulated network: they follow, find out, mark, and come back from the dead."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario

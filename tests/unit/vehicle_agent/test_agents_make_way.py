@@ -1,7 +1,5 @@
 """Agents end to end on a simulated network, in crowds and corridors: they make way for each other."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

@@ -1,7 +1,5 @@
 """Agents end to end on a simulated network, with a keeper: vehicles that operators send to places."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The target of each vehicle of an agent."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

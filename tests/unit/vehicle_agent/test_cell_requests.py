@@ -1,7 +1,5 @@
 """A wish is kept until something that it was made of changes, and no longer."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 

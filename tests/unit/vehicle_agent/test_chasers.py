@@ -1,7 +1,5 @@
 """Reports of an agent to planners about their chasers: true at every tick, and no more often than that takes."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

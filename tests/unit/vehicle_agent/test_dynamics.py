@@ -1,7 +1,5 @@
 """Vehicles driven at the speeds of a plug-in: never faster than the ground allows, never beyond their path."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from typing import Any

@@ -1,8 +1,6 @@
 """The rate at which an agent asks all planners because targets jump: soon where they are few, seldom where many
 do."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The places that a change of the map concerns."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """A member of a shard: what it promises and stores, and how it becomes leader."""
 
-from __future__ import annotations
-
 import msgspec
 from msgspec.structs import replace
 from support.shard_tables import (

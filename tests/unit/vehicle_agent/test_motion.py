@@ -1,7 +1,5 @@
 """The cell that a vehicle occupies, however it is driven."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

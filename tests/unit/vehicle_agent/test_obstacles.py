@@ -1,7 +1,5 @@
 """Reports of obstacles: bad ones are named once, counted, and open no cell."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

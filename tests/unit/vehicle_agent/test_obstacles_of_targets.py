@@ -1,7 +1,5 @@
 """Targets as obstacles: speed and heading are taken from poses, and a jump leaves nothing behind."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

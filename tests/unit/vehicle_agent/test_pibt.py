@@ -1,7 +1,5 @@
 """The moves of one shard, planned at once."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Vehicles of an added agent enter the map on free cells: no obstacle, and no zone."""
 
-from __future__ import annotations
-
 from swarm.clock import NS_PER_S
 from vehicle_agent.placement import Spawning
 

@@ -1,7 +1,5 @@
 """The file of an agent's promises: records survive a kill, and no other process writes it."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

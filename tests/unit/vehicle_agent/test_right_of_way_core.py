@@ -1,7 +1,5 @@
 """An agent whose file takes nothing is no member: it promises, stores and tells nothing until its file takes it."""
 
-from __future__ import annotations
-
 import msgspec
 from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
 

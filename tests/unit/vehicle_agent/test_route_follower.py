@@ -1,7 +1,5 @@
 """Routes on their way to be driven, and the point that drives them."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 

@@ -1,7 +1,5 @@
 """Observations, and the marks which follow from them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

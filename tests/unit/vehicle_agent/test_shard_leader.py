@@ -1,7 +1,5 @@
 """The grants, releases and messages of a shard's leader."""
 
-from __future__ import annotations
-
 from msgspec.structs import replace
 from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_of
 

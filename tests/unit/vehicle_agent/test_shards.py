@@ -1,7 +1,5 @@
 """Shards of any size: as many as agents have use for, and one size in one run."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

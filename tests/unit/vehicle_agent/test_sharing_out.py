@@ -1,7 +1,5 @@
 """Balanced assignment: each target's pursuers come first, and every agent of the group finds the same ones."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Vehicles keep to the steps that are not too steep, and none is stuck on one that is."""
 
-from __future__ import annotations
-
 import math
 import random
 from itertools import pairwise

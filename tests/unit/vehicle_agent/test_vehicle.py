@@ -1,7 +1,5 @@
 """One vehicle: what it asks for and its state, whatever happens."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from itertools import pairwise

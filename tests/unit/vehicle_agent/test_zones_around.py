@@ -1,7 +1,5 @@
 """Vehicles and zones: a vehicle inside one drives out, none drives in, and its observations there are no news."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
