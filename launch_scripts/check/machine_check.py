@@ -197,9 +197,10 @@ def _packages(runs: Path) -> Said:
     wrong: dict[str, str] = {}
     for extra in _LARGEST_FIRST:  # so that the smallest that brings a package remains
         for wanted in every:
+            if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
+                continue
             here = _version(wanted.name)
-            brings = wanted.marker is None or wanted.marker.evaluate({"extra": extra})
-            if brings and (here is None or not wanted.specifier.contains(here, prereleases=True)):
+            if here is None or not wanted.specifier.contains(here, prereleases=True):
                 wrong[wanted.name] = f"{wanted.name} is {here or 'missing'}, expected {wanted.specifier} ({extra})"
     if wrong:
         return "failure", f"{'; '.join(wrong.values())}: install the extras in brackets (docs/start/install.md)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import islice
 
 import msgspec
 
@@ -237,14 +238,16 @@ class KeeperService:
         self.counters.gauge("authors_throttled", float(len(throttled)))
         for author in self._named:
             self.counters.gauges.pop(THROTTLED + author, None)
-        for author in throttled[:_NAME_AT_MOST]:
-            self.counters.gauge(THROTTLED + author, 1.0)
-            if author not in self._named:
-                self._named.append(author)
-                text = f"author {author} exceeds its quota; its marks are delayed"
-                self._member.note(now_ns, "quota", text)
-                self._member.alarms.begin("quota", author, text, now_ns)
+        # Those which are named stay until they wait no more: else each new name that sorts first would be one more.
         self._named = [author for author in self._named if author in throttled]
+        unnamed = (author for author in throttled if author not in self._named)
+        for author in islice(unnamed, _NAME_AT_MOST - len(self._named)):
+            self._named.append(author)
+            text = f"author {author} exceeds its quota; its marks are delayed"
+            self._member.note(now_ns, "quota", text)
+            self._member.alarms.begin("quota", author, text, now_ns)
+        for author in self._named:
+            self.counters.gauge(THROTTLED + author, 1.0)
         self._member.alarms.last_of("quota", self._named, now_ns)
 
     def _accepted(self, mark_set: MarkSet) -> None:

@@ -6,8 +6,9 @@ from support.map_strategies import set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.keeper.service import THROTTLED
+from shared_map.keeper.service import _NAME_AT_MOST, THROTTLED
 from shared_map.replication.author_limits import _MAX_WAITING, _TURNS, Capacity, Quota
+from shared_map.replication.replica_sync import MapSync
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
@@ -160,6 +161,14 @@ def test_authors_that_are_gone_are_compared_with_digests_of_keepers_by_turns_ove
         assert len(compared[-1]) == most
         swarm.run(0.1)
     assert [name for each in compared[:3] for name in each] == [f"all.q{n}.1" for n in range(2500)]
+
+
+def test_few_authors_are_named_whichever_names_come_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    keeper = SwarmModel().keeper("keeper", KeeperStore(":memory:"))
+    for n in reversed(range(50)):
+        monkeypatch.setattr(MapSync, "throttled", [f"a{each:02}" for each in range(n, 50)])
+        keeper._name_throttled(NS_PER_S)
+        assert len(keeper._named) == min(50 - n, _NAME_AT_MOST)
 
 
 def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
