@@ -1,6 +1,5 @@
-"""Order of the tests: those of the network last, their longest files first; `--network` leaves these out, or all
-others. `--seeds` lets tests that replay seeded histories run others; `--thorough` adds those of which the others
-show enough for each commit.
+"""Order of the tests: those of the network last; `--network` leaves these out, or all others. `--seeds` lets tests
+that replay seeded histories run others; `--thorough` adds those of which the others show enough for each commit.
 Properties are tried with the same examples in every run, so that a gate answers the same twice; `--random` looks
 for new ones."""
 
@@ -25,8 +24,6 @@ for name in [name for name in os.environ if name.startswith("SWARM_")]:
 _STATE = tempfile.TemporaryDirectory(prefix="swarm-state-")
 os.environ["SWARM_STATE"] = _STATE.name
 
-LONGEST = ("test_docs", "test_live", "test_orders_live", "test_package", "test_external_vehicles_live")
-"""Files of the network which take minutes. They begin first, so that no worker is left with one at the end."""
 EXAMPLES = 100
 """Number of examples of a property that names none, with `--thorough`; each commit tries a share
 (support.effort)."""
@@ -84,11 +81,4 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left:
         config.hook.pytest_deselected(items=left)
         items[:] = [each for each in items if each not in set(left)]
-
-    def place(item: pytest.Item) -> tuple[bool, int]:
-        """Sorts those of the network last, and among them the longest files first."""
-        if item.get_closest_marker("network") is None:
-            return False, 0
-        return True, LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
-
-    items.sort(key=place)
+    items.sort(key=lambda item: item.get_closest_marker("network") is not None)
