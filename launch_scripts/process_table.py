@@ -80,7 +80,7 @@ TABLE: dict[str, Role] = {
     "monitor": Role(
         entry="launch_scripts.monitor.main:run",
         stops=3,
-        niceness=10,
+        niceness=5,
         memory_mib=4096,
         is_needed=False,
         expendable=True,
