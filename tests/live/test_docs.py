@@ -113,10 +113,10 @@ class Bench:
         assert done.returncode == 0, f"{text}\n{done.stdout}"
 
 
-@pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory) -> Any:
+@pytest.fixture
+def beside(tmp_path: Path) -> Any:
     """The demo, for all blocks beside it. It is the newest swarm of its folder, so commands find it."""
-    bench = Bench(tmp_path_factory.mktemp("beside"), "all")
+    bench = Bench(tmp_path, "all")
     words = ["swarm", "demo", "--port", "0", "--seconds", "600", "--no-live"]
     demo = subprocess.Popen(
         words, cwd=bench.folder, env=bench.around, start_new_session=True, text=True,
