@@ -279,7 +279,7 @@ class LatestState(Counts):
             self._told_ns[key] = now_ns
         elif key in self._alive:
             self._alive[key].discard(peer.incarnation)
-            if not self._alive[key] and key not in self._newest:
+            if not self._alive[key] and key not in self._newest and key not in self._started:
                 del self._alive[key]  # of a stranger, whose names must not fill the place of others
 
     def touch(self, now_ns: int) -> None:
