@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -207,7 +207,7 @@ class Where(Tls):
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
         (run, network), *others = find_swarm(self.runs, self.run)
-        say_newest(run, [name for name, _ in others if name])
+        say_newest(run, (name for name, _ in others))
         return network
 
     def network(self) -> NetworkConfig:
@@ -253,10 +253,10 @@ class Where(Tls):
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
-def say_newest(run: str, others: Sequence[str]) -> None:
-    """Says which run a command asks, if others run too."""
-    if others:
-        told = ", ".join(others[:_NAMED])
+def say_newest(run: str, others: Iterable[str]) -> None:
+    """Says which run a command asks, if others run too. A run of several launchers is one."""
+    if names := list(dict.fromkeys(name for name in others if name not in ("", run))):
+        told = ", ".join(names[:_NAMED])
         typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
 
 
