@@ -147,7 +147,7 @@ def factors(
 ) -> None:
     """Show the learned factors of terrain classes.
 
-    A row has driven over prior pace, and the factor on the prior (map.learning).
+    Each row: measured pace / prior pace, and the factor applied to the prior (map.learning).
 
     swarm marks factors
 

@@ -73,7 +73,7 @@ SignalsAddress = Annotated[
     str,
     typer.Option(
         metavar="ADDRESS",
-        help="Address of the port of figures and health; 0.0.0.0 for other machines.",
+        help="Address at which metrics and health are served; 0.0.0.0 for other machines.",
     ),
 ]
 LogFormatOption = Annotated[
@@ -116,10 +116,11 @@ class RunOptions:
     seconds        How long the run lasts once the swarm is up.
     seed           Seed of everything random.
     no_live        Serve no live view. The run is recorded all the same.
-    record_inputs  Record what every process hears, so that `swarm runs replay` can repeat it.
-    metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
+    record_inputs  Record all input of every process, so that `swarm runs replay` can repeat the run.
+    metrics_port   Serve metrics to Prometheus, and health to probes, on this port; 0 picks one.
     plain          Plain lines instead of the live table.
-    detach         Run in the background: return once the swarm is whole. `swarm down` ends it.
+    detach         Run in the background: return once all processes run and a route was served. `swarm down` ends
+                   it.
     """
 
     panel: ClassVar[str | None] = None
@@ -188,7 +189,7 @@ class Where(Tls):
 
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
-    run        The run to ask, where several run here: its name, or its folder.
+    run        The run to ask, if several run here: its name, or its folder.
     runs       To find a swarm: only the runs in this folder; if not given, all of yours here.
     """
 

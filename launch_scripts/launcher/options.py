@@ -173,7 +173,7 @@ _DIGITS = 20
 
 
 def common_run_id(scenario: Scenario) -> str:
-    """Runs id derived from the scenario, so that separately started parts agree on it."""
+    """Run id derived from the scenario, so that separately started parts agree on it."""
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )

@@ -405,7 +405,7 @@ class _Run:
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
     def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
-        """Returns the run time (s), start-up included. All displays show this value."""
+        """Returns the title line of the displays. Its time includes the start-up."""
         if self._up_at_s is None:
             waits = f", waits for {', '.join(missing)}" * (0 < len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {elapsed_s:.0f} s"

@@ -21,7 +21,7 @@ from swarm.wire.messages.orders import GoalState
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One target at an instant. `facts.TARGET_FACTS` selects and formats its fields.
+    """One target at an instant. `fact_table.TARGET_FACTS` selects and formats its fields.
 
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
@@ -62,7 +62,7 @@ class TargetLine:
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """A run at an instant. `facts.FACTS` selects and formats its fields.
+    """A run at an instant. `fact_table.FACTS` selects and formats its fields.
 
     elapsed_s       time of the run, since it began
     states          vehicles that are driven, by VehicleState

@@ -91,7 +91,7 @@ class CostGrid:
         self.grid = grid
         self.config = config
         self.rule = rule_of(config)
-        """Returns which steps there are: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
+        """Rule of the allowed steps: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
         self.corners = config.corner_cutting
         """True if a diagonal step may pass a lethal cell."""
         self.stride = grid.cols + 2

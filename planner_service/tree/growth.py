@@ -101,7 +101,7 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
 _SAMPLE = 1 << 10
 """Number of cells in the sample for the usual cell cost."""
 _RARE = 1 / 16
-"""Number of them that may cost less than the usual."""
+"""Share of the sampled cells that may cost less than the usual cost."""
 _FEW, _NEAR = 16.0, 4.0
 """Buckets are as narrow as the lowest cell cost asks for where none is more than `_FEW` times as much, or the usual
 one no more than `_NEAR` times."""
@@ -115,7 +115,7 @@ def grow_directed_costs(
     cost: Floats,
     kept: dict[tuple[int, int], Any],
 ) -> None:
-    """Exact costs to a padded, passable root, written whole; the arguments are those of `growth.grow_tree`."""
+    """Computes exact costs to a padded, passable root, written whole. Arguments as of `grow_tree`."""
     cell_cost = padded[0]
     key = cell_cost.size, 0
     if key not in kept:

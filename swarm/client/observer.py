@@ -30,9 +30,9 @@ _ZONES = "operator."
 
 @dataclass(frozen=True, slots=True)
 class SeenVehicle:
-    """A vehicle, where it was said to be last.
+    """A vehicle at its last reported place.
 
-    state   idle, waiting, following, arrived, stranded, lost; "outside" of one that is not the swarm's own
+    state   idle, waiting, following, arrived, stranded, lost, outdated; "outside" if it is not the swarm's own
     target  the target that it chases, None if there is none
     """
 

@@ -77,7 +77,7 @@ class Route:
 
     @property
     def ok(self) -> bool:
-        """True if a path exists."""
+        """True if the route leads to the target."""
         return self.status == RouteStatus.OK
 
     @property

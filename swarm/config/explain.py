@@ -337,9 +337,9 @@ def _meant_number(key: str, value: Any, kind: Any) -> str:
         return ""
     number, unit = float(match[1].replace(",", ".")), match[2]
     if unit is None:
-        return f" without quotes: {key} = {number:g}"
+        return f"; leave out the quotes: {key} = {number:g}"
     factor = next(units for ending, units in _UNITS if key.endswith(ending)).get(unit.lower())
-    return ", without its unit" if factor is None else f" without its unit: {key} = {number * factor:.6g}"
+    return "; leave out the unit" + ("" if factor is None else f": {key} = {number * factor:.6g}")
 
 
 def _field_type(section: Any, key: str) -> Any:

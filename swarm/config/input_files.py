@@ -49,7 +49,7 @@ class FileKind(Enum):
     RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
-    GENERATIONS = ("lives", 1 << 20, StoreError)
+    GENERATIONS = ("generations", 1 << 20, StoreError)
     RECORDING = ("recording", 256 << 20, StoreError)
 
     def __init__(self, what: str, most_bytes: int, error: type[SwarmError]) -> None:

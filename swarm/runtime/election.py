@@ -30,7 +30,7 @@ _MOST_OTHERS = 64
 """Generations of other candidates that are remembered."""
 
 _Order = tuple[bool, int, int]
-"""The lower, the better: not ready, rank, older generation."""
+"""(not ready, rank, -incarnation): the lowest is best, so of one rank the younger incarnation."""
 
 
 @dataclass(slots=True)

@@ -19,7 +19,7 @@ from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS, Topic, asker_of
 from swarm.wire.versions import are_neighbours
 
-_MOST_HOST_STATES, _MOST_OVER = 40, 20
+_MOST_STANDING, _MOST_OVER = 40, 20
 """Alarms in a `Stats`, which has to stay a small message: it is sent each second."""
 
 
@@ -51,7 +51,7 @@ class Alarms:
     ) -> None:
         """Something lasts from now on; said again, only its words and its place change."""
         known = self._standing.get((kind, about))
-        if known is None and len(self._standing) >= _MOST_HOST_STATES:
+        if known is None and len(self._standing) >= _MOST_STANDING:
             return
         since_ns = now_ns if known is None else known.since_ns
         self._standing[kind, about] = Alarm(
