@@ -126,7 +126,7 @@ def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
 
 
 def size(count: int) -> str:
-    """Bytes, readable."""
+    """A number of bytes, as people read it."""
     for power, unit in ((9, "GB"), (6, "MB")):
         if count >= 10 ** (power - 1):
             return f"{count / 10**power:.1f} {unit}"
