@@ -391,7 +391,7 @@ class _Run:
         self._terminal.say(f"from elsewhere: {tunnel(port)}, then the same address")
 
     def _register(self) -> None:
-        """Says to commands how far the run is; `begin_run` has said if that is impossible."""
+        """Registers the run's progress for other commands; `begin_run` has reported any failure."""
         register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:

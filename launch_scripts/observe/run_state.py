@@ -71,8 +71,7 @@ class RunState:
     well            processes that are as they should be (alive, or ended because they were asked to), and all that
                     the run needs
     crew            the same by role
-    learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
-                    whose prior does not stand
+    learned         class of ground -> measured factor on its prior pace; only classes whose factor is not 1
     goals           progress of the vehicles that were sent to places
     beside          processes that are alive and not needed: routers, monitors, agents of external vehicles
     messages_per_s  that all processes send now
@@ -197,7 +196,7 @@ def _lines(
 
 
 def _learned(latest: LatestState) -> dict[str, float]:
-    """From the planner with the most learned factors: those of other groups may have received fewer."""
+    """Learned factors, from the planner that has the most: planners of other groups may have received fewer."""
     told = [
         {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
         for (role, _), stats in latest.newest().items()

@@ -145,7 +145,7 @@ class CostGrid:
         self._directions: NDArray[np.uint8] = np.empty(1 << 12, np.uint8)
         """Scratch of `walk`, which makes it longer where routes are."""
         self._trail: tuple[NDArray[np.uint32], NDArray[np.float64]] | None = None
-        """Scratch of `rests`, which makes it: room for all cells, of which only what routes need becomes memory."""
+        """Scratch of `rests`, which makes it. It reserves all cells; memory is used only where routes need it."""
         self._repair_scratch: repair.Scratch | None = None
         """Made by the first repair of a small map."""
         if self.climbs is not None:
