@@ -94,7 +94,7 @@ def route(
 def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
     """Show a running swarm: metrics, processes, targets and alarms.
 
-    Without --connect it asks the newest run of this machine that runs, whatever its ports.
+    Without --connect it asks the newest active run of this machine, whatever its ports.
 
     swarm status
 
@@ -124,7 +124,7 @@ def top(
     """Watch a running swarm, once a second; Ctrl-C ends it.
 
     Processes on other machines are shown, too, from their own reports. CPU of 100 % is one core; late/s counts
-    ticks that came late or not at all, for a role its worst process.
+    ticks that came late or not at all; a role shows its worst process.
 
     swarm top --each
 
@@ -150,7 +150,7 @@ def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: AsJ
     swarm health --url http://127.0.0.1:9464 --live
 
     url   Where figures or health are served, such as http://127.0.0.1:9464.
-    live  Whether the processes live, not whether they are ready.
+    live  Check that processes are alive, not that they are ready.
     """
     from launch_scripts.web.health_probe import ask
 

@@ -71,11 +71,11 @@ def plan(
 
     swarm deploy plan my.toml --hosts hosts.toml --out kits
 
-    then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
+    Then, on each machine NAME with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
-    An archive holds service, scenario and certificates. Every process runs once; keepers, and planners and their
-    standbys, run on machines of their own. A second plan into the same folder renews certificates that end soon,
-    and removes archives of other machines.
+    An archive holds service, scenario and certificates. Every process runs once. Two keepers, or a process and its
+    standby, never share a machine. A second plan into the same folder renews certificates that end soon, and
+    removes archives of other machines.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
     out    Write an archive for each machine here, certificates included; if not given, only show.
@@ -232,13 +232,13 @@ def certs(
 
     swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
 
-    makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
-    allows. docs/operate/access.md says which files go where. ca.key stays here: its holder can admit any process.
-    Existing certificates are kept while more than a third of their time is left.
+    This makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its
+    name allows. docs/operate/access.md says which files go where. ca.key stays here: its holder can admit any
+    process. Existing certificates are kept while more than a third of their validity is left.
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Make certificates that its processes lack, that end soon or that it revokes, too.
+    scenario  Also renew its processes' certificates that are missing, expire soon or are revoked.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """
@@ -269,9 +269,9 @@ def revoke(folder: Path, names: list[str]) -> None:
 
     swarm deploy revoke certs agent.all.a0
 
-    adds them to the file `revoked` in the folder. Do so, or copy the file, on every machine with a router. All
-    links of the router end, and are back at once, those of the names with no rights. `swarm deploy certs --renew`
-    makes the next certificate of a name.
+    This adds the names to the file `revoked` in the folder. Then, on each machine with a router, do the same or
+    copy the file. All links drop and return at once; revoked names return without rights. `swarm deploy certs
+    --renew` makes the next certificate of a name.
 
     folder  Folder with the certificate of a router.
     names   Names as in the certificates: agent.all.a0~2.

@@ -103,13 +103,13 @@ def _join(network: NetworkConfig) -> Swarm:
 class Drives:
     """Control of a vehicle.
 
-    target         Follow routes to this target; without it or --to the vehicle is avoided, and no more.
+    target         Follow routes to this target; without it and without --to, others only avoid the vehicle.
     to             Go to this place, as 46.81,9.84, xy:X,Y or cell:ROW,COL.
     drive          By missions, or by guided setpoints.
     arm            Arm it and set its mode; without it that is the pilot's.
-    altitude       Metres at which one that flies follows.
+    altitude       Altitude (m) of a flying vehicle.
     above          Reference of --altitude; terrain: ArduPilot only.
-    vehicle_class  Which class of the swarm's vehicles it drives as.
+    vehicle_class  Its vehicle class.
     """
 
     panel: ClassVar[str | None] = "How it is driven"
@@ -127,11 +127,11 @@ class Vehicle:
     """Identity of a vehicle, in the swarm and on its link.
 
     id           Its name in the swarm; if not given, mav1 of system 1.
-    group        Whose it is.
+    group        Its group.
     radius       Metres around it that others keep clear.
     sysid        Its MAVLink system; if not given, the first autopilot.
     lost_after   Seconds without heartbeat or position, after which it is left to its fail-safe.
-    signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
+    signing_key  File of 64 hexadecimal digits: messages are signed; unsigned ones are ignored.
     """
 
     panel: ClassVar[str | None] = "Identity of the vehicle"

@@ -31,7 +31,7 @@ target_app = family_app("Add, move and remove simulated targets while the swarm 
 Key = Annotated[str, typer.Argument(metavar="KEY")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
 At = Annotated[
-    str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
+    str, typer.Option(metavar="PLACE", help="Place: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
 
 

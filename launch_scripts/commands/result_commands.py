@@ -161,11 +161,11 @@ def replay(
 ) -> int:
     """Replay recorded inputs of a run, and report the first output that differs.
 
-    swarm demo --record-inputs, then swarm runs replay
-
+    swarm demo --record-inputs
+    swarm runs replay
     swarm runs replay LAST --process planner-t3 --until-s 34.5
 
-    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
+    Simulated runs always record inputs. Exit code 1 if any output differs or a recording cannot be replayed.
 
     process  Only this process, such as planner-t3.
     until_s  Stop at this time (s) of the run's own clock.

@@ -15,11 +15,11 @@ app = typer.Typer()
 
 @command(app, RUN)
 def demo(run: RunOptions) -> int:
-    """Run the built-in example: 99 rovers and a drone chase 10 targets.
+    """Run the built-in example: 99 ground vehicles and a drone chase 10 targets.
 
-    The same as `swarm up demo`. Ends a minute after the swarm is whole, or later, once no live view is open any
-    more; after --seconds in any case; or on Ctrl-C. Leaves runs/RUN/ with run.rrd, report.html, report.json,
-    report.png and a log file per process.
+    The same as `swarm up demo`. Ends after --seconds. Without it: a minute after the start-up, or later when the
+    last live view closes. Ctrl-C ends it. Leaves runs/RUN/ with run.rrd, report.html, report.json, report.png and a
+    log file per process.
 
     swarm demo --seconds 20 --port 0
     """

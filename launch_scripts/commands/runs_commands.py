@@ -53,7 +53,7 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 
     swarm ps -a
 
-    all  Runs that are over too.
+    all  List ended runs, too.
     """
     from rich.console import Console
 
@@ -81,8 +81,8 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 def down(run: RunArgument = None) -> int:
     """End a run of this machine as Ctrl-C does, and wait for its report.
 
-    If the run has not ended, a second `swarm down` kills the processes that are left. So does the first, if the
-    launcher of the run is not there any more.
+    If the run has not ended, a second `swarm down` kills the processes that are left. If the launcher is gone, the
+    first one kills them.
 
     swarm down
 
@@ -141,7 +141,7 @@ def logs(
     process  One process, such as planner-t3; if not given, all by time.
     follow   Go on with new lines until the run ends.
     lines    Print at most this number of lines of the past.
-    run      Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    run      Name of the run, or its folder; if not given, the newest active run, else the newest ended one.
     """
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
@@ -168,7 +168,7 @@ def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--pr
 
     swarm open
 
-    run         Name of the run, or its folder; if not given, the newest that runs, or else the newest.
+    run         Name of the run, or its folder; if not given, the newest active run, else the newest ended one.
     only_print  Print the address, and open no browser.
     """
     import webbrowser
@@ -241,8 +241,8 @@ def in_background(*, as_json: bool) -> int:
 
 
 def _chosen(name: str | None, only: bool = False) -> KnownRun:
-    """The run of a name or folder; without one the newest that runs, or else the newest. Raises ConfigError, with
-    `only` also if several run."""
+    """The run of a name or folder; without one the newest active run, else the newest ended one. Raises
+    ConfigError, with `only` also if several runs are active."""
     from launch_scripts.observe.run_folder import RUNS, find_run
     from launch_scripts.observe.run_registry import registered
 

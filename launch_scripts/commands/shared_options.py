@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -73,7 +73,7 @@ SignalsAddress = Annotated[
     str,
     typer.Option(
         metavar="ADDRESS",
-        help="Address of the port of figures and health; 0.0.0.0 for other machines.",
+        help="Address at which metrics and health are served; 0.0.0.0 for other machines.",
     ),
 ]
 LogFormatOption = Annotated[
@@ -116,10 +116,11 @@ class RunOptions:
     seconds        How long the run lasts once the swarm is up.
     seed           Seed of everything random.
     no_live        Serve no live view. The run is recorded all the same.
-    record_inputs  Record what every process hears, so that `swarm runs replay` can repeat it.
-    metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
+    record_inputs  Record all input of every process, so that `swarm runs replay` can repeat the run.
+    metrics_port   Serve metrics to Prometheus, and health to probes, on this port; 0 picks one.
     plain          Plain lines instead of the live table.
-    detach         Run in the background: return once the swarm is whole. `swarm down` ends it.
+    detach         Run in the background: return once all processes run and a route was served. `swarm down` ends
+                   it.
     """
 
     panel: ClassVar[str | None] = None
@@ -188,7 +189,7 @@ class Where(Tls):
 
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
-    run        The run to ask, where several run here: its name, or its folder.
+    run        The run to ask, if several run here: its name, or its folder.
     runs       To find a swarm: only the runs in this folder; if not given, all of yours here.
     """
 
@@ -207,7 +208,7 @@ class Where(Tls):
                 raise ConfigError("--connect and --run both say which swarm: give one of them")
             return NetworkConfig()
         (run, network), *others = find_swarm(self.runs, self.run)
-        say_newest(run, [name for name, _ in others if name])
+        say_newest(run, (name for name, _ in others))
         return network
 
     def network(self) -> NetworkConfig:
@@ -253,10 +254,10 @@ class Where(Tls):
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
-def say_newest(run: str, others: Sequence[str]) -> None:
-    """Says which run a command asks, if others run too."""
-    if others:
-        told = ", ".join(others[:_NAMED])
+def say_newest(run: str, others: Iterable[str]) -> None:
+    """Says which run a command asks, if others run too. A run of several launchers is one."""
+    if names := list(dict.fromkeys(name for name in others if name not in ("", run))):
+        told = ", ".join(names[:_NAMED])
         typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
 
 

@@ -32,13 +32,13 @@ from swarm.grid import GridSpec
 
 app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
 
-    Where to get an elevation model, and the rule for cost: docs/gis/costs.md.
+    Elevation models: docs/gis/terrain.md. Cost rules: docs/gis/costs.md.
     """)
 console = Console()
 
-Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
+Crs = Annotated[str | None, typer.Option(help="Coordinate system, if the file names none, such as EPSG:32632.")]
 Metres = Annotated[
-    float | None, typer.Option(min=1e-6, max=1e6, help="Cell size in metres to bring everything to.")
+    float | None, typer.Option(min=1e-6, max=1e6, help="Cell size (m) to which everything is resampled.")
 ]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
 
@@ -58,11 +58,10 @@ def info(
 ) -> None:
     """Describe a terrain file or the terrain of a scenario.
 
-    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
-    these in a .zip, .asc, .npz, .csv and .xyz grids, land cover (ESA
-    WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml,
-    and .png with --resolution-m and --height-scale. Lines after the table
-    state processing steps and notes; those with a ! look wrong.
+    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, or one of these in a .zip; .dt2, .nc, .vrt, .asc, .grd, .npz,
+    .csv and .xyz grids, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml, and
+    .png with --resolution-m and --height-scale. Lines after the table state processing steps and notes; those with
+    a ! look wrong.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
@@ -70,10 +69,10 @@ def info(
 
     file                A terrain file, a scenario, or jacksboro.
     height_scale        Metres per unit of height, if the file does not state it.
-    fill                Fill voids from their surroundings instead of forbidding them.
+    fill                Fill voids from their surroundings instead of making them lethal.
     cover               A raster of land-cover codes on the same ground.
-    cover_codes         Meaning of its codes: worldcover, corine, corine-level-3, nlcd, or a CSV file.
-    elevation_encoding  metres, if whole numbers that look like codes of land cover are heights.
+    cover_codes         Legend of the land cover: worldcover, corine, corine-level-3, nlcd, or a CSV file.
+    elevation_encoding  Give metres if the whole numbers are heights, though they look like land-cover codes.
     """
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
@@ -242,7 +241,7 @@ def reach(
     start    Start of a corridor: only cells on near-optimal paths from there.
     slack    With --from: a path may take this share longer than the best.
     out      Write .tif: seconds, -1 without a path; .geojson, .gpkg, .kml or .csv: areas.
-    every_s  Distance between areas, in seconds: 600; of a corridor a fifth of the time that slack allows.
+    every_s  Step between areas (s). Default 600; for a corridor a fifth of the slack time.
     """
     from launch_scripts.commands import terrain_routes
 

@@ -63,7 +63,7 @@ def send(
 ) -> int:
     """Send a vehicle to a place, or to one place after the other. It chases no target meanwhile.
 
-    The newest order counts. `swarm order ls` and `swarm status` show how far it is.
+    The newest order counts. `swarm order ls` and `swarm status` show its progress.
 
     swarm order vehicle send a0-03 46.81,9.84
 

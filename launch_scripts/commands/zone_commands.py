@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
 
-    The shared map holds a zone: all planners and vehicles go by it, also later ones.
+    The shared map holds a zone: all planners and vehicles obey it, also those that start later.
     """)
 _LASTS = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -57,13 +57,13 @@ def add(
 
     swarm order zone add --file quarry.geojson --name quarry --class truck
 
-    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several. A fence's file says
-    itself which of its areas keep in. Elsewhere --kind keep-in closes all but the areas.
+    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several. A fence file states which
+    areas to keep in. For other files, --kind keep-in closes everything outside the areas.
 
     polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
-    file           A file of areas instead, as in a scenario's zones, in any system.
+    file           A file of areas instead, as in a scenario's zones, in any coordinate system.
     layer          Layer of a file that has several.
-    crs            Coordinate system, if the file names none: EPSG:32632, or local.
+    crs            Coordinate system, if the file names none, such as EPSG:32632, or local.
     kind           lethal, keep-in (all else is lethal), or pace:X for X seconds per metre.
     for_           Duration: 90s, 10m, 2h. Until it is removed, if not given.
     name           Zone name. Replaces a zone of the same name.

@@ -126,8 +126,8 @@ def make_plan(
 ) -> Plan:
     """The plan of a scenario on these machines. Raises ConfigError where the machines do not suffice.
 
-    Every process runs once, a monitor if a machine may have one. Each machine that may has a router. Keepers, and
-    the processes of one job, run on machines of their own. Agents with consecutive ids run together, as their
+    Every process runs once, a monitor if a machine may have one. Each machine that may have a router has one. Two
+    keepers, or a process and its standby, never share a machine. Agents with consecutive ids run together, as their
     vehicles start near each other. The same scenario and machines give the same plan.
 
     keepers  id of a keeper -> name of the machine that it ran on before: it stays there if it can, with its store
@@ -164,7 +164,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         found = sum(role in host.roles for host in hosts.hosts)
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))
         if found < wanted:
-            because = f", as {why} are kept on machines of their own" if wanted > 1 else ""
+            because = f", because {why}: no two share a machine" if wanted > 1 else ""
             raise ConfigError(
                 f"hosts: {role!r} is among the roles of {found} machines, expected at least {wanted}{because}"
             )

@@ -100,8 +100,8 @@ def wait_for_launcher() -> None:
 
 
 def _run_until_launcher_ends(niceness: int) -> None:
-    """Blocks until the launcher has ended. A role calls it once it is built, and gives way to others from then on.
-    It does not return earlier: all wait for any process that still starts."""
+    """Blocks until the launcher has ended. A role calls it once it is built, and gives way to others from then
+    on."""
     import psutil  # the launcher, which imports this module too, needs none to start
 
     with contextlib.suppress(OSError):  # not every system lets a process choose

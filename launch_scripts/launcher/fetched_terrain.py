@@ -59,8 +59,8 @@ def fetch_if_missing(
     roles: Collection[str],
     progress: Progress = no_progress,
 ) -> bool:
-    """Fetches the terrain from a keeper if files of it are missing here, and save it prepared in the run's folder
-    for every process of this machine. True if the run's folder then holds a fetched terrain.
+    """Fetches the terrain from a keeper if files of it are missing here, and saves it prepared in the run's folder
+    for every process of this machine. Returns True if the run's folder then holds a fetched terrain.
 
     found  processes of runs in the namespace; the run's terrain is theirs
     roles  roles that this machine is about to start

@@ -175,8 +175,8 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
 
 
 def _say(tell: Connection, what: object) -> None:
-    """Reports the launcher. A launcher that has refused its scenario meanwhile has closed the pipe, and its user
-    must read no traceback of that."""
+    """Reports to the launcher. A launcher that has refused its scenario meanwhile has closed the pipe; its user
+    must see no traceback of that."""
     with contextlib.suppress(OSError):
         tell.send(what)
 

@@ -199,7 +199,7 @@ class LocalSwarm:
         self.running.append(running)
 
     def dismiss(self, spec: ProcessSpec) -> None:
-        """Asks a process to end for good. Once it has, it is not in `running` any more."""
+        """Asks a process to end for ever. Once it has ended, it is no longer in `running`."""
         for running in self.running:
             if running.spec.name == spec.name and running.dismissed_s is None:
                 running.dismissed_s, running.due_s = time.monotonic(), None
@@ -207,7 +207,7 @@ class LocalSwarm:
                     running.process.terminate()
 
     def _let_go(self) -> None:
-        """Forgets dismissed processes that have ended, and kill those that do not."""
+        """Forgets dismissed processes that have ended, and kills those that do not end."""
         for running in [each for each in self.running if each.dismissed_s is not None]:
             if running.alive and running.exitcode is None:
                 if time.monotonic() - (running.dismissed_s or 0.0) > STOP_GRACE_S:
@@ -245,9 +245,8 @@ class LocalSwarm:
         return endings
 
     def _end_hung(self) -> None:
-        """Ends processes which hang (`hang_watch`): at first by SIGABRT, at which they write into their log where
-        all of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
-        SIGKILL."""
+        """Ends processes which hang (`hang_watch`). First SIGABRT: the process logs the stacks of all its threads.
+        If it still runs after `STOP_GRACE_S`, SIGKILL."""
         now_s = time.monotonic()
         passed_s = now_s - self._looked_s
         if passed_s < LOOK_EVERY_S:
@@ -275,14 +274,13 @@ class LocalSwarm:
         while_waiting: Callable[[], None] = lambda: None,
         force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
-        """Ends all processes, role by role: by SIGKILL what runs `STOP_GRACE_S` later. Returns a sentence for each
-        that did not end as asked.
+        """Ends all processes, role by role: by SIGKILL those which still run after `STOP_GRACE_S`. Returns a
+        sentence for each process that did not end as asked.
 
-        One that has said that it ended is waited for no longer: it takes as long to leave as the machine is busy or
-        its disk stalls, and has nothing to do any more. It gets `STOP_GRACE_S` after all others, and its end is no
-        failure.
+        A process that has reported its end is waited for no longer: only a busy machine or a stalled disk delays
+        its exit. It gets `STOP_GRACE_S` after all others, and its end is no failure.
 
-        Once `force` says so, all are asked at once and get `FORCED_GRACE_S`. A process killed then is in
+        Once `force` returns True, all are asked at once and get `FORCED_GRACE_S`. A process killed then is in
         `cut_short`, and is no failure.
         """
         for running in self.running:
@@ -352,9 +350,9 @@ class LocalSwarm:
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
 
     def _is_final(self, running: Running, exit_code: int, ran_s: float, now_s: float) -> bool:
-        """Returns True if a process that refused to run now would do so again. A refused first start is; a later
-        one may be the network's, so it takes several in a short time. A disk that was written to once is full and
-        will have space again."""
+        """Returns True if a process that refused to run now would do so again. At the first start a refusal is
+        final; later, only after several in a short time, as the network may be the cause. A disk that was written
+        to once is full and will have space again."""
         running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
         first = running.restarts == 0 and ran_s < SETTLED_S
         return first or (exit_code != StoreError.exit_code and len(running.refused_s) >= REFUSALS_ALLOWED)

@@ -173,7 +173,7 @@ _DIGITS = 20
 
 
 def common_run_id(scenario: Scenario) -> str:
-    """Runs id derived from the scenario, so that separately started parts agree on it."""
+    """Run id derived from the scenario, so that separately started parts agree on it."""
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )
@@ -289,8 +289,8 @@ class UpOptions:
 
     @property
     def ranks_of_added(self) -> list[int]:
-        """Returns which planners of a target that is added while the swarm runs are started here: as those of the
-        scenario's first target, so that each starts on one machine, and those of one target apart."""
+        """Returns the ranks of the planners that are started here for a target which is added during the run: the
+        same ranks as of the scenario's first target. Each planner then starts once, and standbys elsewhere."""
         ids = [split_rank(spec.id) for spec in self.table if spec.role == "planner"]
         return [rank for target, rank in ids if target == self.scenario.target_ids[0]]
 

@@ -28,10 +28,11 @@ class OrderedPlanners:
     """Starts and ends planners on this machine according to orders.
 
     ranks  which of an added target's planners to start here
-    own    processes that this launcher started: of the scenario's own targets it sees to their planners only
+    own    processes that this launcher started: for the scenario's targets, it manages only these planners
     whole  whether this launcher started the whole swarm: then no other will start them
     say    tells the user
-    no_room  number of planners of added targets here -> reason why the machine cannot carry that number
+    no_room  number of planners of added targets here -> reason why the machine cannot carry that number; None if it
+             can
     """
 
     def __init__(

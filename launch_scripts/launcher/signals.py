@@ -1,5 +1,5 @@
-"""Signals: those that ask a launcher to end, and what it tells other programs (figures and health by HTTP, if it is
-given a port, and how it is to the supervisor that started it, if there is one)."""
+"""Signals which ask a launcher to end; its metrics and health by HTTP, if it is given a port, and its state to its
+supervisor."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ _NAME = "launcher"
 
 class StopAsked:
     """Counts the signals that ask for the end. SIGINT and SIGTERM: the first ends the run in order, the second ends
-    it within a second. SIGHUP, by which a terminal says that it is closed, ends it in order however often it comes;
-    it stays ignored where `nohup` has said so."""
+    it within a second. SIGHUP (terminal closed) always ends it in order, unless `nohup` has disabled it."""
 
     def __init__(self) -> None:
         self.number: signal.Signals | None = None
@@ -88,10 +87,10 @@ class StopAsked:
 
 
 class MachineSignals:
-    """Raises BusError if the port is taken; where another launcher is taken over from, it is opened once that one
-    has left it.
+    """Metrics and health of this launcher's processes, by HTTP. Raises BusError if the port is taken; if another
+    launcher is taken over from, the port is opened once that one has left it.
 
-    seen  how the processes are that this launcher has started; called by any thread
+    seen  state of the processes that this launcher has started; called by any thread
     """
 
     def __init__(self, options: UpOptions, run_id: str, seen: Callable[[], Sequence[Process]]) -> None:
@@ -125,9 +124,9 @@ class MachineSignals:
     ) -> None:
         """Notes a turn of the launcher, and answers scrapes that came since the last one.
 
-        missing  names of processes that it has started and that no process has received yet
-        up       (role, id) of the processes that live, where these are a part of the run; None: all of the run is
-                 observed, so the figures name it
+        missing  names of processes that it has started and that no process has seen alive yet
+        up       (role, id) of the living processes, if these are a part of the run; None: the whole run is
+                 observed, so the metrics name it
         """
         self._health.turned([f"word of {name}" for name in missing])
         if self._metrics is None:

@@ -96,14 +96,13 @@ class TakeOver:
         self._look_again()
 
     def _look_again(self) -> None:
-        """Updates the process to follow: one that has crashed meanwhile runs in a new generation, or comes no
-        more."""
+        """Updates the process to follow: one that has crashed meanwhile runs in a new generation, or is gone."""
         own = [each.process.pid for each in self._running if each.process is not None]
         self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
 
     def _is_free(self, name: str) -> bool:
-        """Returns True if the exclusive resources of a process are free. The launcher before starts a generation
-        that has crashed again until it ends, so the end of a generation before that says nothing."""
+        """Returns True if the exclusive resources of a process are free. The old launcher restarts crashed
+        processes until it ends itself; an earlier end of a process proves nothing."""
         return self._asked and has_ended(self.predecessors.get(name, self._launcher))
 
 
@@ -114,13 +113,13 @@ def _lacks(running: Running) -> tuple[str, ...] | None:
 
 
 def _plans(running: Running) -> bool:
-    """Returns True if a process can reply, if it is a planner."""
+    """Returns False for a planner that cannot reply yet."""
     return TABLE[running.spec.role].takes_over != "beside" or _lacks(running) == ()
 
 
 def _waits(running: Running) -> bool:
-    """Returns True if a process has come as far as the file of its promises, if it is an agent that follows
-    another; or further, if the generation before it has crashed."""
+    """Returns False for an agent that follows another one and has not come as far as the file of its promises; it
+    is further if the generation before it has crashed."""
     return not running.takes_over or _lacks(running) in ((GENERATION_BEFORE,), ())
 
 

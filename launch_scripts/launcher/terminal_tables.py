@@ -40,7 +40,7 @@ def fitted(state: RunState, above: list[RenderableType], console: Console) -> Gr
 
 
 def targets_table(state: RunState, most: int, *, always: bool = True) -> Table:
-    """A line for each target, `most` at most, with the columns of every table, or else with the others."""
+    """A line for each target, `most` at most, with the main columns, or with the remaining ones."""
     labels, rows = facts.table(state, always=always)
     shown = columns(*labels)
     kept = most if len(rows) <= most else most - 1

@@ -391,7 +391,7 @@ class _Run:
         self._terminal.say(f"from elsewhere: {tunnel(port)}, then the same address")
 
     def _register(self) -> None:
-        """Says to commands how far the run is; `begin_run` has said if that is impossible."""
+        """Registers the run's progress for other commands; `begin_run` has reported any failure."""
         register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
@@ -405,7 +405,7 @@ class _Run:
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
     def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
-        """Returns the run time (s), start-up included. All displays show this value."""
+        """Returns the title line of the displays. Its time includes the start-up."""
         if self._up_at_s is None:
             waits = f", waits for {', '.join(missing)}" * (0 < len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {elapsed_s:.0f} s"

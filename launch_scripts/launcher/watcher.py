@@ -25,7 +25,8 @@ from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, STATS, STATUS
 
 _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
-"""Topics of all processes that a launcher receives if another one records the run: routes until one is served."""
+"""Topics of all processes that a launcher receives if another one records the run; FOLLOWED only until a route is
+served."""
 _READ_S = 0.1
 """Longest time for which the launcher reads at once: it has processes to look after."""
 
@@ -41,7 +42,7 @@ class OwnPart(LatestState):
 
     @property
     def observed(self) -> LatestState:
-        """Itself, where a recorder has one."""
+        """The object itself; of a `Recorder`, the state that it records."""
         return self
 
     def look_after(self, own: frozenset[ProcessSpec]) -> None:

@@ -95,8 +95,8 @@ class Sample:
 
 
 def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
-    """Mean, p95 and max of the certified gaps of the routes that were begun since the sample before, and how many
-    these are; of the first sample those until then."""
+    """Mean, p95 and max of the certified gaps of the routes that were begun since the sample before, and the number
+    of these routes; the first sample covers all routes until then."""
     gaps: list[dict[str, float | None]] = []
     before: dict[int, int] = {}
     for sample in samples:
@@ -108,9 +108,8 @@ def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
 
 
 def at_once(samples: Sequence[Sample], of: Callable[[Sample], float]) -> list[float]:
-    """The number of vehicles that did something at the same time, on average since the sample before, from the
-    seconds that all have spent with it. A sample without a new count repeats the number before: a run which ends
-    has none."""
+    """Mean number of vehicles in a state since the sample before, from their summed seconds in it. A sample without
+    a new count repeats the number before: a run which ends has none."""
     counts = [0.0] * min(len(samples), 1)
     for early, late in itertools.pairwise(samples):
         passed_s = late.driven_s - early.driven_s

@@ -40,7 +40,7 @@ _VEHICLES_LAST_NS = 3 * NS_PER_S
 _MOST_NAMES = 1 << 14
 """Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
 _MOST_SETS = 1 << 17
-"""Sets of marks that are remembered: of a map of 4096 x 4096 cells, those of eight authors on each tile."""
+"""Sets of marks that are remembered: enough for eight authors on each tile of 4096 x 4096 cells."""
 _ODD_POSES = ("poses_refused", "poses_outside")
 """Counts of planners: poses which do not count."""
 
@@ -432,7 +432,8 @@ class LatestState(Counts):
         return pose.x_m - self.grid.west_m, self.grid.north_m - pose.y_m
 
     def learned_words(self) -> list[MarkSet]:
-        """Returns the measurements of each author of terrain classes: sets in the tile beyond the map."""
+        """Returns the measured factors of kinds of ground, by author. They are stored as one extra tile, after the
+        map's last."""
         return [marks for (_, tile), marks in sorted(self._marks.items()) if tile == self.grid.tiles]
 
     def marked(self) -> MarkedCells:

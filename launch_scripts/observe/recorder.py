@@ -104,7 +104,7 @@ class Recorder:
         self._sample(now_ns)
 
     def finish(self, now_ns: int) -> None:
-        """The run is over: its last sample is of its end."""
+        """Takes the last sample, at the run's end."""
         self.observed.touch(now_ns)
         self._add_sample(now_ns)
 

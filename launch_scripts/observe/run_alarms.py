@@ -6,8 +6,8 @@ is lost.
 
 An old tree is no alarm: later changes are repaired in it.
 
-An observer opens an alarm only if it also hears what closes it, for as long as the run lasts (`EVIDENCE`). Else a
-launcher that hears a part of the run would say for ever what was so when it last heard of it.
+An observer opens an alarm only if it also receives the messages which close it, for as long as the run lasts
+(`EVIDENCE`). Otherwise a launcher that receives only a part of the run would show an alarm for ever.
 """
 
 from __future__ import annotations

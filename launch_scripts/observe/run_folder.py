@@ -33,8 +33,8 @@ _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba"
 def begin_run(
     folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True, simulated: bool = False
 ) -> list[str]:
-    """Writes `scenario.toml` and `run.json`, makes `LAST` point here and registers the run. Returns what a person
-    should know: a run goes on without them, as on a full disk.
+    """Writes `scenario.toml` and `run.json`, makes `LAST` point here and registers the run. Returns a warning for
+    the user if a file cannot be written; the run goes on.
 
     recorded   whether a report follows; else another launcher of the run makes it
     simulated  the run has no router: no command can ask it

@@ -176,7 +176,7 @@ class OutsideObserver(RunObserver):
         self.answered = False
         """True if all processes that would reply to a query have done so."""
         self.over = False
-        """True if all processes that reply belong to another run by now. Set for good."""
+        """True if all processes that reply belong to another run by now; never reset."""
         self.answers: dict[tuple[str, str], RunInfo] = {}
         self._follows = follows
         self._early: deque[Callable[[LatestState], object]] = deque(maxlen=_EARLY)
@@ -188,7 +188,7 @@ class OutsideObserver(RunObserver):
         self.ask_gone()
 
     def tick(self, now_ns: int) -> None:
-        """Asks who takes part, if it is time to. Call it often."""
+        """Queries the processes of the run, if it is time to. Call it often."""
         if now_ns >= self._ask_due_ns and not self._asking:
             self._asking = True
             self._bus.ask(RUN, Nothing(), self._post, tag=_RUN, timeout_s=_ASK_TIMEOUT_S)

@@ -21,7 +21,7 @@ from swarm.wire.messages.orders import GoalState
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One target at an instant. `facts.TARGET_FACTS` selects and formats its fields.
+    """One target at an instant. `fact_table.TARGET_FACTS` selects and formats its fields.
 
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
@@ -62,7 +62,7 @@ class TargetLine:
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """A run at an instant. `facts.FACTS` selects and formats its fields.
+    """A run at an instant. `fact_table.FACTS` selects and formats its fields.
 
     elapsed_s       time of the run, since it began
     states          vehicles that are driven, by VehicleState
@@ -71,8 +71,7 @@ class RunState:
     well            processes that are as they should be (alive, or ended because they were asked to), and all that
                     the run needs
     crew            the same by role
-    learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
-                    whose prior does not stand
+    learned         class of ground -> measured factor on its prior pace; only classes whose factor is not 1
     goals           progress of the vehicles that were sent to places
     beside          processes that are alive and not needed: routers, monitors, agents of external vehicles
     messages_per_s  that all processes send now
@@ -197,7 +196,7 @@ def _lines(
 
 
 def _learned(latest: LatestState) -> dict[str, float]:
-    """From the planner with the most learned factors: those of other groups may have received fewer."""
+    """Learned factors, from the planner that has the most: planners of other groups may have received fewer."""
     told = [
         {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
         for (role, _), stats in latest.newest().items()

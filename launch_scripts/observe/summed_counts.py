@@ -71,12 +71,12 @@ class ProcessLoad:
 
 
 class Counts:
-    """The newest counts of every process, and of its earlier generations only what no later one carries on: an hour
-    of kills takes no more memory than a minute."""
+    """The newest counts of every process, and of earlier generations only counts that no later one continues, so
+    restarts cost no memory."""
 
     def __init__(self) -> None:
         self._generations: dict[tuple[str, str], dict[int, Stats]] = {}
-        """(role, id) -> incarnation -> what it has said last."""
+        """(role, id) -> incarnation -> its last `Stats`."""
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self._before: dict[tuple[str, str], Stats] = {}

@@ -116,7 +116,7 @@ class Rounding:
 
     @cached_property
     def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowers bounds on the sum of the n cheapest cells, s, and their numbers; both begin with 0."""
+        """Lower bounds (s) on the sum of the n cheapest cells, and each n; both begin with 0."""
         classes = np.flatnonzero(self.classes[:_LETHAL])
         counts = self.classes[classes]
         least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)

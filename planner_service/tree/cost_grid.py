@@ -91,7 +91,7 @@ class CostGrid:
         self.grid = grid
         self.config = config
         self.rule = rule_of(config)
-        """Returns which steps there are: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
+        """Rule of the allowed steps: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
         self.corners = config.corner_cutting
         """True if a diagonal step may pass a lethal cell."""
         self.stride = grid.cols + 2
@@ -145,7 +145,7 @@ class CostGrid:
         self._directions: NDArray[np.uint8] = np.empty(1 << 12, np.uint8)
         """Scratch of `walk`, which makes it longer where routes are."""
         self._trail: tuple[NDArray[np.uint32], NDArray[np.float64]] | None = None
-        """Scratch of `rests`, which makes it: room for all cells, of which only what routes need becomes memory."""
+        """Scratch of `rests`, which makes it. It reserves all cells; memory is used only where routes need it."""
         self._repair_scratch: repair.Scratch | None = None
         """Made by the first repair of a small map."""
         if self.climbs is not None:

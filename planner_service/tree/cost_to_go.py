@@ -33,8 +33,8 @@ from swarm.grid import Window
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 MOST_SPREAD_SHARE = 48
-"""While a tree is repaired, a fall in cost spreads over one cell in this number at most, ten times as expensive as
-evaluating it: beyond, whole branches have moved, and their trees are evaluated first
+"""In a repair, a fall in cost spreads over at most 1/48 of the cells: a spread costs ten times an evaluation. If
+more cells change, whole branches have moved, and their trees are evaluated first
 (docs/design/incremental-trees.md)."""
 
 
@@ -61,13 +61,13 @@ class CostToGoTree:
         self.reach = 0.0
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
         self.bound = math.inf
-        """s; a cell with no cost has no way, or costs this at least. inf of a whole tree: then it has no way. Only
-        `take_grown` makes a tree that is not whole, which is exact; it can be read, and be grown again."""
+        """s; a cell without a cost has no path, or costs at least this. inf for a whole tree: then it has no path.
+        Only `take_grown` makes a tree that is not whole, which is exact; it can be read, and be grown again."""
         self._box = 0, 0, 0, 0
         """Box of the cells that have a cost, if the tree is not whole."""
         self.window_bound: WindowBound | None = None
         """Bound proven by the last window, as long as its root is the tree's. `move` sets it, a growth resets it,
-        and so does the owner (to None) when a cell gets cheaper: it bounds from below."""
+        and so does the owner (to None) when a cell gets cheaper, as it is a lower bound."""
         self._kept: KeptScratch = {}
         """Scratch of the last small window."""
         self._walk: Walk | None = None
@@ -268,8 +268,8 @@ class CostToGoTree:
 
     @property
     def slack(self) -> tuple[float, float]:
-        """Returns the largest excess of a cost driven in an exact tree over the optimum, and never more than all of
-        it: a share of it, and a share for each unit of the cost grid's rounding of it."""
+        """Returns the bound on the relative excess of a driven cost in an exact tree over the optimum: a constant,
+        and a factor on the cost grid's `Rounding`; together at most 1."""
         return 0.0, 2.0
 
     def tighten(self, cells: Cells) -> None:

@@ -52,7 +52,8 @@ def grow_tree(
 
     climbs         of the same cells; None where entering a cell costs the same from everywhere
     cost, parent   padded, written whole; None where parents, and a bound, are not wanted
-    kept           scratch of the last growth, for one of the same size: small ones feel what it takes to make it
+    kept           scratch of the last growth, reused for the same size; allocation is a large share of small
+                   growths
     """
     cell_cost, _, stride, _, _ = padded
     size, lowest = cell_cost.size, bounds[0]
@@ -68,7 +69,7 @@ def grow_tree(
         return reach
     point_to_parents(padded, climbs, cost, root, (0, 0, size // stride - 2, stride - 2), parent)
     if reach > FINE * lowest:
-        # Steps may be lost in the rounding of the ways behind them, and parents lead in a circle.
+        # Steps may be lost in the rounding of the paths behind them, and parents lead in a circle.
         untie_parents(padded, climbs, (cost, parent, root), np.empty(2 * size, np.uint32))
     return reach
 
@@ -101,10 +102,10 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
 _SAMPLE = 1 << 10
 """Number of cells in the sample for the usual cell cost."""
 _RARE = 1 / 16
-"""Number of them that may cost less than the usual."""
+"""Share of the sampled cells that may cost less than the usual cost."""
 _FEW, _NEAR = 16.0, 4.0
-"""Buckets are as narrow as the lowest cell cost asks for where none is more than `_FEW` times as much, or the usual
-one no more than `_NEAR` times."""
+"""Buckets are as wide as the lowest cell cost if the highest is at most `_FEW`, or the usual one at most `_NEAR`,
+times that."""
 
 
 def grow_directed_costs(
@@ -115,7 +116,7 @@ def grow_directed_costs(
     cost: Floats,
     kept: dict[tuple[int, int], Any],
 ) -> None:
-    """Exact costs to a padded, passable root, written whole; the arguments are those of `growth.grow_tree`."""
+    """Computes exact costs to a padded, passable root, written whole. Arguments as of `grow_tree`."""
     cell_cost = padded[0]
     key = cell_cost.size, 0
     if key not in kept:
@@ -126,7 +127,7 @@ def grow_directed_costs(
 
 
 def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:
-    """s, of the finest buckets; whether some steps may cost less than that.
+    """Width (s) of the finest buckets, and whether some steps may cost less than that.
 
     Returns a width at which one level of buckets is as wide as the usual cell cost asks for, and the finest no
     wider than the lowest does.
@@ -153,7 +154,7 @@ _SMALL = 1 << 16
 class GrownWindow(NamedTuple):
     """Costs and parents of a window as a padded grid of its own, s.
 
-    way  s; what it costs to get from the old root to the new one inside the window; inf where there is no way
+    way  s; cost from the old root to the new one inside the window; inf if no path exists
     """
 
     box: Box

@@ -17,8 +17,8 @@ from planner_service.tree.growth import NARROW
 from shared_map.array_files import Floats
 
 MOST_BUCKETS = 1 << 12
-"""A growth that stops has narrow buckets up to this ratio of cell costs, beyond it none: to pass many empty ones
-costs less than to grow a whole map."""
+"""A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
+growing a whole map. With more, each growth is whole."""
 
 _FEW = 4
 """If fewer than one cell in this number of a growth's rows has a cost, the column of each is computed. Otherwise
@@ -76,7 +76,7 @@ class PartialGrowth:
         self.root = -1
         """The padded root of the tree in hand; -1 if there is none."""
         self.bound = 0.0
-        """s; no cell without a cost costs less. inf: it has no way."""
+        """s; every cell without a cost costs at least this; inf: it is unreachable."""
 
     @property
     def usable(self) -> bool:

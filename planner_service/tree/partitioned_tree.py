@@ -153,8 +153,8 @@ class PieceTree:
         return window.cells
 
     def mend(self) -> int:
-        """Makes the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
-        cells looked at."""
+        """Makes the tree exact after any moves and repairs, or gives way to a growth: see `exact`. Returns the
+        number of cells examined."""
         return self._mend(self._most, self._at_once)
 
     def repair(self, changes: Changes) -> int:
@@ -197,7 +197,7 @@ class PieceTree:
         return 2.0**-21, MOST_SLACK * 2.0**24
 
     def tighten(self, cells: Cells) -> None:
-        """Costs are those driven at all times."""
+        """Does nothing: costs are always those driven."""
 
     def _relabel(self, changed: NDArray[np.uint8]) -> None:
         """Labels again the changed tiles: uint8 (n,), `partition.COSTLIER` or more."""

@@ -81,7 +81,7 @@ _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
 def read_routes(
     tree: CostToGoTree | PieceTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int
 ) -> RouteBatch:
-    """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
+    """Routes from the cells, in order. Failures are statuses, not exceptions. `max_cells` 0: whole routes."""
     grid = tree.cost_grid
     starts, statuses = asked.copy(), np.empty(asked.size, np.uint8)
     walks = grid.walk(tree.parent, grid.pad(tree.root), starts, max_cells, grid.time_cost, statuses)

@@ -62,7 +62,7 @@ class Orders:
         return self._give(subject="vehicle", name=vehicle)
 
     def go(self, vehicle: str) -> Acknowledged:
-        """Resumes it."""
+        """Starts a stopped vehicle again."""
         return self._give(subject="vehicle", name=vehicle, off=True)
 
     def send(self, vehicle: str, places: Sequence[str], *, then: Then = "hold") -> Acknowledged:
@@ -97,11 +97,11 @@ class Orders:
         return self._give(subject="target", name=id, cell=self._session.frame.cell(x_m, y_m))
 
     def remove_target(self, id: str) -> Acknowledged:
-        """No vehicle chases it any more."""
+        """Removes a target: no vehicle chases it any more."""
         return self._give(subject="target", name=id, off=True)
 
     def set(self, key: str, value: float | None) -> Acknowledged:
-        """Changes a setting of the scenario that may change live; None: what the scenario says."""
+        """Changes a setting that may change during the run; None restores the scenario's value."""
         return self._give(subject="set", name=key, value=value, off=value is None)
 
     def add_zone(
@@ -113,7 +113,7 @@ class Orders:
         for_s: float | None = None,
         vehicle_class: str | None = None,
     ) -> tuple[str, Acknowledged]:
-        """Closes an area, or give it a pace. Returns the zone's name, too.
+        """Closes an area, or gives it a pace. Returns the zone's name, too.
 
         polygon_m     corners (x_m, y_m)
         name          a zone that has it is replaced; the keeper finds one if it is empty
@@ -139,7 +139,7 @@ class Orders:
         return list(self._operator.zones().zones)
 
     def given(self) -> list[Order]:
-        """All else that is ordered."""
+        """Orders in force, without zones and goals."""
         return list(self._operator.orders().orders)
 
     def _give(self, **fields: Any) -> Acknowledged:
@@ -178,7 +178,7 @@ class Swarm:
         self._session = session
         self._stop = stop
         self._open_trusted = open_trusted or (lambda: session.bus)
-        """Opens a bus whose words count in right of way."""
+        """Opens a bus whose messages right of way accepts."""
         self._externals: list[ExternalSession] = []
 
     def __enter__(self) -> Swarm:
@@ -218,8 +218,7 @@ class Swarm:
 
     @property
     def ended(self) -> SwarmError | None:
-        """Reason why nothing can be said any more: it is closed, or another run is in the namespace. None while it
-        can."""
+        """Reason why the connection is unusable (closed, or another run in the namespace); None while it works."""
         return self._session.ended
 
     @property
@@ -243,9 +242,9 @@ class Swarm:
         id             letters, digits, '_' and '.'; not of any other vehicle
         group          whose it is
         radius_m       around its place, which others keep clear
-        lease_s        others avoid its last place for so long after they hear nothing more
-        right_of_way   it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Needs the user
-                       of the swarm, or with certificates the name `rover.GROUP.ID`. The state for its next
+        lease_s        others avoid its last place for this time after its last message
+        right_of_way   it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Works for the
+                       swarm's user only, or with the certificate `rover.GROUP.ID`. The state for its next
                        generation is kept in the file of this path; if True, in a file of this user for each run and
                        id
         vehicle_class  whose routes it asks for: one of the scenario's classes of vehicles
@@ -261,7 +260,8 @@ class Swarm:
         return vehicle
 
     def _external(self, id: str, file: Path | None) -> ExternalSession:
-        """Raises StoreError if another program has the file."""
+        """Opens the session of right of way for an external vehicle. Raises StoreError if another program has the
+        file."""
         from swarm.right_of_way.external_session import ExternalSession
         from swarm.right_of_way.incarnations import GenerationFile
         from swarm.runtime.run_secret import state_folder
@@ -280,7 +280,7 @@ class Swarm:
 
         id       of the target
         tracker  name of this tracker, the same after a restart: it goes on at once then
-        lease_s  the target counts as lost, or as the next tracker's, so long after the last word
+        lease_s  after this time without a pose the target is lost, or the next tracker owns it
         """
         return Target(self._session, id, tracker, lease_s)
 

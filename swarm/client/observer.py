@@ -17,22 +17,23 @@ from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, Obstacle, V
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, OBSTACLE, POSE
 
 _SILENCE_NS = 5 * NS_PER_S
-"""A fleet that was silent for so long is shown no more. Agents tell at each tick, and at once when they leave."""
+"""A fleet that was silent for this time is no longer shown. Agents publish at each tick, and at once when they
+leave."""
 EVERY_S = 0.2
-"""Time between two readings of positions if a program does not say: five a second are smooth to an eye."""
+"""Default time between two readings of positions: five a second are smooth to an eye."""
 _HEARD = (FLEET, OBSTACLE, POSE, FOLLOWED, NOTE, MARKS)
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
 """Sets of marks that are held: a quarter of what a replica may hold (docs/design/map-merge-law.md)."""
 _ZONES = "operator."
-"""Authors that begin so are zones."""
+"""Authors with this prefix write zones."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeenVehicle:
-    """A vehicle, where it was said to be last.
+    """A vehicle at its last reported place.
 
-    state   idle, waiting, following, arrived, stranded, lost; "outside" of one that is not the swarm's own
+    state   idle, waiting, following, arrived, stranded, lost, outdated; "outside" if it is not the swarm's own
     target  the target that it chases, None if there is none
     """
 
@@ -48,7 +49,7 @@ class SeenVehicle:
 
 @dataclass(frozen=True, slots=True)
 class SeenTarget:
-    """A target, where its owner among the trackers said last that it is.
+    """A target at the last place that its owner among the trackers reported.
 
     captures  how often it was captured
     tracker   name of the owner, if it has one
@@ -72,8 +73,8 @@ class Mark:
 
 
 class Observer:
-    """Positions, targets, routes, marks and notes of a swarm, from its making on. Made by `Swarm.observer`; use it
-    in a `with`, or `leave`. Each property is a copy, made when it is read.
+    """Positions, targets, routes, marks and notes of a swarm, from its creation on. Made by `Swarm.observer`; use
+    it in a `with`, or `leave`. Each property is a copy, made when it is read.
 
     notes  sentences for people, as they come: `for note in observer.notes`; captures have the kind "capture"
     """
@@ -245,7 +246,7 @@ def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
 
 def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Mark]:
     """The winning statements of these sets, which are for the same vehicles, by cell of the grid: the newest wins,
-    of two with one stamp that of the larger author, and an operator's over all others, as in
+    on equal stamps that of the larger author id, and an operator's over all others, as in
     `shared_map.replication.merge`."""
     won: dict[int, tuple[bool, int, str, int, float]] = {}
     for each in sets:

@@ -19,16 +19,16 @@ R = TypeVar("R", bound="Reported")
 
 
 class Reported:
-    """One thing under an id of its own. Use it in a `with`, or `leave`.
+    """A vehicle or target of this program, under its own id. Use it in a `with`, or `leave`.
 
     incarnation  when it joined, in ns: tells it from an earlier generation under the same id
     """
 
     def __init__(self, session: Session, topic: Topic, kind: str, id: str, lease_s: float, repeat_ns: int) -> None:
-        """Does not take part before `_join`.
+        """The reports begin at `_join`.
 
-        kind       the noun for it in sentences
-        repeat_ns  time from a word to its repetition; a fourth of the lease if that is shorter
+        kind       its noun in sentences: vehicle or target
+        repeat_ns  time from a report to its repetition; a quarter of the lease if that is shorter
         """
         self.id = id
         self.lease_s = lease_s
@@ -44,7 +44,7 @@ class Reported:
         self._repeat_due_ns = 0
 
     def _join(self) -> None:
-        """Takes part from now on: the last step of its making, as events and ticks come on another thread.
+        """Begins the reports. Call it last: from then on another thread delivers events and ticks.
 
         Raises ConfigError where the id is in use in this program.
         """
@@ -119,7 +119,7 @@ class Target(Reported):
     id           of the target, as in the scenario
     tracker      name of this tracker; a later start under the same name takes over at once. None: each start is a
                  tracker of its own
-    lease_s      the target counts as lost when nothing was heard of its trackers for so long
+    lease_s      after this time without a pose the target counts as lost
     incarnation  when its tracking began, in ns
     """
 

@@ -22,17 +22,17 @@ class Route:
     While the target is unseen the status is "searching", and the route leads to a cell where it may be.
 
     target         id of the target; empty of a route between places
-    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target, lethal_target;
-                   searching. Between places also growing (not known yet), lethal_goal, outside_goal
-    cells          from the vehicle's cell to the target's, or as far as the planner tells
-    turns          of a pulled route the indices of the cells in which it turns, its first and last included: it
-                   goes straight from one to the next, along the cells between. Empty: from cell to cell
+    status         "ok", "searching", or why there is no route: unreachable, outside, lethal_start, no_target,
+                   lethal_target. Between places also growing (not known yet), lethal_goal, outside_goal
+    cells          from the vehicle's cell to the target's, or as far as the planner states them
+    turns          indices of the cells in which a pulled route turns, first and last included: it is straight from
+                   one to the next. Empty: from cell to cell
     cost_s         seconds that it takes
     lower_bound_s  proven: no route is quicker on the planner's present map
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
-    pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
+    pose_age_s     age of the target's pose when the planner replied; None if it does not state it
     tracker_lost   no tracker publishes the target now: this is its last known position
-    target_cell    cell of the target that the planner went by: a target that has just moved may be elsewhere by now
+    target_cell    cell of the target that the planner used: a target that has just moved may be elsewhere by now
     nearest_cell   of a lethal target the nearest cell that can be reached
     """
 
@@ -77,7 +77,7 @@ class Route:
 
     @property
     def ok(self) -> bool:
-        """True if a path exists."""
+        """True if the route leads to the target."""
         return self.status == RouteStatus.OK
 
     @property
@@ -118,8 +118,8 @@ class Route:
 
     def ahead(self, x_m: float, y_m: float, distance_m: float) -> tuple[float, float, float]:
         """Returns the position after driving `distance_m` along the route from its point nearest to a location:
-        (x_m, y_m, heading_rad), the heading clockwise from north. At its end it stays there; without a way the
-        place itself is returned."""
+        (x_m, y_m, heading_rad), the heading clockwise from north. At its end it stays there; without a route the
+        location itself is returned."""
         points = self.points_m
         if not points:
             return x_m, y_m, 0.0

@@ -37,7 +37,8 @@ _REPORT_AGAIN_NS = 60 * NS_PER_S
 _SAME_CLOCK_NS = NS_PER_S
 """Clocks that differ by less are not corrected: an answer is as old as a tick."""
 _MOST_REPORTED = 1024
-"""Sentences that are remembered for it. Beyond this number all are forgotten, and reported again at most."""
+"""Problems that are remembered, to report each once. Beyond this number all are forgotten; then some are reported
+twice."""
 
 
 class Part(Protocol):
@@ -136,7 +137,7 @@ class Session:
     ) -> float:
         """A number that a program gives. Raises ConfigError, and counts it, on anything else or beyond its bounds.
 
-        more  the least is itself too little
+        more  the value must exceed `least`
         """
         try:
             found = number(name, value)
@@ -211,8 +212,8 @@ class Session:
         return self.ask(ROUTE, request, timeout_s, target=target, asker=asker_of("rover", vehicle))
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
-        """Waits for the replies to a query. Raises BusError; ConfigError on the thread that would have to bring
-        it."""
+        """Waits for the replies to a query. Raises BusError; ConfigError if called on the thread that delivers
+        replies."""
         if threading.get_ident() == self._owner:
             raise ConfigError("a callback must not wait for an answer: ask from another thread, or follow a target")
         try:

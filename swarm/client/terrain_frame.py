@@ -17,7 +17,7 @@ from swarm.wire.messages.processes import RunInfo
 
 WGS84 = "EPSG:4326"
 _EARTH_M = 6_371_000.0
-"""Mean radius of the Earth: an obstacle within 1 % of it is taken for the Earth."""
+"""Mean radius of the Earth: a planet or moon within 1 % of it is taken for the Earth."""
 Point = tuple[float, float]
 _Transform = Callable[[float, float], Point]
 
@@ -126,7 +126,7 @@ class Frame:
 
 
 def _degrees_of(system: Any) -> str:
-    """Returns the geographic system of the obstacle on which a coordinate system lies: WGS 84 on the Earth."""
+    """Returns the geographic system of the planet or moon of a coordinate system: WGS 84 on the Earth."""
     ellipsoid = system.ellipsoid
     if ellipsoid is None or abs(ellipsoid.semi_major_metre - _EARTH_M) < 0.01 * _EARTH_M:
         return WGS84

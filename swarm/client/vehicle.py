@@ -81,7 +81,7 @@ class OwnMarks:
         until_ns: int = FOREVER,
         class_number: int = 0,
     ) -> list[MarkSet]:
-        """State the same of all these cells of the grid. Returns the sets to put.
+        """Makes one statement about all these cells of the grid. Returns the sets to put.
 
         class_number  for whom: 0 is all vehicles, a class of the scenario counts from 1 on
         """
@@ -185,7 +185,7 @@ class Vehicle(Reported):
         super().__init__(session, OBSTACLE, "vehicle", id, lease_s, _REPEAT_NS)
         self._target: str | None = None
         self._goal: int | None = None
-        """The cell of the place that is followed; None of a target."""
+        """The cell of the place that is followed; None if a target is followed."""
         self._route: Route | None = None
         self._ask_due_ns = 0
         self._asking = False
@@ -241,8 +241,8 @@ class Vehicle(Reported):
 
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
         """States into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
-        and wait until it may enter the first. Returns the cells that it may enter now: no other vehicle enters them
-        before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
+        and waits until it may enter the first. Returns the cells that it may enter now: no other vehicle enters
+        them before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
 
         Raises ConfigError where cells leap, and unless the vehicle was made with `right_of_way`.
         """
@@ -316,7 +316,7 @@ class Vehicle(Reported):
             self._streams.clear()
 
     def _ask(self, now_ns: int) -> None:
-        """For the route from where we are now, which keeps us registered with the planner."""
+        """Asks for a route from here, which keeps us registered with the planner."""
         target, before = self._target, self._route
         assert target is not None
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS
@@ -387,8 +387,8 @@ class Vehicle(Reported):
         pace_s_per_m  they take so long to drive
         clear         they are as the map had them before
         for_s         lifetime of the mark; None: it holds until another mark replaces it
-        only_for      one of the scenario's classes of vehicles, for which the statement counts before those for
-                      all, unless they are lethal. To the others it says nothing
+        only_for      vehicle class to which the statement applies; there it overrides non-lethal marks for all
+                      classes
 
         Raises ConfigError on a cell outside, on a pace beyond its bounds, on a class that there is not, and unless
         exactly one thing is stated.

@@ -25,7 +25,7 @@ class AgentPlan(msgspec.Struct, frozen=True):
 
 
 class AddedAgent(msgspec.Struct, frozen=True):
-    """An agent that joins a run which its scenario does not name it in.
+    """An agent that the run's scenario does not name.
 
     at  place near which its vehicles enter, as a target's `start`; anywhere if None
     """
@@ -37,7 +37,7 @@ class AddedAgent(msgspec.Struct, frozen=True):
 def added_agent(
     scenario: Scenario, id: str, group: str, count: int, at: tuple[int, int] | str | None = None
 ) -> AddedAgent:
-    """Vehicles of a group of the scenario, beside those that it has. Raises ConfigError where that cannot be."""
+    """Vehicles of a group of the scenario, beside those that it has. Raises ConfigError if that is impossible."""
     groups = {each.name: each for each in scenario.groups}
     if group not in groups:
         raise ConfigError(f"scenario {scenario.name} has no group {group!r}; it has {', '.join(groups)}")
@@ -67,8 +67,8 @@ PLACE_TREES_BYTES = 256 << 20
 
 
 def place_trees_bytes(budget_bytes: int, classes: int, cells: int) -> int:
-    """Bytes of trees to places that are kept for each of some classes: its share, and two whole trees at least, as
-    two askers far away would else drop each other's tree for ever. One takes 5 bytes a cell, with its parents."""
+    """Bytes of trees to places that are kept for each of some classes: its share, but at least two whole trees;
+    otherwise two distant askers would evict each other's for ever. One takes 5 bytes a cell, with its parents."""
     return max(budget_bytes // classes, 2 * 5 * cells)
 
 

@@ -109,7 +109,7 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
 
 
 def check_cost(cost: CostConfig, source: str) -> None:
-    """Raises ConfigError where settings of cost that are valid each do not fit together."""
+    """Raises ConfigError if individually valid settings of cost contradict each other."""
     where = f"{source}: cost"
     if bool(cost.slope_table) != (cost.slope_rule == "table"):
         needs = (

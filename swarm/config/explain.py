@@ -129,7 +129,7 @@ def is_several(hint: Any) -> bool:
 # --- errors -------------------------------------------------------------------------------------------------------
 
 _LONGEST_LIST = 200
-"""Characters of a list of allowed words; where one of them is near, a longer list says nothing more."""
+"""Characters of a list of allowed words; if a similar word is suggested, a longer list is left out."""
 _SECONDS = {"s": 1, "sec": 1, "ms": 0.001, "m": 60, "min": 60, "h": 3600}
 _UNITS: tuple[tuple[str, dict[str, float]], ...] = (
     ("_m_per_s", {"m/s": 1, "km/h": 1 / 3.6, "kmh": 1 / 3.6}),
@@ -337,9 +337,9 @@ def _meant_number(key: str, value: Any, kind: Any) -> str:
         return ""
     number, unit = float(match[1].replace(",", ".")), match[2]
     if unit is None:
-        return f" without quotes: {key} = {number:g}"
+        return f"; leave out the quotes: {key} = {number:g}"
     factor = next(units for ending, units in _UNITS if key.endswith(ending)).get(unit.lower())
-    return ", without its unit" if factor is None else f" without its unit: {key} = {number * factor:.6g}"
+    return "; leave out the unit" + ("" if factor is None else f": {key} = {number * factor:.6g}")
 
 
 def _field_type(section: Any, key: str) -> Any:

@@ -107,9 +107,9 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Sources of elevation and photo.
 
-    source              "jacksboro" (built in), "synthetic", or a file. Rasters: .tif, .tiff, .img, .hgt, .bil,
-                        .flt, .dem, .dt2, .nc, .vrt; each of these may be in a .zip. Others: .asc, .npz, .png, .csv,
-                        .xyz, .map (MovingAI), .yaml or .yml (ROS map)
+    source              "jacksboro" (built in), "synthetic", or a file. .tif, .tiff, .img, .hgt, .bil, .flt, .dem,
+                        each also in a .zip; .dt2, .nc, .vrt, .asc, .grd, .npz, .png, .csv, .xyz, .map (MovingAI),
+                        .yaml or .yml (ROS map)
     photo               a colour GeoTIFF on the same ground
     labels              a TOML file of labelled polygons and points, from which the classes of the photo are learnt
     cover               a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or your own

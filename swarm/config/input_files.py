@@ -49,7 +49,7 @@ class FileKind(Enum):
     RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
-    GENERATIONS = ("lives", 1 << 20, StoreError)
+    GENERATIONS = ("generations", 1 << 20, StoreError)
     RECORDING = ("recording", 256 << 20, StoreError)
 
     def __init__(self, what: str, most_bytes: int, error: type[SwarmError]) -> None:
@@ -126,7 +126,7 @@ def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
 
 
 def size(count: int) -> str:
-    """Bytes, readable."""
+    """A number of bytes, as people read it."""
     for power, unit in ((9, "GB"), (6, "MB")):
         if count >= 10 ** (power - 1):
             return f"{count / 10**power:.1f} {unit}"

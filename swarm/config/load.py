@@ -26,7 +26,7 @@ from swarm.places import read_place
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Reads and check a scenario. Raises ConfigError that names the file and the key."""
+    """Reads and checks a scenario. Raises ConfigError that names the file and the key."""
     return parse_scenario(read_text(path, FileKind.SCENARIO), str(path), base=path.parent)
 
 
@@ -155,7 +155,7 @@ def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
 
 
 def _faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """Returns contradictions between settings that are valid each."""
+    """Returns contradictions between individually valid settings."""
     count = sum(target.count for target in scenario.targets)
     if count > MOST_TARGETS:
         yield f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}"

@@ -1,7 +1,7 @@
 """Election of a leader among the processes with one job: by rank, heartbeats and a lease.
 
-Leader election as in Garcia-Molina's bully algorithm, without its messages: ranks are fixed, and everybody tells
-the others regularly whether it is ready and whether it leads. `Leadership` decides and is pure; `Candidacy` is its
+Leader election as in Garcia-Molina's bully algorithm, without its messages: ranks are fixed, and each candidate
+regularly publishes whether it is ready and whether it leads. `Leadership` decides and is pure; `Candidacy` is its
 side on the bus.
 """
 
@@ -22,15 +22,15 @@ HEARTBEAT_NS = NS_PER_S // 10
 """Time between two heartbeats of a candidate: one message of some 50 bytes, ten times a second
 (docs/design/leader-and-standby.md)."""
 LEASE_NS = 6 * HEARTBEAT_NS
-"""A leader that has been silent for so long is replaced."""
+"""A leader that has been silent for this time is replaced."""
 SETTLED_NS = 2 * NS_PER_S
-"""A better process takes over from a ready leader once it has been there and ready for so long. A process that was
-just started has the whole map by then, and one that keeps stalling never comes so far."""
+"""A better process takes over from a ready leader once it has been alive and ready for this time. A process that
+was just started has the whole map by then, and one that keeps stalling never comes so far."""
 _MOST_OTHERS = 64
-"""Generations of other candidates that are remembered."""
+"""Incarnations of other candidates that are remembered."""
 
 _Order = tuple[bool, int, int]
-"""The lower, the better: not ready, rank, older generation."""
+"""(not ready, rank, -incarnation): the lowest is best, so of one rank the younger incarnation."""
 
 
 @dataclass(slots=True)
@@ -46,7 +46,7 @@ class Leadership:
     """One candidate's view of who leads.
 
     - A leader stops when it receives heartbeats of a better-ranked leader. Better is: ready, then of lower rank,
-      then the younger generation.
+      then the younger incarnation.
     - A candidate that receives no leader's heartbeat for one lease takes over, unless a better-ranked candidate is
       alive, which does so itself.
     - A candidate that receives a worse-ranked leader takes over once it has been ready for `SETTLED_NS`, or for a
@@ -74,12 +74,12 @@ class Leadership:
         self._led_ns = 0
         """Time when a leader was last heard; at first, when this began to listen."""
         self._better_since_ns: int | None = None
-        """Since when this has been ready while a worse one leads; None if it is not so."""
+        """Time from which on this candidate has been ready while a worse one leads; None if it is not so."""
         self._others: dict[tuple[int, int], _Other] = {}
         """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
-        """Takes in what another candidate says."""
+        """Takes the heartbeat of another candidate."""
         rank = split_rank(heartbeat.id)[1]
         key = (rank, heartbeat.incarnation)
         if key == (self._rank, self._incarnation):
@@ -149,7 +149,7 @@ log = logging.getLogger(__name__)
 class Candidacy:
     """Heartbeats for one process, and `Leadership` fed with those of the others of its job.
 
-    standbys  how many others there are by the scenario; with none it leads and says nothing
+    standbys  number of standbys in the scenario; if 0, this process leads without heartbeats
     """
 
     def __init__(self, setup: RoleSetup, standbys: int, tick_hz: float, bus: Bus, post: Post) -> None:
@@ -166,7 +166,7 @@ class Candidacy:
         return self._core.leads
 
     def start(self) -> None:
-        """Listens to all candidates of this job, other generations of this id among them."""
+        """Subscribes to all candidates of this job, other incarnations of this id among them."""
         for rank in range(self._standbys + 1 if self._standbys else 0):
             id = ranked_id(job_of(self._setup.id), rank)
             self._bus.subscribe(LEAD, self._post, role=self._setup.role, id=id)
@@ -190,7 +190,7 @@ class Candidacy:
         return leads
 
     def tell(self, member: Member, now_ns: int) -> None:
-        """States to people that another leads from now on. Without standbys there is nothing to say."""
+        """Notes for people whether this process leads from now on. Without standbys there is nothing to note."""
         if not self._standbys:
             return
         text = "leads from now on" if self.leads else "is a standby from now on"

@@ -69,7 +69,7 @@ class Modules:
 
 
 def note(what: str) -> None:
-    """Something is loaded now, by the thread that calls."""
+    """Records that the calling thread loads something now."""
     if not hasattr(_this, "counters"):
         return
     if refused:

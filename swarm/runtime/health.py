@@ -32,10 +32,10 @@ _PINGS_PER_LIMIT = 4
 
 
 class Supervisor:
-    """Tells it when the process is up, that its loop turns, and what it does.
+    """Tells a supervisor (systemd) when the process is up, that its loop turns, and what it does.
 
     address    of the socket: a path, or `@name` in the abstract namespace; None: there is no supervisor
-    limit_ns   after so long without a ping the supervisor takes the process for hung; None: it does not look
+    limit_ns   after this time without a ping the supervisor takes the process for hung; None: it does not watch
     """
 
     def __init__(self, address: str | None, limit_ns: int | None = None) -> None:
@@ -101,7 +101,7 @@ SLOT_BYTES = 1024
 """Bytes of one record: a head of 23 and the missing needs, some ten of `_LONGEST_NEED` characters at most."""
 BOARD_BYTES = 2 * SLOT_BYTES
 _HEAD = struct.Struct("<IQQBH")
-"""Checksum of all behind it, when it was written, `limit_ns`, phase, length of what follows."""
+"""Checksum of the rest, time of writing, `limit_ns`, phase, length of the record that follows."""
 _CHECKED = 4
 """Bytes of the checksum itself, which it does not cover."""
 _WRITE_NS = NS_PER_S // 10

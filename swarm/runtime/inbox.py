@@ -167,7 +167,8 @@ _NAMELESS = "?"
 """Asker of all questions of costly topics that name none."""
 
 _Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
-"""Key -> (number, event), in the order of arrival. The key is the number, or what only the newest counts of."""
+"""Key -> (number, event), in the order of arrival. The key is the number, or the key of which only the newest event
+is kept."""
 
 
 class Inbox:
@@ -272,7 +273,7 @@ class Inbox:
         return dropped
 
     def _put_question(self, question: Question) -> list[Question]:
-        """Adds a question. Returns those that have to go for it."""
+        """Adds a question. Returns the questions which were dropped to make room."""
         costly = question.topic.costly
         asker = question.asker or (_NAMELESS if costly else f"{_NAMELESS}{question.topic.name}")
         rank = 1 if costly and not is_own(asker) else 0

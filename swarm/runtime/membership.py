@@ -19,7 +19,7 @@ from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS, Topic, asker_of
 from swarm.wire.versions import are_neighbours
 
-_MOST_HOST_STATES, _MOST_OVER = 40, 20
+_MOST_STANDING, _MOST_OVER = 40, 20
 """Alarms in a `Stats`, which has to stay a small message: it is sent each second."""
 
 
@@ -38,7 +38,7 @@ class Alarms:
     def happened(
         self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None
     ) -> None:
-        """Something happened that is over at once, as a collision."""
+        """Reports an event that is over at once, such as a collision."""
         self._over.append(
             Alarm(
                 kind=kind, about=about[:100], text=text[:MOST_TEXT], since_ns=now_ns, over_ns=now_ns,
@@ -49,9 +49,9 @@ class Alarms:
     def begin(
         self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None
     ) -> None:
-        """Something lasts from now on; said again, only its words and its place change."""
+        """Something lasts from now on; a repeated call changes only its text and its place."""
         known = self._standing.get((kind, about))
-        if known is None and len(self._standing) >= _MOST_HOST_STATES:
+        if known is None and len(self._standing) >= _MOST_STANDING:
             return
         since_ns = now_ns if known is None else known.since_ns
         self._standing[kind, about] = Alarm(
@@ -128,7 +128,7 @@ class Member:
         self._linked = True
         """True if the router is reached; a bus opens with its link."""
         self._asked_all = self._confirmed
-        """True if a round of replies has ended in which no other run was alone."""
+        """True if a round of replies has ended in which not all of them named other runs."""
         self._needs: list[tuple[str, Callable[[], bool]]] = []
         self._router_appeared = False
         """True if a router's token has risen since others were asked for their run. All are asked once a second at
@@ -145,7 +145,7 @@ class Member:
         return Peer(self.info.role, self.info.id, self.info.incarnation)
 
     def needs(self, what: str, met: Callable[[], bool]) -> None:
-        """Name something without which the process does not do its job, and how to see whether it is there."""
+        """Names a need of the process, and how to test whether it is met."""
         self._needs.append((what, met))
 
     def lacks(self) -> list[str]:
@@ -163,7 +163,7 @@ class Member:
         self._ask()
 
     def move_to(self, bus: Bus) -> None:
-        """Goes on, and join, on another bus; the one before is closed."""
+        """Continues on another bus, and joins there; the previous one is closed."""
         self._bus = bus
         self.join()
 
@@ -256,7 +256,7 @@ class Member:
         self._rate_ns, self._rate_of, self._dropped = now_ns, sent, dropped
 
     def ask_by_name(self, topic: Topic, request: Message, *, tag: str, timeout_s: float = 2.0, **of: str) -> None:
-        """Asks under our name, so that our questions have a turn of their own.
+        """Sends a query under our name, so that our queries have a turn of their own.
 
         of  fields of the key, beside the asker
         """

@@ -40,18 +40,18 @@ _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
 """Roles that answer `Obey`: zones concern those which hold a map, other orders those which move things, too."""
 _FIND_S = 3.0
-"""Longest wait for all members to say who they are: some ticks of a process that is behind."""
+"""Longest wait for all members to reply with their names: some ticks of a process that is late."""
 _ORDER_S = 5.0
 """Longest wait for a keeper, which answers once the order is on its disk."""
 OBEY_S = 3.0
-"""Longest wait for all to obey. An order reaches who misses it with the next word of a keeper, a second later."""
+"""Longest wait for all to obey. A process that missed an order gets it from a keeper a second later."""
 _MOST_SETS = DIGEST_ROW_BYTES << 13
-"""Most bytes of a zone's sets that are asked about, so that a process looks for them within a tick: those of 8,192
-tiles, the others of a larger zone come with them."""
+"""Most bytes of a zone's sets that are asked about, so that a process looks for them within a tick: those of the
+first 8,192 tiles. A larger zone's other tiles arrive with them."""
 _LEAVE_S = 0.3
 """After the last answer, time for tokens of those who leave to fall: Zenoh takes 3 to 8 ms for a killed process."""
 _MOST_REPLIES = 1 << 16
-"""More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
+"""More than any swarm has processes, tiles with marks or orders: a flood of replies fills no memory."""
 _MOST_SEEN = 1 << 12
 """The holder of a certificate may raise tokens of any number of generations, one after the other."""
 

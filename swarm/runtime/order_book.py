@@ -46,11 +46,11 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Register(Generic[K, E]):
-    """The newest entry about each thing.
+    """The newest entry about each subject.
 
     key   what an entry is about
-    rank  of two entries about one thing that of the higher rank counts
-    full  whether there is no room for another thing, beside this number of things
+    rank  of two entries about one subject that of the higher rank counts
+    full  whether there is no room for another subject, beside this number of subjects
 
     version  grows with every change
     """
@@ -67,7 +67,7 @@ class Register(Generic[K, E]):
         return len(self._entries)
 
     def merge(self, entries: Iterable[E], now_ns: int) -> list[E]:
-        """Takes in entries; returns those that were news."""
+        """Adds entries; returns those that were new."""
         news = []
         for entry in entries:
             key = self._key(entry)
@@ -82,11 +82,11 @@ class Register(Generic[K, E]):
         return news
 
     def get(self, key: K) -> E | None:
-        """The entry about a thing, in force or taken back."""
+        """The entry about a subject, in force or revoked."""
         return self._entries.get(key)
 
     def in_force(self, key: K) -> E | None:
-        """The entry that stands about a thing; None if there is none, or it was taken back."""
+        """The entry in force about a subject; None if there is none, or it was revoked."""
         entry = self._entries.get(key)
         return None if entry is None or entry.off else entry
 
@@ -188,7 +188,7 @@ class FreshOrders:
         """Timestamps that counted and that are not too old yet."""
 
     def fault(self, stamp_ns: int, now_ns: int) -> str | None:
-        """Reason why an order of this timestamp does not count; None if it does, which it will not do again."""
+        """Reason why an order of this timestamp does not count; None if it counts. It then counts only once."""
         self._taken = {each for each in self._taken if each > now_ns - FRESH_NS}
         if not max(now_ns - FRESH_NS + 1, self._since_ns) <= stamp_ns < now_ns + FRESH_NS:
             return (

@@ -42,7 +42,7 @@ class OrderClient:
     goals  of an agent: its book of where its vehicles are sent, which keepers alone have beside it
 
     book    the orders
-    shared  cell -> how many vehicles were sent there, where it is more than one
+    shared  cell -> number of vehicles sent there, if more than one
     """
 
     def __init__(

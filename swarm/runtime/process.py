@@ -37,7 +37,8 @@ LONG_NS = 200_000_000
 _RETRY_S = 0.02
 """Time between two attempts to get a free slot: a tenth of the shortest job that queues."""
 _LONGEST_S = 20.0
-"""Longest wait (s): the process whose turn it is may be stopped for ever. Turns make jobs quick, not right."""
+"""Longest wait (s): the process whose turn it is may be stopped for ever. A missed turn costs time, not
+correctness."""
 
 
 class JobSlots:
@@ -215,7 +216,7 @@ class Process:
 
     tick_hz  ticks a second; those that come too late are dropped and counted (`ticks_dropped`). `ticks_late` counts
              these and those that come later than half a period after they were due
-    phase    where in the clock's periods all ticks but the first fall, from 0 to 1; if None, where that falls
+    phase    phase of all ticks after the first in the clock's periods, 0 to 1; None: that of the first
     health   receives the health of the loop and the missing needs of the service; None: no reports
     gather   of the service's bus, called before each call of the service; None: the service collects nothing
 

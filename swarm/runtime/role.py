@@ -26,7 +26,7 @@ class RoleSetup:
     added          of an agent that the scenario does not name: what it hosts
     restarts       how often it was started before in this run
     before         what its earlier generations have counted; None if that is not known
-    anew           True if the run begins with it: there was no earlier generation of it
+    anew           True if this is its first start in the run
     takes_over     whether the generation before it may still run on this machine, and ends soon
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     health         receives the health of its loop; None: no reports

@@ -148,7 +148,8 @@ def figures(stats: Stats) -> int:
 
 
 def carried(before: Stats, own: Stats) -> Stats:
-    """The statistics of a generation that goes on counting where the one before it ended. Gauges are of now."""
+    """The statistics of a generation that continues the counts of the previous one. Gauges are only the new
+    generation's."""
     return msgspec.structs.replace(
         own,
         counts=_summed(before.counts, own.counts),

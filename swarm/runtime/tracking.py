@@ -12,7 +12,7 @@ The owner's poses count; those of others are refused. Leases are counted from th
 clock, and how long a tracker has tracked is the difference of two times of its own clock: no clock is compared with
 another.
 
-The rule looks at those only who live. Receivers which have received different messages, or the same in another
+Only living trackers count. Receivers which have received different messages, or the same in another
 order, agree again once each has received a pose of every living tracker. This is seniority as in the oldest member
 of a process group (Birman, Joseph 1987), not the first that each happened to receive. Cost: a tracker that was
 silent for longer than its lease gets its target back when it returns with the same incarnation.
@@ -130,8 +130,8 @@ class Tracking:
         return Verdict.COUNTS
 
     def place(self, pose: TargetPose, now_ns: int) -> None:
-        """Takes a pose for where a target without a tracker is, for as long as its lease says. The same once more
-        changes nothing."""
+        """Uses a pose as the place of a target without a tracker, until its lease ends. The same pose again changes
+        nothing."""
         if pose != self.pose and 0 <= pose.cell < self._grid.cells:
             self.pose, self.heard_ns = pose, now_ns
             self._until_ns = now_ns + int(pose.lease_s * NS_PER_S)
