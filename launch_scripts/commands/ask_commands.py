@@ -102,16 +102,15 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
     watch  Show processes once a second, as `swarm top`.
     """
-    from rich.console import Console
-
     from launch_scripts.commands.status_view import ask_status, print_status, show_top, status_fields
+    from launch_scripts.launcher.terminal_tables import whole_output
 
     if watch:
         show_top(where, each=False, once=False, as_json=as_json)
     elif as_json:
         typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:
-        print_status(ask_status(where), Console(markup=False))
+        print_status(ask_status(where), whole_output())
 
 
 @command(app, ASK)

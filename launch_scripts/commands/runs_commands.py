@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch_scripts.command_line import RUN, command, complete_runs
-from launch_scripts.commands.shared_options import AsJson, RunOption, say_newest
+from launch_scripts.commands.shared_options import AsJson, RunOption, network_of, say_newest
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
 from swarm.errors import ConfigError, StoreError, SwarmError
@@ -66,7 +66,7 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
     if as_json:
         typer.echo(json.dumps(told, indent=2))
         return
-    table = columns("run", "scenario", "state", "began", "seconds", "processes", "live page", "folder")
+    table = columns("run", "scenario", "state", "began", "seconds", "processes", "router", "live page", "folder")
     for column in table.columns:
         column.justify = "left"
     for each in told:
@@ -103,7 +103,8 @@ def down(run: RunArgument = None) -> int:
         terminal.say(f"run {found.name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
         return 0
     if not found.launchers:
-        raise ConfigError(f"run {found.name} does not run here; `swarm ps` lists those which do")
+        which = "no run of yours runs" if run is None else f"run {found.name} does not run"
+        raise ConfigError(f"{which} here; `swarm ps` lists those which do")
     for pid in found.launchers:
         with suppress(psutil.NoSuchProcess):  # it ended by itself
             process = psutil.Process(pid)
@@ -289,6 +290,7 @@ def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
         "began": began,
         "seconds": lasted_s,
         "processes": processes,
+        "router": network.connect[0] if run.launchers and (network := network_of(run.folder)) else None,
         "page": page_of(run.web_port) if run.launchers and run.web_port else None,
         "folder": str(run.folder),
     }

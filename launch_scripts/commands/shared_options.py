@@ -278,7 +278,7 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
         folders = [find_run(name, runs or RUNS)]
     else:
         folders = [each.folder for each in registered() if runs is None or each.folder.parent == runs.resolve()]
-    networks = ((folder.resolve().name, _network_of(folder)) for folder in folders)
+    networks = ((folder.resolve().name, network_of(folder)) for folder in folders)
     tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
     if name is None:
         tried.append(("", NetworkConfig()))
@@ -297,7 +297,7 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     )
 
 
-def _network_of(folder: Path) -> NetworkConfig | None:
+def network_of(folder: Path) -> NetworkConfig | None:
     """The network of a run, from its scenario as it ran; None if it was simulated or that cannot be read."""
     from launch_scripts.observe.run_folder import SCENARIO_FILE, run_facts
     from swarm.config.scenario import NetworkConfig

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.console import Tell, make_output_outlive_readers, progress
-from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table
+from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table, whole_output
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
@@ -228,7 +228,7 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
 def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
     """Shows the swarm until Ctrl-C or its end. Raises BusError if no process replies at the beginning."""
     make_output_outlive_readers()
-    console = Console(highlight=False)
+    console = whole_output()
     moving = console.is_terminal and not as_json and not once
     with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus:
         observer, clock = observed(bus, where, _TOP_LISTEN_S), MonotonicClock()

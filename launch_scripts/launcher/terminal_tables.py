@@ -19,6 +19,12 @@ _FEWEST_TARGETS = 3
 """Lines of targets where the terminal has no room for any: two targets and how many more there are."""
 
 
+def whole_output() -> Console:
+    """Standard output, for a command that prints once: into a pipe or a file nothing is cut or broken."""
+    console = Console(highlight=False, markup=False)
+    return console if console.is_terminal else Console(highlight=False, markup=False, width=1000, height=10_000)
+
+
 def live_table(state: RunState, title: str, console: Console) -> Group:
     """The table of one instant, as wide and as high as the console allows: lines that are too long go on in the
     next, and of many targets the first are shown."""

@@ -86,7 +86,7 @@ def of_all(value: tuple[int, int]) -> str:
 
 def each(value: Mapping[str, int]) -> str:
     """17 following, 1 arrived"""
-    return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none yet"
+    return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none"
 
 
 def factors(value: Mapping[str, float]) -> str:

@@ -50,11 +50,12 @@ def added_agent(
 
 
 def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
-    """(role, id) of the processes that a complete run needs. A router belongs to no run, and nothing waits for a
-    monitor."""
+    """(role, id) of the processes that a complete run needs, with each keeper that `network.admit` names. A router
+    belongs to no run, and nothing waits for a monitor."""
     standbys = scenario.standbys
+    names = (name.partition(".") for name in ("keeper.0", *scenario.network.admit))
     return [
-        ("keeper", "0"),
+        *dict.fromkeys((role, id) for role, _, id in names if role == "keeper"),
         *(("targets", ranked_id("0", rank)) for rank in range(standbys.targets + 1)),
         *(("planner", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in scenario.target_ids),
         *(("places", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in places_of(scenario)),

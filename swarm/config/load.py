@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import ipaddress
+import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
@@ -23,6 +24,8 @@ from swarm.config.vehicle_classes import aloft_classes, class_faults, complete_c
 from swarm.errors import ConfigError
 from swarm.liveness import split_rank
 from swarm.places import read_place
+
+log = logging.getLogger(__name__)
 
 
 def load_scenario(path: Path) -> Scenario:
@@ -118,6 +121,7 @@ def _of_today(raw: dict[str, Any]) -> dict[str, Any]:
         for key, value in list(table.items()):
             match former.get(path + key):
                 case str(new) if new not in table:
+                    log.warning("%s%s is %s now: the next version does not read the former name", path, key, new)
                     table[new] = table.pop(key)
                 case tuple(neutral) if not neutral or (value in neutral and not isinstance(value, bool)):
                     del table[key]

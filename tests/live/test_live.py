@@ -96,6 +96,7 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
 def test_a_run_is_found_from_any_folder_with_its_page_logs_and_pids(live: LiveSwarm) -> None:
     (run,) = json.loads(swarm("ps", "--json").stdout)
     assert (run["folder"], run["state"], run["processes"]) == (str(live.run_dir), "running", 8)
+    assert run["router"] == live.endpoint
     eventually(lambda: swarm("open", "--print").stdout.startswith("http://127.0.0.1:"), 30, "the live page")
     told = swarm("logs", "planner-t1", "-n", 2, "--run", run["run"])
     assert told.stdout == "".join((live.run_dir / "planner-t1.log").read_text().splitlines(True)[-2:])
@@ -107,6 +108,7 @@ def test_a_run_is_found_from_any_folder_with_its_page_logs_and_pids(live: LiveSw
     pids = {f"{each['role']}-{each['id']}": each["pid"] for each in status["processes"]}
     assert pids == {name: live.pid_of(name) for name in pids}
     titles = {name: psutil.Process(pid).cmdline()[0] for name, pid in pids.items()}
+    assert "messages/s  restarts" in swarm("top", "--once", "--each").stdout, "a pipe has no width that cuts"
     assert titles["planner-t0"] == f"swarm: planner t0 (run {run['run']})"
     for name in ("launcher", "planner-t9", "1"):
         told = swarm("kill", name)

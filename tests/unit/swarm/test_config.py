@@ -6,7 +6,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from swarm.config.agents import plan_agents
+from swarm.config.agents import crew_of, plan_agents
 from swarm.config.explain import meanings
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import Scenario
@@ -43,12 +43,21 @@ def test_an_empty_scenario_is_a_whole_one():
     assert scenario.vehicle_count == 100
 
 
-def test_a_scenario_which_version_0_2_wrote_is_read_under_the_names_of_today():
+def test_a_run_needs_each_keeper_whose_name_its_routers_admit():
+    assert ("keeper", "0") in crew_of(Scenario())
+    crew = crew_of(parse_scenario("[network]\nadmit = ['keeper.east', 'keeper.0', 'operator.anna']"))
+    assert [id for role, id in crew if role == "keeper"] == ["0", "east"]
+
+
+def test_a_scenario_which_version_0_2_wrote_is_read_under_the_names_of_today(caplog):
     """It has all keys of 0.2 which are no more, also in the costs of classes, with values of its presets."""
     old = (Path(__file__).parents[2] / "specimens/scenario-0.2.0.toml").read_text("utf-8")
     new, gone = re.subn(r"(?m)^(grpc_port|critical_slope\w*|cross_slope\w*|rough_per_m) = .*\n", "", old)
     new = new.replace("plot_regions", "shard_regions").replace("body_radius_m", "obstacle_radius_m")
     assert (parse_scenario(old), gone) == (parse_scenario(new), 13)
+    assert {record.message.partition(": ")[0] for record in caplog.records} == {
+        "map.plot_regions is shard_regions now", "targets.body_radius_m is obstacle_radius_m now",
+    }  # fmt: skip
     for preset, factor in (("hiker", 1.0), ("wheeled", 2.0), ("tracked", 1.5)):
         text = f"[cost]\npreset = '{preset}'\n"
         assert parse_scenario(f"{text}cross_slope_factor = {factor}") == parse_scenario(text)
