@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from planner_service.kernels.layout import step_offsets
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, joined
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.partial_growth import CutTree, PartialGrowth, route_of, whole_tree
+from planner_service.tree.partial_growth import CutTree, PartialGrowth, Way, way_of, whole_tree
 from swarm.wire.route_columns import Route, RouteStatus
 
 MOST_CHANGES = 500
@@ -29,8 +29,6 @@ _MOST_ENTRIES = 2000
 """Changes of the map since a tree was looked at, beyond which it is dropped: to sort them out takes 30 ms."""
 _LONGEST_LOG = 1 << 16
 """Cells in the log of changes: a tree that would need older ones is dropped."""
-_OBJECTS_BYTES = 1 << 10
-"""Memory of a tree beside its costs."""
 _NO_CELLS: Cells = np.empty(0, np.int64)
 
 
@@ -52,8 +50,7 @@ class GoalAnswer(NamedTuple):
         return self.route.status is RouteStatus.NO_TARGET
 
 
-Directions = NDArray[np.uint8]
-_Found = tuple[CutTree, Directions | None]
+_Found = tuple[CutTree, Way | None]
 """A tree, and a route of it; None if it has none from the start, or does not know it yet."""
 
 
@@ -87,8 +84,8 @@ class GoalTrees:
         self._budget = budget_bytes
         self._growth = PartialGrowth(costs)
         self._offsets = step_offsets(costs.stride).astype(np.int64)
-        self._lengths = np.array((1.0, costs.diagonal))
-        """Lengths of a straight and of a diagonal step."""
+        self._room: NDArray[np.uint8] = np.empty(costs.size, np.uint8)
+        """Room for the longest route, of which only what routes need becomes memory."""
         self._in_hand: _Kept | None = None
         # By goal, in the order of their last asks.
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
@@ -138,13 +135,14 @@ class GoalTrees:
         known: _Found | None = None
         if kept is not None:
             self._kept.move_to_end(goal)
-            known = self._known(kept, at)
+            known = self._known(kept, at, most_steps)
         grown = 0
         if known is None:
-            known, grown = self._grown(goal, kept, root, at, max(most_cells, 1))
-        tree, directions = known
-        if directions is not None:
-            return GoalAnswer(self._route(tree, start, directions, most_steps), grown_cells=grown)
+            tree, grown = self._grown(goal, kept, root, at, max(most_cells, 1))
+            known = self._found(tree, at, most_steps)
+        tree, way = known
+        if way is not None:
+            return GoalAnswer(self._route(tree.at(at, self.costs.stride), start, way, most_steps), False, grown)
         if tree.bound == math.inf:
             return GoalAnswer(Route(status=RouteStatus.UNREACHABLE, start=start), grown_cells=grown)
         frontier_s = tree.bound * (1.0 - 1e-6) * self.costs.time_share
@@ -156,43 +154,41 @@ class GoalTrees:
         """Returns True if the cheapest routes between two cells are known to cost what they did before the last
         changes. Nothing is grown, and the cache keeps its order."""
         kept = self._up_to_date(goal)
-        return kept is not None and self._known(kept, self.costs.pad(start)) is not None
+        return kept is not None and self._known(kept, self.costs.pad(start), 0) is not None
 
     def _up_to_date(self, goal: int) -> _Kept | None:
         """The tree of a goal with the changes near it since it was asked last; None, and dropped, if those are too
         many."""
         kept = self._kept.get(goal)
-        if kept is not None and not self._collect(kept):
+        if kept is None:
+            return None
+        first = kept.seen - self._forgotten
+        kept.seen = self._forgotten + len(self._log)
+        known = first >= 0 and len(self._log) - first <= _MOST_ENTRIES
+        if known and kept.tree is not None and first < len(self._log):
+            near = [_near(each, kept.tree.box, self.costs.stride) for each in self._log[first:]]
+            kept.changes = joined([kept.changes, *near])
+        if not known or kept.changes.cells.size > MOST_CHANGES:
             self._drop(goal)
             return None
         return kept
 
-    def _collect(self, kept: _Kept) -> bool:
-        """Collects the changes near a tree. Returns False if they are too many."""
-        if kept.seen < self._forgotten:
-            return False
-        fresh = self._log[kept.seen - self._forgotten :]
-        if len(fresh) > _MOST_ENTRIES:
-            return False
-        kept.seen = self._forgotten + len(self._log)
-        if kept.tree is not None and fresh:
-            near = [_near(each, kept.tree.box, self.costs.stride) for each in fresh]
-            kept.changes = joined([kept.changes, *near])
-        return kept.changes.cells.size <= MOST_CHANGES
-
-    def _known(self, kept: _Kept, start: int) -> _Found | None:
+    def _known(self, kept: _Kept, start: int, most: int) -> _Found | None:
         """The answer of a tree as it is; None if it must grow for that."""
         tree = self._held if kept.tree is None else kept.tree
         cost = tree.at(start, self.costs.stride)
         if not kept.changes.cells.size:
-            if cost < math.inf:
-                return tree, route_of(self.costs, tree, start)
-            return (tree, None) if tree.bound == math.inf else None
+            return self._found(tree, start, most) if cost < math.inf or tree.bound == math.inf else None
         if cost == math.inf:
             return None
-        route = self._as_it_was(kept.changes, tree, start)
-        level, stands = self._growth.stays(tree, kept.changes, self._cells(start, route))
-        return (tree, route) if stands or cost < level * (1.0 - 1e-6) else None
+        way = self._as_it_was(kept.changes, tree, start, most)
+        level, stands = self._growth.stays(tree, kept.changes, self._cells(start, way))
+        return (tree, way) if stands or cost < level * (1.0 - 1e-6) else None
+
+    def _found(self, tree: CutTree, start: int, most: int) -> _Found:
+        """The answer of a tree of the present map."""
+        has_way = tree.at(start, self.costs.stride) < math.inf
+        return tree, way_of(self.costs, tree, start, most, self._room) if has_way else None
 
     @property
     def _held(self) -> CutTree:
@@ -201,21 +197,21 @@ class GoalTrees:
         whole = growth.cost.reshape(-1, stride)
         return CutTree(growth.root, (0, 0, *whole.shape), whole, growth.bound, 0.0)
 
-    def _as_it_was(self, changes: Changes, tree: CutTree, start: int) -> Directions:
-        """The directions of a route on the map on which the tree was grown."""
+    def _as_it_was(self, changes: Changes, tree: CutTree, start: int, most: int) -> Way:
+        """A route on the map on which the tree was grown."""
         costs, cells = self.costs.cell_cost, changes.cells
         now = costs[cells]
         costs[cells[::-1]] = changes.before[::-1]  # of a cell that changed twice, its first cost stays
         try:
-            return route_of(self.costs, tree, start)
+            return way_of(self.costs, tree, start, most, self._room)
         finally:
             costs[cells] = now
 
-    def _grown(self, goal: int, kept: _Kept | None, root: int, start: int, most: int) -> tuple[_Found, int]:
+    def _grown(self, goal: int, kept: _Kept | None, root: int, start: int, most: int) -> tuple[CutTree, int]:
         """Grows the tree until it has a cost for the start. Returns the cells grown, too."""
         growth = self._growth
         if not growth.usable:
-            return self._grown_whole(goal, root, start)
+            return self._grown_whole(goal, root)
         if kept is None or (kept.tree is not None and kept.tree.parent is not None):
             self._drop(goal)
             self._put_down()
@@ -223,7 +219,7 @@ class GoalTrees:
             kept = self._kept[goal] = _Kept(None, self._forgotten + len(self._log))
         elif kept.tree is not None:
             tree, changes, level = kept.tree, kept.changes, math.inf
-            self.bytes -= _bytes(tree)
+            self.bytes -= tree.bytes
             kept.tree, kept.changes = None, NO_CHANGES
             self._put_down()
             if changes.cells.size:
@@ -232,49 +228,35 @@ class GoalTrees:
         self._in_hand = kept
         cells = growth.go_on(np.array((start,)), most)
         if cells < 0:
-            return self._grown_whole(goal, root, start)
-        tree = self._held
-        return (tree, route_of(self.costs, tree, start) if growth.cost[start] < np.inf else None), cells
+            return self._grown_whole(goal, root)
+        return self._held, cells
 
-    def _grown_whole(self, goal: int, root: int, start: int) -> tuple[_Found, int]:
+    def _grown_whole(self, goal: int, root: int) -> tuple[CutTree, int]:
         self._drop(goal)
         tree = whole_tree(self.costs, root)
         self._kept[goal] = _Kept(tree, self._forgotten + len(self._log))
-        self.bytes += _bytes(tree)
+        self.bytes += tree.bytes
         self._evict()
-        has_way = tree.at(start, self.costs.stride) < math.inf
-        return (tree, route_of(self.costs, tree, start) if has_way else None), self.costs.grid.cells
+        return tree, self.costs.grid.cells
 
-    def _route(self, tree: CutTree, start: int, directions: Directions, most: int) -> Route:
-        costs, at = self.costs, self.costs.pad(start)
-        cost = tree.at(at, costs.stride)
-        cells, lengths = self._cells(at, directions), self._lengths[directions & 1]
-        steps = directions.size if not 0 < most < directions.size else most
-
-        def driven(first: int) -> float:
-            if costs.climbs is None:
-                return float(costs.time_cost[cells[first + 1 :]] @ lengths[first:])
-            assert tree.parent is not None
-            walks = costs.walk(tree.parent, tree.root, cells[first : first + 1].copy(), 0, costs.time_cost)
-            return float(walks.driven[0])
-
-        driven_s = driven(0)
+    def _route(self, cost: float, start: int, way: Way, most: int) -> Route:
+        costs = self.costs
         bound = cost * (1.0 - 2.0 * float(costs.rounding.at(np.float64(cost)))) * costs.time_share
         return Route(
             status=RouteStatus.OK,
             start=start,
-            directions=directions[:steps].tobytes(),
-            cost_s=driven_s,
-            lower_bound_s=min(max(bound, 0.0), driven_s),
-            length_m=float(lengths[:steps].sum()) * costs.grid.resolution_m,
-            remaining_s=driven(steps) if steps < directions.size else 0.0,
+            directions=way.directions[: most or way.directions.size].tobytes(),
+            cost_s=way.driven_s,
+            lower_bound_s=min(max(bound, 0.0), way.driven_s),
+            length_m=way.length_m,
+            remaining_s=way.rest_s,
         )
 
-    def _cells(self, start: int, directions: Directions) -> Cells:
-        """The padded cells that directions lead through from one."""
-        cells = np.empty(directions.size + 1, np.int64)
+    def _cells(self, start: int, way: Way) -> Cells:
+        """The padded cells that a route leads through from one."""
+        cells = np.empty(way.directions.size + 1, np.int64)
         cells[0] = start
-        np.cumsum(self._offsets[directions], out=cells[1:])
+        np.cumsum(self._offsets[way.directions], out=cells[1:])
         cells[1:] += start
         return cells
 
@@ -285,7 +267,7 @@ class GoalTrees:
         kept, self._in_hand = self._in_hand, None
         if kept is not None and self._growth.root >= 0:
             kept.tree = self._growth.cut()
-            self.bytes += _bytes(kept.tree)
+            self.bytes += kept.tree.bytes
             self._evict()
 
     def _drop(self, goal: int) -> None:
@@ -296,23 +278,17 @@ class GoalTrees:
             self._in_hand = None
             self._growth.forget()
         if kept.tree is not None:
-            self.bytes -= _bytes(kept.tree)
+            self.bytes -= kept.tree.bytes
 
     def _evict(self) -> None:
         """Drops trees, the one with the oldest ask first, until the budget holds."""
-        for goal in [goal for goal, kept in self._kept.items() if kept.tree is not None]:
-            if self.bytes <= self._budget:
-                return
-            self._drop(goal)
-
-
-def _bytes(tree: CutTree) -> int:
-    return _OBJECTS_BYTES + tree.bytes
+        while self.bytes > self._budget:
+            self._drop(next(goal for goal, kept in self._kept.items() if kept.tree is not None))
 
 
 def _near(changes: Changes, box: tuple[int, int, int, int], stride: int) -> Changes:
-    """Those of the changes that lie in a box of padded cells, or beside it."""
+    """Those of the changes that lie in a box of padded cells."""
     rows, cols = np.divmod(changes.cells, stride)
     row0, col0, row1, col1 = box
-    near = (rows >= row0 - 1) & (rows <= row1) & (cols >= col0 - 1) & (cols <= col1)
+    near = (rows >= row0) & (rows < row1) & (cols >= col0) & (cols < col1)
     return Changes(changes.cells[near], changes.before[near], changes.after[near])

@@ -57,6 +57,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     parents.point_to_parents,
     StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,
+    StepKernel(crops.box_of, None),
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
     route_walk.drive_rests,

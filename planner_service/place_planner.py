@@ -1,8 +1,11 @@
 """The process `places`: routes between any two cells of the map, for groups that share their marks.
 
 A place is a goal without a process of its own: its tree is grown as far as its askers are and is kept for the next
-(`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
-changes, and the asker that has paid least is next. A vehicle whose route a change concerns is pushed another, as by
+(`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Questions of agents come first, then
+those whose goal is near, then those of the asker that has paid least. One that was begun is finished before another
+of its kind begins. Begun by turns, a thousand growths would drop each other's trees from the cache.
+
+Between two slices the map takes its changes. A vehicle whose route a change concerns is pushed another, as by
 planners of targets (`Followers`). Nothing here need outlive the process: the one that takes over grows again when
 asked.
 """
@@ -76,6 +79,8 @@ class _Question:
     asked_ns: int
     found: list[Route] = field(default_factory=list)
     lethal_goal: bool = False
+    turn: int = 0
+    """Those of a lower one come first: of agents before those of others, and of one slice before longer ones."""
     version: int = -1
     """Version of the map on which they were found."""
 
@@ -209,8 +214,8 @@ class PlacesService(PlanningProcess):
         self._waiting: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
         self._at_work: _Question | None = None
         """The question of which the worker has a slice."""
-        self._going_on: set[int] = set()
-        """Identities of the questions that wait for their next slice."""
+        self._going_on: list[_Question] = []
+        """Questions that wait for another slice. The last one has the lowest turn."""
         for name in ("place_routes", "place_cells_grown", "place_questions_refused", "pushes"):
             self.counters.count(name, 0)
 
@@ -243,11 +248,11 @@ class PlacesService(PlanningProcess):
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
-        if self._at_work is not None:
-            self._drop(self._at_work, "the process ends")
-            self._at_work = None
-        while (question := self._waiting.take()) is not None:
-            self._drop(question, "the process ends")
+        waiting = iter(self._waiting.take, None)
+        for question in (self._at_work, *self._going_on, *waiting):
+            if question is not None:
+                self._drop(question, "the process ends")
+        self._at_work = None
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
@@ -272,33 +277,42 @@ class PlacesService(PlanningProcess):
             self._go_on()
 
     def _wait(self, question: _Question) -> None:
-        """Puts a question into the queue, at the price of its next slice: a growth takes about three times the
+        """Puts a question into the queue, at the price of its first slice: a growth takes about three times the
         square of the distance in cells."""
         request, cols = question.request, self._cost_maps[GROUND].grid.cols
         row, col = divmod(request.to, cols)
         away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
-        cells = min(3 * max(away, default=0) ** 2, SLICE_CELLS)
-        price = _BASE_PRICE + len(request.cells) + cells // _CELLS_OF_A_PRICE
-        rank = 0 if is_own(question.asker) else 1
-        for dropped in self._waiting.put(question.asker, question, price=price, rank=rank):
-            self._going_on.discard(id(dropped))
+        cells = 3 * max(away, default=0) ** 2
+        price = _BASE_PRICE + len(request.cells) + min(cells, SLICE_CELLS) // _CELLS_OF_A_PRICE
+        question.turn = 2 * (not is_own(question.asker)) + (cells > SLICE_CELLS)
+        flow = f"{question.asker} {question.turn}"
+        for dropped in self._waiting.put(flow, question, price=price, rank=question.turn):
             self._drop(dropped, "too many questions wait here already: ask again in a second")
+
+    def _next(self) -> _Question | None:
+        """The question that has the next slice."""
+        if self._going_on and not self._waiting.comes_before(self._going_on[-1].turn):
+            return self._going_on.pop()
+        return self._waiting.take()
 
     def _go_on(self) -> None:
         """Gives the worker the next slice, if it has none."""
-        while self._at_work is None and (question := self._waiting.take()) is not None:
+        while self._at_work is None and (question := self._next()) is not None:
             if question.event is not None and question.event.expired:
-                self._going_on.discard(id(question))
                 question.event.end()
                 continue
             trees, news = self._trees(question.request.vehicle_class), None
             if question.event is None and not question.found and not self._starts_now(trees, question):
-                self._going_on.discard(id(question))
                 continue
-            if not self._going_on or self._now_ns - trees.kept_up_ns >= _KEEPS_UP_NS:
-                news = trees.news(self._now_ns)
             self._at_work = question
+            if not self._goes_on or self._now_ns - trees.kept_up_ns >= _KEEPS_UP_NS:
+                news = trees.news(self._now_ns)
             self._worker.submit("places", partial(trees.work, question, news), self._post, SLICE_CELLS * _CELL_NS)
+
+    @property
+    def _goes_on(self) -> bool:
+        """True if a question has had a slice and is still to be answered."""
+        return bool(self._going_on) or (self._at_work is not None and self._at_work.version >= 0)
 
     def _starts_now(self, trees: _ClassTrees, question: _Question) -> bool:
         """Moves the start of a route that no vehicle asked for to where the vehicle is by now. Returns False if it
@@ -325,15 +339,14 @@ class PlacesService(PlanningProcess):
         question, self._at_work = self._at_work, None
         if question is None:
             return
-        self._going_on.discard(id(question))
         trees = self._trees(question.request.vehicle_class)
         self.counters.count("place_cells_grown", done.grown)
         trees.followers.touch(Window(0, 0, 0, 0), done.changed)
         for vehicle in done.outdone:
             trees.followers.mark_stale(vehicle)
         if not question.done and (question.event is None or now_ns - question.asked_ns < _HOLD_NS):
-            self._going_on.add(id(question))
-            self._wait(question)
+            question.turn |= 1
+            self._going_on.append(question)
         elif question.event is None:
             self._push_routes(trees, question, now_ns)
         else:
@@ -423,7 +436,7 @@ class PlacesService(PlanningProcess):
         """A zone is obeyed once the map has it: the next question finds it in the trees."""
         pending = any(each.cost_map.dirty for each in self._classes.values())
         return order.subject is not None or (
-            not (pending and self._going_on) and self._sync.holds(order.author, order.sets, self._now_ns)
+            not (pending and self._goes_on) and self._sync.holds(order.author, order.sets, self._now_ns)
         )
 
 

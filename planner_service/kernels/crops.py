@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import BOX, GRID, INF, RULE_FOUR, RULE_OCTILE, step_length
+from planner_service.kernels.layout import BOX, GRID, INF, RULE_OCTILE, SQRT2_EXACT, diagonal_length
 
 _DETOUR = 0.4142135
 """Least that a diagonal octile step costs beyond a straight one, in straight ones."""
@@ -24,6 +24,21 @@ def _cost_in(crop, box, row, col):
         return INF
     c = crop[row - row0, col - col0]
     return c if c >= 0 else INF
+
+
+@kernel("(u4[::1], i8)")
+def box_of(cells, stride):
+    """The box of some padded cells, at least one. Divides in float64, which vectorises and is exact here."""
+    row0 = col0 = np.int32((1 << 31) - 1)
+    row1 = col1 = np.int32(0)
+    share = 1.0 / stride
+    for i in range(cells.size):
+        v = np.int32(cells[i])
+        row = np.int32((v + 0.5) * share)
+        col = np.int32(v - row * np.int32(stride))
+        row0, row1 = min(row0, row), max(row1, row)
+        col0, col1 = min(col0, col), max(col1, col)
+    return row0, col0, row1 + 1, col1 + 1
 
 
 @kernel(f"({GRID}, {BOX}, f4[:, ::1], i8[::1], f4[::1], f8, i8[::1], UniTuple(f8, 2), u1[::1])")
@@ -76,33 +91,43 @@ def stays_exact(grid, box, crop, cells, before, bound, route, known, mark):
     return level, stands
 
 
-@kernel(f"({GRID}, {BOX}, f4[:, ::1], i8, i8, u1[::1])")
-def walk_by_costs(grid, box, crop, start, root, directions):
-    """Writes the directions of a cheapest route from a padded cell that has a cost, by costs alone; of equals the
-    first as in `parents`. Returns how many, or -1 if it does not end at the root within as many as have room."""
+@kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
+def walk_by_costs(grid, box, crop, time_cost, ends, directions):
+    """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents`.
+
+    crop       one row of it after the other. All neighbours of a cell with a cost lie in the box
+    time_cost  float32 (size,), s, of a straight step into a padded cell
+    ends       padded cells, a start that has a cost and the root; and the number of steps of the first part
+    Returns the steps, or -1 if it does not end at the root within as many as have room; diagonal ones of the first
+    part; what it takes, s, all and the first part.
+    """
     cell_cost, offsets, stride, rule, corners = grid
-    v = start
-    n = 0
+    v, root, part = ends
+    row0, col0, _, col1 = box
+    width = col1 - col0
+    beside = (-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1)
+    at = (v // stride - row0) * width + v % stride - col0
+    lengths = np.float32(1.0), diagonal_length(rule)
+    n = slanted = 0
+    driven = first = 0.0
     while v != root:
         best = INF
         way = -1
-        for j in range(4 if rule == RULE_FOUR else 8):
+        for j in range(8):
             k = 2 * j if j < 4 else 2 * j - 7
-            u = v + offsets[k]
-            odd = k & 1
-            if (
-                odd
-                and not corners
-                and not max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) < INF
-            ):
-                continue
-            key = _cost_in(crop, box, u // stride, u % stride) + cell_cost[u] * step_length(rule, odd)
-            if key < best:
-                best = key
-                way = k
+            key = crop[at + beside[k]] + cell_cost[v + offsets[k]] * lengths[k & 1]
+            shut = max(cell_cost[v + offsets[k - (k & 1)]], cell_cost[v + offsets[(k + 1) & 7]]) == INF
+            if key < best and not (k & 1 and shut and not corners):
+                best, way = key, k
         if way < 0 or n == directions.size:
-            return -1
+            return -1, 0, 0.0, 0.0
         directions[n] = way
         n += 1
         v += offsets[way]
-    return n
+        at += beside[way]
+        step = np.float64(time_cost[v]) * (SQRT2_EXACT if way & 1 and rule == RULE_OCTILE else 1.0)
+        driven += step
+        if n <= part:
+            first += step
+            slanted += way & 1
+    return n, slanted, driven, first

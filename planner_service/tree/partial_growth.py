@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
-from planner_service.kernels.crops import stays_exact, walk_by_costs
+from planner_service.kernels.crops import box_of, stays_exact, walk_by_costs
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
@@ -20,16 +20,12 @@ MOST_BUCKETS = 1 << 12
 """A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
 growing a whole map. With more, each growth is whole."""
 
-_FEW = 4
-"""If fewer than one cell in this number of a growth's rows has a cost, the column of each is computed. Otherwise
-its rows are scanned, which takes a third as long a cell."""
-
 
 class CutTree(NamedTuple):
     """The part of a root's tree that was grown: exact costs, on the map as it was.
 
     root    padded cell
-    box     padded rows and columns (row0, col0, row1, col1), in which all cells with a cost lie
+    box     padded rows and columns (row0, col0, row1, col1), around all cells with a cost and their neighbours
     cost    float32 (rows, cols), s; inf or less where a cell has none
     bound   s; no cell without a cost costs less. inf: it has no way
     width   s, of the buckets of the growth
@@ -45,7 +41,8 @@ class CutTree(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        return self.cost.nbytes + (0 if self.parent is None else self.parent.nbytes)
+        """Returns its memory, with that of its objects."""
+        return (1 << 10) + self.cost.nbytes + (0 if self.parent is None else self.parent.nbytes)
 
     def at(self, cell: int, stride: int) -> float:
         """s, of a padded cell; inf where it has no cost."""
@@ -55,6 +52,21 @@ class CutTree(NamedTuple):
             return math.inf
         cost = float(self.cost[row - row0, col - col0])
         return cost if cost >= 0 else math.inf
+
+
+class Way(NamedTuple):
+    """A route that was read off a tree.
+
+    directions  uint8, one for each step to the root
+    driven_s    what it takes, by the time of each step
+    rest_s      what is left of that after the part that is given
+    length_m    of that part
+    """
+
+    directions: NDArray[np.uint8]
+    driven_s: float
+    rest_s: float
+    length_m: float
 
 
 class PartialGrowth:
@@ -141,8 +153,10 @@ class PartialGrowth:
         self.bound = self.reach if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
-        """Returns the tree in hand, as an array of its own; then there is none in hand."""
-        box = self.box()
+        """Returns the tree in hand, as an array of its own with a rim of cells without a cost. Then none is
+        in hand."""
+        row0, col0, row1, col1 = self.box()
+        box = row0 - 1, col0 - 1, row1 + 1, col1 + 1
         inner = self.inside(box)
         tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
         self._empty(inner)
@@ -151,13 +165,8 @@ class PartialGrowth:
     def box(self) -> tuple[int, int, int, int]:
         """Returns the padded rows and columns in which all cells with a cost lie."""
         assert self._scratch is not None
-        cells, stride = self._scratch[0][: self.touched], self._grid.stride
-        row0, row1 = int(cells.min()) // stride, int(cells.max()) // stride + 1
-        if cells.size < (row1 - row0) * stride // _FEW:
-            cols = cells - cells // np.uint32(stride) * np.uint32(stride)
-        else:
-            cols = np.flatnonzero(np.isfinite(self.inside((row0, 0, row1, stride))).any(axis=0))
-        return row0, int(cols.min()), row1, int(cols.max()) + 1
+        box: tuple[int, int, int, int] = box_of(self._scratch[0][: self.touched], self._grid.stride)
+        return box
 
     def forget(self) -> None:
         """There is no tree in hand any more. The work follows the size of the tree."""
@@ -205,16 +214,26 @@ class PartialGrowth:
         return float(level), bool(stands)
 
 
-def route_of(cost_grid: CostGrid, tree: CutTree, start: int) -> NDArray[np.uint8]:
-    """Returns the directions of a cheapest route from a padded cell that has a cost to the tree's root."""
+def way_of(costs: CostGrid, tree: CutTree, start: int, part: int, room: NDArray[np.uint8]) -> Way:
+    """Returns a cheapest route from a padded cell that has a cost to the tree's root.
+
+    part  steps of the part that is measured; 0 is the whole route
+    room  uint8, written: for as many steps as the longest route has
+    """
     if tree.parent is None:
-        directions = np.empty(tree.cost.size, np.uint8)
-        steps = walk_by_costs(cost_grid.padded, tree.box, tree.cost, start, tree.root, directions)
+        ends = start, tree.root, part or room.size
+        steps, slanted, driven, first = walk_by_costs(
+            costs.padded, tree.box, tree.cost.reshape(-1), costs.time_cost, ends, room
+        )
         if steps < 0:
             raise AssertionError("a route does not end at the target: the tree is broken")
-        return directions[:steps].copy()
-    walked = cost_grid.walk(tree.parent, tree.root, np.array((start,)), 0, cost_grid.cell_cost)
-    return walked.directions
+        length = min(part or steps, steps) + slanted * (costs.diagonal - 1.0)
+        return Way(room[:steps].copy(), driven, driven - first, length * costs.grid.resolution_m)
+    whole, first_part = (
+        costs.walk(tree.parent, tree.root, np.array((start,)), most, costs.time_cost) for most in (0, part)
+    )
+    driven = float(whole.driven[0])
+    return Way(whole.directions, driven, driven - float(first_part.driven[0]), float(first_part.length[0]))
 
 
 def whole_tree(cost_grid: CostGrid, root: int) -> CutTree:

@@ -74,6 +74,10 @@ class FairQueue(Generic[T]):
     def __len__(self) -> int:
         return sum(map(len, self._order.values()))
 
+    def comes_before(self, rank: int) -> bool:
+        """Returns True if an item of a lower rank waits."""
+        return any(order for each, order in self._order.items() if each < rank)
+
     def put(self, sender: str, item: T, *, price: int = 1, rank: int = 0) -> list[T]:
         """Adds an item. Returns those which are dropped for it."""
         self._next += 1

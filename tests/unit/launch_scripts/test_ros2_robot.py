@@ -12,25 +12,15 @@ from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
-from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.robot import Robot
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_types import types_of
+from swarm.client import Route
 from swarm.clock import NS_PER_S
 
 TYPES = types_of("jazzy")
-
-
-class Questions:
-    """Questions for routes, which a test answers."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[Place | str, Callable[[Any], None]]] = []
-
-    def ask(self, goal: Place | str, start: Place, vehicle_class: str, answer: Callable[[Any], None]) -> None:
-        self.asked.append((goal, answer))
 
 
 class World:
@@ -42,7 +32,6 @@ class World:
         self.node: Any = FakeNode(TYPES)
         map = RosMap(self.swarm.frame.grid)
         self.messages = RosMessages(TYPES, map)
-        self.routes: Any = Questions()
         robots = Robots(lease_s=10.0, **settings)
         self.robots = {
             id: Robot(
@@ -50,7 +39,7 @@ class World:
                 robots,
                 cast(Any, self.node),
                 self.swarm,
-                cast(Any, self.routes),
+                cast(Any, None),
                 self.messages,
                 taken.__contains__,
             )
@@ -80,22 +69,26 @@ class World:
         return vehicle._target
 
 
-def test_a_goal_is_asked_for_until_the_robot_is_there_and_its_target_is_followed_again() -> None:
+def test_a_place_is_followed_until_the_robot_is_there_and_then_its_target_again() -> None:
     world = World(target="fox")
     world.say("one", "goal_pose", 5, 5)
-    assert world.follows("one") is None
-    (_, answer), *_ = world.routes.asked
-    world.run("one", 20)
-    assert len(world.routes.asked) == 1, "one question at a time"
-    answer("no way leads there")
-    world.run("one", 12)
-    assert len(world.routes.asked) == 2, "every two seconds"
-    assert [each.message for each in world.node.heard["/one/plan_certificate"]] == ["no way leads there"]
+    assert world.follows("one") == "cell:5,5"
+    robot, frame = world.robots["one"], world.swarm.frame
+    end = frame.grid.cell(5, 5)
+    for cells, status in (((end - 1, end), "ok"), ((end - 1,), "unreachable")):
+        robot._followed.put(Route(frame, "", status, cells, 1.0, 1.0, 0.0))  # type: ignore[union-attr]
+        world.run("one", 1)
+    assert [each.message for each in world.node.heard["/one/plan_certificate"]] == ["ok", "unreachable"]
+    assert not world.node.heard["/one/goal_pose"], "the gateway repeats no goal of another"
     world.say("one", "odom", 5, 5)
     assert world.follows("one") == "fox"
-    world.routes.asked[1][1]("too late")
-    world.run("one", 20)
-    assert len(world.routes.asked) == len(world.node.heard["/one/plan_certificate"]) + 1 == 2
+
+
+def test_no_plan_to_another_goal_stays() -> None:
+    world = World()
+    for col, plans in ((5, 1), (5, 1), (6, 2)):
+        world.say("one", "goal_pose", 5, col)
+        assert [len(each) for each in world.node.heard["/one/plan"]] == [len(world.messages.path(0, ()))] * plans
 
 
 @pytest.mark.parametrize("frame", ["odom", "targets/a b", "targets/"])
@@ -104,10 +97,7 @@ def test_a_goal_that_is_refused_ends_the_one_before_and_the_plan_says_so(frame: 
     world.say("one", "goal_pose", 5, 5)
     world.say("one", "goal_pose", 6, 6, frame)
     assert world.follows("one") == "fox"
-    assert world.node.heard["/one/plan_certificate"][-1].level == Level.ERROR
-    world.routes.asked[0][1]("of the goal before")
-    world.run("one", 1)
-    assert len(world.node.heard["/one/plan_certificate"]) == 1
+    assert [each.level for each in world.node.heard["/one/plan_certificate"]] == [Level.ERROR]
 
 
 def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(

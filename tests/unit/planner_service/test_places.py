@@ -2,6 +2,7 @@
 
 import math
 import random
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -230,28 +231,18 @@ def test_the_worker_alone_touches_trees_and_costs(monkeypatch: pytest.MonkeyPatc
     assert set(touched) == {(name, True) for name in ("load", "apply", "cut", "begin")}
 
 
-def test_a_part_of_a_route_says_what_the_rest_costs() -> None:
-    pace = rough(3)
-    world = PlacesWorld(pace)
-    to = GRID.cell(20, 2)
-    start = GRID.cell(20, 45)
-    (whole,) = world.answer(to, start).routes
-    (part,) = world.answer(to, start, max_cells=5).routes
-    assert part.directions == whole.directions[:5]
-    end = walk(GRID, start, part.directions)[-1]
-    assert part.remaining_s == pytest.approx(optimum_s(pace, to)[end], rel=1e-5)
-    assert part.cost_s == whole.cost_s
-
-
-def test_routes_that_do_not_fit_into_an_answer_say_what_the_rest_costs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "MOST_STEPS", 20)
+@pytest.mark.parametrize("max_cells", [0, 3])
+def test_a_part_of_a_route_says_what_the_rest_costs(monkeypatch: pytest.MonkeyPatch, max_cells: int) -> None:
     pace = rough(3)
     world = PlacesWorld(pace)
     to = GRID.cell(20, 2)
     best = optimum_s(pace, to)
     starts = [GRID.cell(20, 45), GRID.cell(20, 45), GRID.cell(20, 3), GRID.cell(20, 2)]
-    for start, route in zip(starts, world.answer(to, *starts).routes, strict=True):
-        assert len(route.directions) <= 5
+    whole = world.answer(to, *starts).routes
+    monkeypatch.setattr(places, "MOST_STEPS", 20)
+    parts = world.answer(to, *starts, max_cells=max_cells).routes
+    for start, route, all_of_it in zip(starts, parts, whole, strict=True):
+        assert route.directions == all_of_it.directions[: max_cells or 5]
         end = walk(GRID, start, route.directions)[-1]
         assert route.remaining_s == pytest.approx(best[end], rel=1e-5)
         assert route.cost_s == pytest.approx(best[start], rel=1e-5)
@@ -273,6 +264,26 @@ def test_marks_beside_a_goal_do_not_keep_a_far_asker_waiting(monkeypatch: pytest
     assert isinstance(heard[0], Replied)
     assert isinstance(heard[0].message, PlaceRouteReply)
     assert heard[0].message.status == "ok"
+
+
+def test_a_far_question_keeps_its_turn_from_all_but_nearer_ones_and_those_of_agents(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(places, "SLICE_CELLS", 200)
+    world, worked, work = PlacesWorld(flat()), list[int](), _ClassTrees.work
+    monkeypatch.setattr(_ClassTrees, "work", lambda *given: (worked.append(given[1].request.to), work(*given))[1])
+    far = GRID.cell(30, COLS - 2)
+    asked = [(GRID.cell(2, 2 + n), far, f"agent.a{n}") for n in range(4)]
+    asked += [(GRID.cell(3, 2 + n), far, f"rover.r{n}") for n in range(4)]
+    near = GRID.cell(20, 20), GRID.cell(20, 24), "agent.near"
+    heard = [world.ask(to, cell, asker=asker) for to, cell, asker in (*reversed(asked), near)]
+    world.until(lambda: all(heard), within_s=1.0)
+    turns = [to for to, _ in groupby(worked)]
+    begun = [*dict.fromkeys(turns)]
+    assert len(worked) > 4 * len(turns), "slices follow each other"
+    assert begun[1] == near[0]
+    assert {*begun[2:6]} == {to for to, _, asker in asked if asker.startswith("agent")}
+    assert len(turns) == len(begun) + 1, "only the first had to let others pass"
 
 
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(

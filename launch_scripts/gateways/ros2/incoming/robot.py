@@ -31,11 +31,7 @@ Answer = Callable[[Route | str], None]
 """Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 _GOAL_HZ = 10.0
 """A robot is given no more goals; of several the newest counts."""
-_ROUTE_AGAIN_NS = 2 * NS_PER_S
-"""A route to a goal is asked for again this long after the question before: marks may have closed it since."""
 _MOST_POSTED = 64
-_UNANSWERED_NS = int((_PATIENCE_S + 2.0) * NS_PER_S)
-"""An answer that did not come by then was lost."""
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
@@ -94,11 +90,9 @@ class Robot:
         self._track = Track(self._reader, robots.lease_s)
         self._vehicle: Vehicle | None = None
         self._followed: Stream[Route] | None = None
-        """Routes to the target that it follows."""
-        self._goal: Place | None = None
-        """Place to which it was sent; None while it has no goal of its own."""
-        self._goal_due_ns = 0
-        """Time when the route to the goal is asked for, again if no answer came."""
+        """Routes to the target or the place that it follows."""
+        self._goal: int | None = None
+        """Cell of the place to which it was sent; None while it has no goal of its own."""
         self._goal_cell: int | None = None
         """Cell of the last published goal_pose."""
         self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
@@ -130,12 +124,6 @@ class Robot:
         self._goals.tick(now_ns)
         while self._followed is not None and (route := self._followed.next(0.0)) is not None:
             self._hear_route(route)
-        if (goal := self._goal) is not None and self._track.place is not None and now_ns >= self._goal_due_ns:
-            self._goal_due_ns = now_ns + _UNANSWERED_NS
-            self._routes.ask(
-                goal, self._track.place, self._robots.vehicle_class,
-                lambda found: self._posted.append(lambda: self._hear_goal_route(goal, found, now_ns)),
-            )  # fmt: skip
 
     def close(self) -> None:
         """Takes it away, with all that was declared for it."""
@@ -164,8 +152,7 @@ class Robot:
             )  # fmt: skip
             log.info("robot %s of ROS is a vehicle: %s", self.id, self.topic)
         self._vehicle.at(place.x_m, place.y_m, heading_rad=place.heading_rad, speed_m_per_s=place.speed_m_per_s)
-        goal = self._goal
-        at_goal = goal is not None and self._vehicle.cell == self._swarm.frame.cell(goal.x_m, goal.y_m)
+        at_goal = self._vehicle.cell == self._goal
         if at_goal:
             log.info("robot %s is at its goal", self.id)
             self._end_goal()
@@ -182,7 +169,7 @@ class Robot:
     # --- where it goes ------------------------------------------------------------------------------------------
 
     def _follow(self, target: str | None) -> None:
-        """Raises SwarmError."""
+        """Follows a target, or a place as commands have it. Raises SwarmError."""
         if target and self._vehicle is not None:
             self._followed = self._vehicle.follow(target)
 
@@ -194,6 +181,7 @@ class Robot:
 
     def _hear_goal(self, message: Any, now_ns: int) -> None:
         """Raises SwarmError if it cannot have this goal: then it has none, as its plan says."""
+        before, frame = self._goal, self._swarm.frame
         self._end_goal()
         try:
             if self._vehicle is None:
@@ -201,26 +189,23 @@ class Robot:
             if (target := _target_frame(message)) is not None:
                 self._follow(target)
             else:
-                self._goal, self._goal_due_ns = self._reader.pose(message.header, message.pose), now_ns
+                place = self._reader.pose(message.header, message.pose)
+                goal = frame.cell(place.x_m, place.y_m)
+                self._follow("cell:{},{}".format(*frame.grid.row_col(goal)))
+                self._goal = goal
+                if goal != before:  # no robot goes on by the plan to another goal
+                    self._put(self._plan, self._messages.path(time.time_ns(), ()))
         except SwarmError as error:
             self._put_plan(str(error))
             self._follow(self._robots.target)
             raise
-
-    def _hear_goal_route(self, goal: Place, found: Route | str, asked_ns: int) -> None:
-        """Takes in the answer for a goal; of a goal that it has no more, nothing."""
-        if self._goal is goal:
-            self._goal_due_ns = asked_ns + _ROUTE_AGAIN_NS
-            self._put_plan(found)
-            if isinstance(found, str):
-                self._goals.refuse(found)
 
     def _hear_route(self, route: Route) -> None:
         if self._vehicle is None:
             return
         self._put_plan(route)
         end = route.cells[-1] if route.ok and route.remaining_s == 0 else None
-        if end is not None and end != self._goal_cell:
+        if self._goal is None and end is not None and end != self._goal_cell:
             self._goal_cell = end
             pose = self._messages.pose_stamped(time.time_ns(), *self._swarm.frame.centre_m(end))
             self._put(self._goal_out, pose)
