@@ -2,8 +2,8 @@
 
 To repair a tree costs about the same however many cells have changed. With hundreds of vehicles that see something
 new in every tick, somewhere, a planner that repaired in every tick did little else. A change that no follower's
-route passes is nothing to push; so it waits, but not long. Any change is applied, too, once repairs have had their
-share of `planner.cpu_budget` (`Planner`); no served route passes a waiting one.
+route passes is nothing to push; so it waits, but not long. Any change is applied within about a second, after the
+pause that `planner.cpu_budget` demands (`Planner`); no served route passes a waiting change.
 """
 
 from __future__ import annotations

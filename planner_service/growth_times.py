@@ -215,9 +215,9 @@ class Askers:
 class WindowSchedule:
     """Windows of doubling width, each of which is due once the target has come a share of that width.
 
-    Routes are as old as the widest window that they begin in. Moves of the target since a cell's search matter in
-    proportion to its distance. A window that reaches `AHEAD` times as far keeps that small at every distance, and
-    costs 64 cells of search per cell of its width and move.
+    Routes are as old as the widest window that they begin in. A move of the target matters to a cell relative to
+    the cell's distance: less, the farther it is. A window that reaches `AHEAD` times as far keeps that small at
+    every distance, and costs 64 cells of search per cell of its width and move.
 
     half  of the narrowest window, cells to every side; one that narrow is grown with every move
     """

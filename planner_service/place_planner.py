@@ -3,7 +3,7 @@
 A place is a goal without a process of its own: its tree is grown as far as its askers are and is kept for the next
 (`GoalTrees`). The worker grows beside the loop, a slice of cells at a time. Between two slices the map takes its
 changes, and the asker that has paid least is next. A vehicle whose route a change concerns is pushed another, as by
-planners of targets (`Followers`). Nothing here must outlive the process: the one that takes over grows again when
+planners of targets (`Followers`). Nothing here need outlive the process: the one that takes over grows again when
 asked.
 """
 
@@ -374,7 +374,8 @@ class PlacesService(PlanningProcess):
     # --- published without a question ---------------------------------------------------------------------------
 
     def _forget_routes(self) -> None:
-        """Pushes a route to each follower: this process does not know which routes they have."""
+        """Forgets the given routes, so that each follower is pushed one: this process does not know which routes
+        they have."""
         for trees in self._classes.values():
             trees.followers.forget_routes()
 

@@ -1,7 +1,7 @@
 """Start cells of vehicles: those of the scenario all together, those of an added agent one by one.
 
-Every process computes the same cells for the vehicles of the scenario, so that all differ. An added agent asks
-leaders for a first cell of each of its vehicles (docs/design/external-vehicles.md).
+Every process computes the same assignment of cells for the scenario's vehicles, so no two vehicles get one cell. An
+added agent asks leaders for a first cell of each of its vehicles (docs/design/external-vehicles.md).
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if found["authors_that_learned"]:
-        print(f"  learned factors of terrain classes, by {len(words)} authors: swarm marks factors {store}")
+        print(f"  learned factors of kinds of ground, by {len(words)} authors: swarm marks factors {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
@@ -145,7 +145,7 @@ def factors(
     store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the learned factors of terrain classes.
+    """Show the learned factors of kinds of ground.
 
     Each row: measured pace / prior pace, and the factor applied to the prior (map.learning).
 
@@ -183,7 +183,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
 
 
 def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
-    """Prints the learned factor of each terrain class."""
+    """Prints the learned factor of each kind of ground."""
     kinds = learned_kinds(words)
     if as_json:
         print(json.dumps({"kinds": [each._asdict() for each in kinds]}, indent=2))

@@ -126,7 +126,7 @@ FACTS: tuple[Fact[RunState], ...] = (
     ),
     Fact(
         "learned", "learned", factors,
-        "Learned factor on the prior pace of a terrain class, from measurements of vehicles (map.learning).",
+        "Learned factor on the prior pace of a kind of ground, from measurements of vehicles (map.learning).",
     ),
     Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
     Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),

@@ -20,7 +20,7 @@ from swarm.runtime.stats import LEARNED, Counters
 from swarm.wire.messages.map_data import MarkSet, owner_of
 
 Voice = Mapping[int, Measurement]
-"""Measurements of one process: key of a terrain class -> measurement."""
+"""Measurements of one process: key of a kind of ground -> measurement."""
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
@@ -31,7 +31,7 @@ SLOPE_BIN_DEG = 5
 _PRIOR_VARIANCE = ONE * 49 // 100
 """Prior variance of ln(factor): tau of 0.7."""
 _USUAL_VARIANCE = ONE // 10
-"""Variance of y from cell to cell: paces of one terrain class differ by a third."""
+"""Variance of y from cell to cell: paces of one kind of ground differ by a third."""
 _USUAL_CELLS = 20
 """A variance of few cells is uncertain: it is taken together with this many cells of the usual one. With five, six
 cells that happened to be alike moved a class that was right."""
@@ -75,7 +75,7 @@ def log_steps(stated: Sequence[Measurement]) -> int:
 
 
 def estimate(stated: Sequence[Measurement]) -> Measurement:
-    """Combines all authors' measurements of one terrain class: the cells that count, the mean, and the variance of
+    """Combines all authors' measurements of one kind of ground: the cells that count, the mean, and the variance of
     one cell. No cells if there are no measurements.
 
     No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
@@ -102,8 +102,8 @@ def estimate(stated: Sequence[Measurement]) -> Measurement:
 
 
 def factors_of(voices: Sequence[Voice]) -> Floats:
-    """Returns the factor on the prior pace of each terrain class: float32 (KEYS,). A kind that is hardly driven yet
-    has the factor of its class."""
+    """Returns the factor on the prior pace of each kind of ground: float32 (KEYS,). A kind that is hardly driven
+    yet has the factor of its class."""
     of_classes = [
         (kind, _together(parts))
         for voice in voices
@@ -122,7 +122,7 @@ def factors_of(voices: Sequence[Voice]) -> Floats:
 
 
 def factors_in(sets: Iterable[MarkSet]) -> Floats:
-    """Returns the factor on the prior pace of each terrain class: float32 (KEYS,).
+    """Returns the factor on the prior pace of each kind of ground: float32 (KEYS,).
 
     sets  about the tile beyond the map; what carries no measurements is left out
     """
@@ -130,7 +130,7 @@ def factors_in(sets: Iterable[MarkSet]) -> Floats:
 
 
 class LearnedKind(NamedTuple):
-    """State of one terrain class.
+    """State of one kind of ground.
 
     kind            its class and its slopes in degrees, such as `forest 10-15`
     cells           driven cells, as all authors say together

@@ -1,8 +1,9 @@
-"""An author's measurements of terrain classes, and their encoding: as one more mark set, in a tile beyond the map.
+"""An author's measurements of kinds of ground (class and slope), and their encoding: as one more mark set, in a
+tile beyond the map.
 
 Measurements therefore have all properties of mark sets: numbers of which the newest wins, groups, quotas, authority
 by key, digests, late joins, the keeper's store. The cells of such a set are no places: cell 3 * key is the number
-of cells driven on that terrain class, the next two are the mean and the variance of y = ln(driven pace / prior
+of cells driven on that kind of ground, the next two are the mean and the variance of y = ln(driven pace / prior
 pace). Each number is written as a pace of 1 + n / 65536, which float32 holds exactly, within the bounds of marks.
 """
 
@@ -37,7 +38,7 @@ _CUT = 4
 
 
 class Measurement(NamedTuple):
-    """An author's measurement of one terrain class: cells, and mean and variance of y in `ONE`."""
+    """An author's measurement of one kind of ground: cells, and mean and variance of y in `ONE`."""
 
     cells: int
     mean: int

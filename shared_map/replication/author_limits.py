@@ -43,7 +43,7 @@ class Capacity:
     """Counts the sets and statements held, in all and by process; refuses a set which would exceed a bound.
 
     Which sets are refused depends on what came first, so replicas are equal only within the bounds. The bounds
-    limit what a hostile author can cost to some 330 MB.
+    limit the memory to some 330 MB, a quarter of it for one process.
 
     sets, marks  held now
     """

@@ -100,7 +100,7 @@ class HeldSets:
 
     def off_grid(self, received: MarkSet) -> bool:
         """Returns True if a set has marks in cells which this grid does not have. Measurements are published in the
-        tile beyond the last one, as `words` has it, and not by operators."""
+        tile beyond the last one (`learning.measurements`), never by operators."""
         if received.tile == self._tile_count:
             return is_zone(received.author) or measurements_in(received) is None
         known = received.tile < self._tile_count and not self._ragged

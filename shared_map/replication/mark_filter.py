@@ -1,8 +1,9 @@
 """Filters of what a replica takes in of others: marks by author (the policy of groups) and by tile (its interest),
 and the digests which can concern what it holds (`DigestInterest`). Pure: time is an argument.
 
-An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. Access control can
-therefore enforce the policy; and no set is requested of a digest, which names only authors, that would be refused.
+An author's id begins with its group (`blue.a3.17f2`), and the keys of all that it writes end with this id. Access
+control can therefore enforce the policy; and sets which would be refused are not requested: a digest names their
+authors.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class Follower:
         self.version += 1
 
     def bounds(self, cols: int) -> tuple[int, int, int, int]:
-        """Returns the smallest (row, col) and the greatest of all its cells in a grid with `columns` columns;
+        """Returns the smallest (row, col) and the greatest of all its cells in a grid with `cols` columns;
         without cells an empty rectangle. Kept, as a route changes seldom and the map all the time."""
         if self._bounds is None:
             self._bounds = bounds_of(self._cells, cols) if self._cells else _NOWHERE

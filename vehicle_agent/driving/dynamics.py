@@ -107,9 +107,9 @@ class Dynamics(Protocol):
 
 
 def dynamics_of(plugin: Plugin, world: DynamicsWorld, tell: Tell) -> PluginDynamics | None:
-    """The dynamics that a scenario names; None if vehicles drive as the ground allows, which is the built-in one.
+    """The dynamics that a scenario names; None, the default, if vehicles drive as the ground allows.
 
-    Raises ConfigError if they cannot be made; `tell` takes their later fault.
+    Raises ConfigError if they cannot be made; `tell` is called with a later fault.
     """
     if plugin.factory is None:
         return None
@@ -117,7 +117,7 @@ def dynamics_of(plugin: Plugin, world: DynamicsWorld, tell: Tell) -> PluginDynam
 
 
 def own_dynamics(own: ClassConfig | None, world: DynamicsWorld) -> PluginDynamics | None:
-    """The dynamics that a class says itself; None if it says none."""
+    """The dynamics from a class's own limits; None if it sets none."""
     if own is None or (own.accel_m_per_s2 is None and own.turn_rate_deg_per_s is None):
         return None
     return PluginDynamics(Inertia(world.grid, own.accel_m_per_s2, own.turn_rate_deg_per_s), world.grid, None)
