@@ -205,7 +205,7 @@ class MapReplica:
         return won.counts
 
     def _learn(self) -> None:
-        """Brings the cost map to the words that are held; later if it was changed by words just now."""
+        """Applies the held measurements to the cost map, at most once per `_LEARN_EVERY_NS`."""
         if self._cost_map is None:
             return
         self._learn_due_ns = self._learned_ns + _LEARN_EVERY_NS
@@ -411,8 +411,8 @@ class MapReplica:
         return [tile for _, tiles in wanted for tile in tiles]
 
     def has_ended(self, author: str) -> bool:
-        """Returns True if all marks of an author in some tile have expired: immediately if our clock is far ahead
-        of its."""
+        """Returns True if all marks of an author in some tile have expired: too early if our clock is ahead of
+        its."""
         sets = (self.held.get(tile, author) for tile in self.held.tiles)
         return any(each and each.kinds and not len(standing(each, self._now_ns).cells) for each in sets)
 
