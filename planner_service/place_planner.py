@@ -118,7 +118,7 @@ class _Slice(NamedTuple):
 class _ClassTrees:
     """The map of one class of vehicles, the trees on it, and the vehicles which follow their routes.
 
-    All of it belongs to the loop but what `work` touches, which belongs to the worker while that has a slice.
+    All of it belongs to the loop, except what `work` touches: that is the worker's during a slice.
     """
 
     def __init__(self, cost_map: CostMap, config: PlannerConfig, budget_bytes: int, route_cells: int) -> None:
@@ -130,7 +130,7 @@ class _ClassTrees:
         self.kept_up_ns = 0
 
     def news(self, now_ns: int) -> _News | None:
-        """Returns the changes of the map since the last call; None without any. Not beside a slice."""
+        """Returns the changes of the map since the last call; None without any. Not to be called during a slice."""
         self.kept_up_ns = now_ns
         pace, windows = self.cost_map.pace_s_per_m, self.cost_map.take_dirty()
         if self._version < 0:

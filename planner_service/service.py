@@ -264,7 +264,7 @@ class PlannerService(PlanningProcess):
         self._search.hear_vehicles(*self._presence.columns())
 
     def _listen(self, listens: bool) -> None:
-        """Receives from vehicles where they are and what they see, or do not."""
+        """Receives positions and sightings of vehicles, or stops receiving them."""
         if listens == self._listens:
             return
         self._listens = listens
@@ -278,8 +278,8 @@ class PlannerService(PlanningProcess):
     def _answer(self, now_ns: int) -> None:
         """Answers queries. If there will be a tree to answer from soon, a query waits for that, but not long.
 
-        A query for one class never waits for the tree of another. Agents come first. After `_AT_ONCE` costs
-        the others wait for the next call. Of others than agents one query a tick may force the tree to grow.
+        A query for one class never waits for the tree of another. Agents come first. After `_AT_ONCE` units of work
+        the others wait for the next call. Only one query a tick that is not an agent's may force a growth.
         """
         held, self._held = self._held, []
         spent = 0
