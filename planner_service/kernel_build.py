@@ -292,7 +292,7 @@ class KernelLoader:
 
 
 def main() -> None:
-    """Compile the kernels that are named, or all of planners."""
+    """Compiles the kernels that are named, or all of planners."""
     os.nice(5)
     every = {name_of(kernel): kernel for kernel in all_kernels()}
     names = sys.argv[1:] or list(every)

@@ -150,8 +150,8 @@ def _relax(at, t, cell, grid, tree, tiles, scratch):
 
 @helper
 def _spread(t, grid, tree, tiles, scratch, count):
-    """Spread what the `count` cells of the heap cost, inside the tile, the least first: most cells are then written
-    once. Cells around that are offered less have their tile looked at."""
+    """Spreads what the `count` cells of the heap cost, inside the tile, the least first: most cells are then
+    written once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece = tree.parent, tree.piece
     wanted, across = tiles.wanted, tiles.across

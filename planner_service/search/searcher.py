@@ -109,7 +109,7 @@ class Searcher:
         return blocks.middles[best], np.minimum(total[best], np.float32(1.0)), blocks.side_m
 
     def begin(self, pace_s_per_m: Floats, cell: int | None, age_s: float) -> None:
-        """Search from now on.
+        """Searches from now on.
 
         Parameters
         ----------

@@ -290,7 +290,7 @@ class PendingDigests:
             pending.due_ns = now_ns + _RETRY_NS
 
     def hasten(self, now_ns: int) -> None:
-        """Compare all of them at once: a link has come back."""
+        """Compares all of them at once: a link has come back."""
         for pending in self._pending.values():
             pending.due_ns = now_ns
 

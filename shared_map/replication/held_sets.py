@@ -49,7 +49,7 @@ class Tombstones:
         return tombstone is not None and tombstone[:2] >= number
 
     def add(self, tombstone: MarkSet, now_ns: int) -> None:
-        """Remember a tombstone; beyond 65,536 the oldest is forgotten."""
+        """Remembers a tombstone; beyond 65,536 the oldest is forgotten."""
         self._deleted[tombstone.tile, tombstone.author] = (tombstone.epoch, tombstone.seq, now_ns)
         if len(self._deleted) > _MAX_TOMBSTONES:
             del self._deleted[next(iter(self._deleted))]

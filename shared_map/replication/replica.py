@@ -312,8 +312,8 @@ class MapReplica:
         *,
         lifetime_s: float | None = None,
     ) -> list[MarkSet]:
-        """State something about cells; of a cell named twice the last counts. The own cost map changes at once.
-        Returns the sets that may be published now; `tick` returns the others later.
+        """States something about cells; of a cell named twice the last statement counts. The own cost map changes
+        at once. Returns the sets that may be published now; `tick` returns the others later.
 
         cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
         kinds       uint8 (cells,)    MarkKind, or one for all

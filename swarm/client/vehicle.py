@@ -379,7 +379,7 @@ class Vehicle(Reported):
         for_s: float | None = None,
         only_for: str | None = None,
     ) -> int:
-        """State something about cells, for all vehicles and planners. Returns how many cells were stated.
+        """States something about cells, for all vehicles and planners. Returns how many cells were stated.
 
         cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)`
         lethal        no vehicle may enter them

@@ -347,7 +347,7 @@ class ExternalSession:
         return self._wait(lambda: self._service.external is None or self._service.external.gone, timeout_s)
 
     def close(self) -> None:
-        """Leave, and end the session."""
+        """Leaves, and ends the session."""
         if not self._closed.is_set():
             self.leave()
             with self._changed:

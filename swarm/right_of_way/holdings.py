@@ -130,7 +130,7 @@ class Holdings:
         self.end()
 
     def end(self) -> None:
-        """Holds nothing and know nothing, as before the first generation."""
+        """Resets to the state before the first generation: holds nothing and knows nothing."""
         self.generation = self.newest = 0
         self.replaced = False
         self.shards: dict[int, None] = {}
@@ -285,7 +285,7 @@ class Holdings:
             self._views.setdefault(shard, _View())
 
     def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """Act on what a leader says to us, if it is newer than what we know. Returns the vehicles that have found
+        """Acts on a leader's message to us, if it is newer than what we know. Returns the vehicles that have found
         their place."""
         view = self._views.setdefault(granted.shard, _View())
         knows = self._entries.knows.get(granted.shard, BEFORE_ALL)

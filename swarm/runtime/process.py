@@ -126,7 +126,7 @@ class Service(Protocol):
         ...
 
     def start(self, now_ns: int) -> None:
-        """Subscribe, serve, raise the token. Called once, before all others."""
+        """Subscribes, serves and raises the token. Called once, before all others."""
         ...
 
     def handle(self, event: Event, now_ns: int) -> None:

@@ -212,7 +212,7 @@ class ChaosRun:
             self.results.left_behind += launcher.end()
 
     def _join(self, launcher: UpProcess) -> Attacker:
-        """Wait until the swarm is up and every vehicle has been heard of."""
+        """Waits until the swarm is up and every vehicle has been heard of."""
         began_s = time.monotonic()
         attacker: Attacker | None = None
         try:

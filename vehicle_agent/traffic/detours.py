@@ -61,7 +61,7 @@ class Detours:
         """Vehicle without a way around -> when it is tried again, and the pause before that."""
 
     def tick(self, vehicles: Iterable[Vehicle], path: Callable[[str], Sequence[int]], now_ns: int) -> None:
-        """Begins and continue searches; vehicles for which one has ended follow what it has found."""
+        """Begins and continues searches; vehicles for which one has ended follow what it has found."""
         standing = self._obstacles.standing if self._obstacles.any else ()
         if not standing:
             self._searches.clear()

@@ -193,7 +193,7 @@ class TargetWorld:
         return actions
 
     def lead(self, leads: bool) -> None:
-        """Takes over where the poses of the one before ended, or leave it to another.
+        """Takes over where the poses of the previous one ended, or leaves the lead to another.
 
         Takes the lead: poses from now on supersede those, with an incarnation above theirs. One that leaves no room
         above it is no process's; what follows it is heard once it has been silent.
