@@ -56,7 +56,7 @@ _MOST_WAITING, _MOST_EACH = 1 << 17, 1 << 15
 _BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
 """Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
 _HOLD_NS = NS_PER_S
-"""A question waits so long at most for its growth; then it is answered as far as it is known."""
+"""A question waits at most this time for its growth; then it is answered as far as it is known."""
 _KEEPS_UP_NS = NS_PER_S
 """While a question goes on, its map is so old at most: else marks beside a goal would end no growth."""
 _CELL_NS = 25

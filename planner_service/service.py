@@ -54,9 +54,9 @@ from swarm.wire.topics import (
 log = logging.getLogger(__name__)
 
 _PRESENCE_NS = 5 * NS_PER_S
-"""A vehicle of which nothing was heard for so long sees nothing."""
+"""A vehicle that was silent for this time sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
-"""A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
+"""A query waits at most this time for a tree to answer from, and of more the oldest are answered at once."""
 _AT_ONCE, _ROUTE_COST = 1 << 16, 64
 """Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
 

@@ -12,7 +12,7 @@ from swarm.config.vehicle_classes import GROUND
 UNUSED_NS = 60 * NS_PER_S
 """A tree without a query for this time is dropped."""
 _BEGINS_NS = NS_PER_S
-"""A query waits so long at most for the first tree of its class."""
+"""A query waits at most this time for the first tree of its class."""
 
 
 class ClassPlanners:

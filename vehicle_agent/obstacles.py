@@ -125,7 +125,7 @@ REACTION_S = 0.5
 MAKE_WAY_S = 2.0
 """Vehicles at rest leave cells to which an obstacle comes within this time."""
 STANDS_NS = NS_PER_S
-"""An obstacle that has kept its place for so long is driven around, not waited for."""
+"""An obstacle that has kept its place for this time is driven around, not waited for."""
 MOST_OBSTACLES = 256
 MOST_CELLS = 100_000
 """Limit for all obstacles together: bounds time and memory, and the effect of false reports."""

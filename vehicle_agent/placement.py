@@ -131,10 +131,10 @@ def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bo
 
 
 _FOUND_NS = NS_PER_S
-"""A new generation waits so long for its vehicles of an earlier one to be found in the tables, before others
+"""A new generation waits this time for its vehicles of an earlier one to be found in the tables, before others
 enter."""
 _ANOTHER_CELL_NS = NS_PER_S
-"""A cell that is not granted for so long is taken: the next one is tried."""
+"""A cell that is not granted for this time is taken: the next one is tried."""
 
 
 class Spawning:

@@ -66,7 +66,7 @@ class OwnTime:
 log = logging.getLogger(__name__)
 
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
-"""A new generation waits so long for the others' answers before it begins. What comes later counts as well."""
+"""A new generation waits this time for the others' answers before it begins. What comes later counts as well."""
 _LATE_ANSWERS_S = 10.0
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
@@ -78,10 +78,10 @@ _MOST_REFUSALS_TOLD = 100
 _MOST_DIGITS = 9
 """Digits of a shard's number in a key, and of a certificate's."""
 _RESERVE_NS = NS_PER_S
-"""Space for promises is looked for so often: a check costs a system call."""
+"""Space for promises is looked for at this interval: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _SLOW_FOR_NS = 5 * NS_PER_S
-"""A link is reported once it has been slow for so long: at a start all are, for a moment."""
+"""A link is reported once it has been slow for this time: at a start all are, for a moment."""
 _WAITING_AGAIN_NS = 10 * NS_PER_S
 """Interval of repeated events: a late watcher receives them, and the log stays readable."""
 

@@ -66,7 +66,7 @@ from vehicle_agent.target_choice import AskCosts
 log = logging.getLogger(__name__)
 
 _ANSWER_S = 2.0
-"""A planner's answer is waited for so long, or for several round trips where the link is slow."""
+"""A planner's answer is waited for at most this time, or for several round trips where the link is slow."""
 _TRIPS = 3.0
 _LONGEST_ANSWER_S = 8.0
 _PLACE = "place"

@@ -25,7 +25,7 @@ _RETRY_NS = NS_PER_S // 2
 _STRANDED_RETRY_NS = 3 * NS_PER_S
 """Vehicles without a way ask again so soon: only a changed map gives them one."""
 _JUMPS_APART_NS = NS_PER_S // 50
-"""For each target: so long after a request a jump of a target may cause the next. With many targets one always
+"""For each target: this time after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
 """An agent of the group without costs for this number of periods has ended."""

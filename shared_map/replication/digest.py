@@ -184,7 +184,7 @@ _MAX_PARTS = 128
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""
 _FORGET_NS = 60 * NS_PER_S
-"""A sender that was silent for so long loses its place in the order."""
+"""A sender that was silent for this time loses its place in the order."""
 _AT_ONCE = 1024
 """Authors, and every `_ROWS` rows, that are compared in one tick: some 5 ms."""
 _ROWS = 16

@@ -319,7 +319,7 @@ class MapReplica:
         kinds       uint8 (cells,)    MarkKind, or one for all
         paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
                     of marks (`swarm.wire.messages.map_data`)
-        lifetime_s  the statements expire so long after their stamps, by the reader's clock; None: never
+        lifetime_s  the statements expire this time after their stamps, by the reader's clock; None: never
 
         Raises RuntimeError if the replica has no author.
         """

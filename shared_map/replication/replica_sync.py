@@ -51,7 +51,7 @@ _MAX_ASKS = 16
 """Limit of authors that are asked together: the most that a false digest with thousands of rows can start."""
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
-"""A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
+"""A set that was put is named in digests of changes so often and for this time: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _LOOKS_PER_TICK = 1024

@@ -16,7 +16,7 @@ from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
-"""A host that has not heard a shard's leader for so long speaks to all members of the shard."""
+"""A host that has not heard a shard's leader for this time speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
 MOST_AHEAD = 16

@@ -56,7 +56,7 @@ class Options:
     """Options of a run under faults.
 
     scenario  a file or a built-in name
-    seconds   the run ends after so long; None: with the messages
+    seconds   the run ends after this time; None: with the messages
     messages  number of hostile messages after which the run ends; None: it ends with the seconds
     every_s   from one fault to the next, at least
     kinds     which faults
