@@ -71,6 +71,6 @@ class GapStatistics:
 
 
 def _ratios(driven: Gaps, optimum: NDArray[np.float32]) -> Gaps:
-    """Cost over optimum where both are finite and there is any way to go."""
+    """Cost over optimum where both are finite and the optimum is not 0."""
     given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
     return np.asarray(driven[given] / optimum[given].astype(np.float64), np.float64)

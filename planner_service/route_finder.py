@@ -214,7 +214,7 @@ class RouteFinder:
         return Puller(self._pace, self.grid.resolution_m, self._config, self._climb)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:
-        """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""
+        """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no path."""
         costs: NDArray[np.float32] = self._tree.cost_to_go_at(np.arange(self.grid.cells))
         return costs.reshape(self.grid.rows, self.grid.cols)
 

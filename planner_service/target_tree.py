@@ -331,7 +331,7 @@ class TargetTree:
         return routes
 
     def cost_to_go_at(self, cells: Any) -> Floats:
-        """float32, s, per cell; inf where there is no way or the cell is outside."""
+        """float32, s, per cell; inf where there is no path or the cell is outside."""
         asked = np.asarray(cells, np.int64).reshape(-1)
         costs: Floats = np.full(asked.size, np.inf, np.float32)
         if self.ready:
@@ -515,7 +515,7 @@ class TargetTree:
 
     @property
     def _is_whole(self) -> bool:
-        """Returns True if a cell without a cost has no way."""
+        """Returns True if a cell without a cost has no path."""
         return isinstance(self._tree, PieceTree) or self._tree.bound == np.inf
 
     def _follow_near(self, target_cell: int, changes: Changes | None) -> Update | None:

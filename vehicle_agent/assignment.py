@@ -217,7 +217,7 @@ def need_first(costs_s: Costs, current: Sequence[int], pursuers: int) -> NDArray
 
     Parameters
     ----------
-    costs_s : (targets, vehicles) float64, s, inf where there is no way
+    costs_s : (targets, vehicles) float64, s, inf where there is no path
     current : (vehicles,) the target of each now, -1 for none; another must be cheaper by `HYSTERESIS`
 
     Returns

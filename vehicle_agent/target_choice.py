@@ -23,7 +23,7 @@ from vehicle_agent.driving.driven_vehicle import Vehicle
 _RETRY_NS = NS_PER_S // 2
 """Vehicles for which no planner has answered ask again so soon: a planner needs about that long to start."""
 _STRANDED_RETRY_NS = 3 * NS_PER_S
-"""Vehicles without a way ask again so soon: only a changed map gives them one."""
+"""Vehicles without a path ask again so soon: only a changed map gives them one."""
 _JUMPS_APART_NS = NS_PER_S // 50
 """For each target: this time after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
@@ -55,7 +55,7 @@ class GroupCosts:
     ) -> SharedCosts:
         """The message with the costs of our vehicles.
 
-        costs_s  target -> float32 (vehicles,), s, inf where there is no way
+        costs_s  target -> float32 (vehicles,), s, inf where there is no path
         chased   the target of each vehicle
         """
         targets = sorted(costs_s)[:MOST_SHARED_TARGETS]

@@ -373,7 +373,7 @@ def cut_parents(grid, tree, across, cells, before, changed):
 
 @kernel(GRID, partition.TREE, partition.TILES, "i8[::1]")
 def drop_cut_off(grid, tree, tiles, which):
-    """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
+    """Cells of these tiles that have no path lose their parent, and pieces that lead nowhere go."""
     _, _, stride, _, _ = grid
     parent, piece, root = tree.parent, tree.piece, tree.root
     total = tree.total

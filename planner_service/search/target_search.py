@@ -182,7 +182,7 @@ class TargetSearch:
     def costs_s(self, to_last_s: Floats, open_: NDArray[np.bool_]) -> Floats:
         """float32, s: what it takes to find the target, so that it is compared with others.
 
-        to_last_s  to where it was last; inf where there is no way, or none is known
+        to_last_s  to where it was last; inf where there is no path, or none is known
         open_      whether the cell asked for can be driven from
         """
         known: Floats = np.where(np.isfinite(to_last_s), to_last_s, np.float32(OFFSET_S)) + np.float32(OFFSET_S)
