@@ -46,8 +46,8 @@ standby       as above, but it pushes nothing                 the leader falls s
                                                               to every follower
 ============  ==============================================  =====================================================
 
-The tree's own states are `target_tree.State`; whether a search is under way is `search.target_search`'s, who leads
-the candidacy's. The same without a process, a network or a file:
+The tree's own states are `target_tree.State`; `search.target_search` holds whether a search runs, the candidacy
+which process leads. The same without a process, a network or a file:
 
 >>> import numpy as np
 >>> from planner_service import RouteFinder

@@ -28,16 +28,16 @@ _NOWHERE_BOUNDS = (0, 0, 0, 0)
 
 @dataclass(slots=True, eq=False)
 class Follower:
-    """One vehicle.
+    """One vehicle, as its planner knows it. Not the `Follower` of `vehicle_agent.driving`, a route as a vehicle
+    drives it.
 
     cell       on its path, by its agent's last report or its own request: where a new route for it begins
-    route      what it was given last; None if nothing was, by this incarnation of the planner
-    bounds     a first row and column before which that route and the cells next to it do not lie, and first ones
-               behind them
+    route      its last route from this incarnation of the planner; None if there is none
+    bounds     row0, col0, row1, col1 of that route with its neighbour cells
     walked     the cells of that route; None until they are needed
     row        in the table of all bounds
     stale      there may be a better route than the one it has
-    push_ns    it is not pushed another one before
+    push_ns    earliest time of its next push
     goal       the cell of the place to which it goes; None if it follows the target
     """
 
@@ -88,9 +88,9 @@ MOST_PUSHES = 256
 class Followers:
     """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
 
-    Registered by a request that names them, or by their agent's message that they chase this target; dropped when
-    that agent names them no more, after a lease without messages, and, beyond the capacity, in the order in which
-    they were registered. A vehicle that is dropped so is registered again by its agent's next word.
+    Registered by a request that names them, or by their agent's message that they chase this target; dropped if
+    that agent no longer names them, after a lease without messages, or, when full, oldest first. A vehicle that is
+    dropped so is registered again by its agent's next message.
     """
 
     def __init__(self, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
@@ -148,7 +148,7 @@ class Followers:
     def given(
         self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int, goal: int | None = None
     ) -> None:
-        """A vehicle asked, and this is the answer. One outside the grid is no follower, whatever the status."""
+        """A vehicle asked, and this is the answer. A start outside the grid is ignored."""
         if not 0 <= route.start < self._grid.cells:
             return
         follower = self._by_id.get(vehicle)
@@ -168,8 +168,8 @@ class Followers:
             self._rows[1][follower.row] = bounds
 
     def _bounds(self, route: Route) -> tuple[int, int, int, int]:
-        """Bounds of a route, as if all its steps to the north came first, or all to the south: to walk it takes ten
-        times as long, and routes which turn back are few."""
+        """Outer bounds of a route, from its step counts: ten times as fast as walking it, and routes which turn
+        back are few."""
         row, col = divmod(route.start, self._grid.cols)
         n, ne, e, se, s, sw, w, nw = map(route.directions.count, range(8))
         return row - (nw + n + ne) - 1, col - (sw + w + nw) - 1, row + se + s + sw + 2, col + ne + e + se + 2
@@ -206,7 +206,7 @@ class Followers:
         return any(now_ns >= each.push_ns and self._crosses(each, window) for each, window in self._near(changed))
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
-        """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
+        """Marks the routes concerned stale: the tree is new inside a window, and the map changed in others."""
         fresh = [follower for follower in self._by_id.values() if not follower.stale]
         cells = np.fromiter((follower.cell for follower in fresh), np.int64, len(fresh))
         rows, cols = np.divmod(cells, self._grid.cols)
@@ -217,7 +217,7 @@ class Followers:
             follower.stale = follower.stale or self._crosses(follower, near)
 
     def due(self, now_ns: int) -> dict[Batch, list[tuple[str, Follower]]]:
-        """Followers with a stale route that may be pushed another one, by what they ask for alike; of too many,
+        """Followers with a stale route that may be pushed another one, grouped by goal and length; of too many,
         those that waited longest. From now on their routes are not stale."""
         due = [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
         if len(due) > MOST_PUSHES:
@@ -231,7 +231,7 @@ class Followers:
     def pushed(
         self, batch: Iterable[tuple[str, Follower]], routes: RouteBatch, push_ns: int
     ) -> Iterator[tuple[str, Route]]:
-        """Returns the routes to push: of those for these followers, in their order, the ones that are news."""
+        """Returns those of the routes that are new to their followers, in order."""
         for index, ((id, follower), outline) in enumerate(zip(batch, routes.outlines(), strict=True)):
             if outline.status in _WORTH_PUSHING and self.is_news(follower, outline):
                 route = routes[index]

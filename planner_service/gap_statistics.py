@@ -1,7 +1,7 @@
 """Statistics of one planner about the gap of its routes to the optimum. Pure.
 
 certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
-gap_excess            measured at full growths: driven cost over optimum of what the tree offered each follower
+gap_excess            measured at full growths: cost of each follower's old route over the new optimum, less 1
 broken_certificates   routes whose cost is below their lower bound, and offers below what an exact tree proves:
                       none, unless there is a bug
 """
@@ -71,6 +71,6 @@ class GapStatistics:
 
 
 def _ratios(driven: Gaps, optimum: NDArray[np.float32]) -> Gaps:
-    """Cost over optimum where both are finite and there is any way to go."""
+    """Cost over optimum where both are finite and the optimum is not 0."""
     given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
     return np.asarray(driven[given] / optimum[given].astype(np.float64), np.float64)

@@ -35,7 +35,8 @@ _NO_CELLS: Cells = np.empty(0, np.int64)
 class GoalAnswer(NamedTuple):
     """A route from a start to a goal, or why there is none.
 
-    route        NO_TARGET while it is not known yet: asking again goes on. Its lower bound is then the frontier
+    route        NO_TARGET while it is not known yet: ask again to continue. Until then its lower bound is the
+                 frontier's cost
     lethal_goal  no route leads to the goal: the status is UNREACHABLE
     grown_cells  cells that this ask has grown: 0 if a tree that was kept answered as it was
     """
@@ -58,7 +59,7 @@ _Found = tuple[CutTree, Way | None]
 class _Kept:
     """A tree in the cache.
 
-    tree     as it was cut out; None while it is in hand
+    tree     as it was cut out; None while it is being grown
     seen     changes of the map that were looked at, in a count of all
     changes  those of them that lie near the tree
     """
@@ -69,7 +70,7 @@ class _Kept:
 
 
 class GoalTrees:
-    """Trees of goals on the cost map of one vehicle class; of the thread that changes the map.
+    """Trees of goals on the cost map of one vehicle class; used only by the thread that changes the map.
 
     Parameters
     ----------
@@ -192,7 +193,7 @@ class GoalTrees:
 
     @property
     def _held(self) -> CutTree:
-        """The tree in hand, as a view of it."""
+        """The tree that is being grown, as a view of it."""
         growth, stride = self._growth, self.costs.stride
         whole = growth.cost.reshape(-1, stride)
         return CutTree(growth.root, (0, 0, *whole.shape), whole, growth.bound, 0.0)
@@ -253,7 +254,7 @@ class GoalTrees:
         )
 
     def _cells(self, start: int, way: Way) -> Cells:
-        """The padded cells that a route leads through from one."""
+        """The padded cells passed from a start along a route."""
         cells = np.empty(way.directions.size + 1, np.int64)
         cells[0] = start
         np.cumsum(self._offsets[way.directions], out=cells[1:])

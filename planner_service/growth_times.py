@@ -51,7 +51,7 @@ class GrowthTimes:
     row       of the strategy, in force now
     full_ns   CPU time of a full growth
     exact_ns  CPU time of an exact move, or of mending the tree
-    in_pieces whether exact trees are `PieceTree`s: on large maps, where a cell costs the same from everywhere
+    in_pieces whether exact trees are `PieceTree`s: on large maps whose cells cost the same from all sides
     """
 
     def __init__(
@@ -102,18 +102,18 @@ class GrowthTimes:
             self._choose()
 
     def note_near(self, cells: float) -> None:
-        """Notes how many cells a growth visits that goes as far as the askers are; inf where none can stop."""
+        """Notes the cells of a growth up to the askers; inf if growths cannot stop."""
         if cells != self._near_cells:
             self._near_cells = cells
             self._choose()
 
     @property
     def near_ns(self) -> float:
-        """Returns the CPU time of a growth as far as the askers are; inf where none can stop."""
+        """Returns the CPU time of a growth up to the askers; inf if growths cannot stop."""
         return self._near_cells * self.full_ns / self._grid.cells
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """Notes the time of a full search; not of one that found networks too. A simulation does not call it."""
+        """Notes the time of a full search, unless it found networks, too. A simulation does not call it."""
         median_ns = _median_with(self._full_took_ns, took_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
@@ -208,7 +208,7 @@ class Askers:
 
     @property
     def needed(self) -> int:
-        """Returns about how many cells a growth visits as far as the farthest of the last updates."""
+        """Returns about how many cells a growth to the farthest recent asker visits."""
         return max(self._needed)
 
 
@@ -231,7 +231,8 @@ class WindowSchedule:
 
     def half(self, cell: int, widest: int) -> int:
         """Returns the half width of the window around a target that came to `cell`, at most `widest` unless the
-        narrowest is wider. No window is ever narrower than the way since one so wide, so that windows overlap."""
+        narrowest is wider. A window is never narrower than the target's move since the last of its width, so that
+        windows overlap."""
         found = self._half
         for doublings, centre in enumerate(self._centres):
             half = self._half << doublings
@@ -259,9 +260,10 @@ def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     """Returns the half width, in cells, of the window of variable range (section 3.3.2).
 
     With the largest k >= k_min for which the target crossed the border of a block of 2**k cells the window is
-    2**(k+2) + 1 cells wide, without any 2**(k_min+1) + 1 as in figure 3: 9 cells with k_min = 2. The printed rule
-    asks that row and column cross at once, which a move along an axis never does; here either is enough. At least
-    twice as far as the move was long, so that the window holds both cells and some room around them.
+    2**(k+2) + 1 cells wide; if there is no such k, 2**(k_min+1) + 1 as in figure 3: 9 cells with k_min = 2. The
+    printed rule asks that row and column cross at once, which a move along an axis never does; here either is
+    enough. At least twice as far as the move was long, so that the window holds both cells and some room around
+    them.
     """
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)

@@ -1,10 +1,10 @@
-"""Compiling kernels: what a first route needs before the rest, by several processes, into numba's cache on disk.
+"""Compiles kernels into numba's disk cache by several processes, those for a first route first.
 
     python -m planner_service.kernel_build [KERNEL ...]
 
 is one builder, of these kernels in this order, or of all. Any number of them share the work:
-each claims a kernel by a lock on a file beside numba's, compiles it and writes it there, where planners find it. A
-builder that dies leaves its claim.
+each claims a kernel by a lock on a file beside numba's, compiles it and writes it there, where planners find it.
+The lock of a builder that dies is released.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ _BUILDERS = "builders.lock"
 class NeededKernels:
     """Kernels that planners call, none of them twice. Builders and planners use the same list.
 
-    first  until the first route of each class in `first_classes` is served
+    first  needed until the first route of each class in `first_classes` is served
     later  for the other classes, and what saves growing whole trees
     """
 
@@ -119,8 +119,8 @@ class NeededKernels:
 
 
 def needed_kernels(scenario: Scenario) -> NeededKernels:
-    """Returns the kernels that the planners of a scenario call. Its ground may be of one kind, and a class that
-    flies of the other."""
+    """Returns the kernels that the planners of a scenario call. Its ground may be isotropic while a flying class is
+    directional."""
     ground, aloft = scenario.cost.directional, bool(aloft_classes(scenario))
     first, classes = _first_kernels(scenario)
     later = [*_of_kind(LATER, ground), *(_of_kind(LATER, True) if aloft else [])]
@@ -194,7 +194,7 @@ def load_all() -> None:
 
 
 def build(kernels: Iterable[Kernel], tell: Callable[[Kernel], None] = lambda _: None) -> None:
-    """Compile what no other builder has compiled or is compiling; then wait for these. Tells each."""
+    """Compiles what no other builder has compiled or is compiling; then waits for these. Calls `tell` for each."""
     folder = cache_folder()
     assert folder is not None
     waiting = list(kernels)
@@ -293,7 +293,7 @@ class KernelLoader:
 
 
 def main() -> None:
-    """Compile the kernels that are named, or all of planners."""
+    """Compiles the kernels that are named, or all of planners."""
     os.nice(5)
     every = {name_of(kernel): kernel for kernel in all_kernels()}
     names = sys.argv[1:] or list(every)

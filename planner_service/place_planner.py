@@ -59,7 +59,7 @@ _MOST_WAITING, _MOST_EACH = 1 << 17, 1 << 15
 _BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
 """Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
 _HOLD_NS = NS_PER_S
-"""A question waits so long at most for its growth; then it is answered as far as it is known."""
+"""A question waits at most this time for its growth; then it is answered as far as it is known."""
 _KEEPS_UP_NS = NS_PER_S
 """While a question goes on, its map is so old at most: else marks beside a goal would end no growth."""
 _CELL_NS = 25
@@ -123,7 +123,7 @@ class _Slice(NamedTuple):
 class _ClassTrees:
     """The map of one class of vehicles, the trees on it, and the vehicles which follow their routes.
 
-    All of it belongs to the loop but what `work` touches, which belongs to the worker while that has a slice.
+    All of it belongs to the loop, except what `work` touches: that is the worker's during a slice.
     """
 
     def __init__(self, cost_map: CostMap, config: PlannerConfig, budget_bytes: int, route_cells: int) -> None:
@@ -135,7 +135,7 @@ class _ClassTrees:
         self.kept_up_ns = 0
 
     def news(self, now_ns: int) -> _News | None:
-        """Returns the changes of the map since the last call; None without any. Not beside a slice."""
+        """Returns the changes of the map since the last call; None without any. Not to be called during a slice."""
         self.kept_up_ns = now_ns
         pace, windows = self.cost_map.pace_s_per_m, self.cost_map.take_dirty()
         if self._version < 0:

@@ -1,4 +1,4 @@
-"""The planner of one target: when to grow, what to answer, which followers to push newer routes. Pure."""
+"""The planner of one target: when to grow, what to answer, to which followers to push newer routes. Pure."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class Planner:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
-        """Takes over, or leave it to another."""
+        """Takes over, or leaves the lead to another."""
         self.leads = leads
         self.push_all()
 
@@ -197,7 +197,7 @@ class Planner:
         return answer
 
     def tick(self, now_ns: int) -> list[Action]:
-        """Brings the tree up to date, push newer routes, tell how we are doing."""
+        """Brings the tree up to date, pushes newer routes and publishes the status."""
         actions = self._keep_up(now_ns)
         self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
@@ -430,7 +430,7 @@ class Planner:
         return [cell for cell, is_good in zip(cells, good.tolist(), strict=True) if not is_good]
 
     def _force(self, cells: list[int], now_ns: int) -> bool:
-        """Cover cells, once each between two changes of the tree: asking again costs nothing. Returns True if the
+        """Grows the tree over cells, once each between two changes of the tree. Returns True if the
         tree has changed."""
         fresh = sorted({cell for cell in cells if 0 <= cell < self._grid.cells} - self._forced)
         if not fresh:

@@ -37,12 +37,11 @@ class Planning:
 
 
 class PlanningProcess:
-    """One process of several with one job, of which the leader serves.
+    """One of several processes with the same job; their leader serves.
 
     groups         those whose marks it may know; None if all
     served         topics that the leader serves, and the fields of their keys
-    all_kernels    whether all may be called by now, not only those for whole trees of `first_classes`; if not
-                   given, they may
+    all_kernels    whether all kernels are ready, not only those for whole trees of `first_classes`; default: yes
     """
 
     def __init__(

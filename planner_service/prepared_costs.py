@@ -1,7 +1,7 @@
 """Shared data of the planners of one map on one machine, in files of the run's folder.
 
-One computes it, all map it. A file's name is the digest of all that it follows from, so that it cannot be another
-map's.
+One process computes them; all memory-map the file. A file's name is the digest of all that it follows from, so that
+it cannot be another map's.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _save(path: Path, array: NDArray[Any]) -> None:
 
 
 def _read(path: Path, size: int) -> Floats | None:
-    """None where the file is not there; a damaged one is as none, and is said: kernels check no index that they
+    """None if the file is missing; a damaged one counts as missing, and is logged: kernels check no index that they
     read from it."""
     try:
         whole = open_array(path)

@@ -60,12 +60,12 @@ class Puller:
     def pull(
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
     ) -> tuple[Pulled, NDArray[np.float64]]:
-        """Routes as in `RouteBatch`, read-only or not -> those pulled, and (3, n) float64: the integral of the pace
-        along each one, and along the route that it was, s; its length, m.
+        """Routes as in `RouteBatch`, read-only or not -> those pulled, and (3, n) float64: the pace integral (s) of
+        the pulled route and of the original, and its length (m).
 
-        The integral is inf for a route that meets closed cells by now: each of its steps is a segment then. A route
-        is not pulled either if that would bring it to a cell twice: a vehicle that is pushed the same route in that
-        cell would drive the loop again.
+        The integral is inf for a route that now meets closed cells; such a route stays unpulled. A route is not
+        pulled either if that would bring it to a cell twice: a vehicle that is pushed the same route in that cell
+        would drive the loop again.
         """
         many, steps = starts.size, directions.size
         # Arrays from the wire, or put together of single routes, are read-only, which the kernel refuses.

@@ -70,7 +70,7 @@ class PulledRoute:
 
 
 class RouteFinder:
-    """Cheapest routes from everywhere to one target, kept up with as the target moves and the map changes.
+    """Cheapest routes from everywhere to one target, kept up to date as the target moves and the map changes.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ class RouteFinder:
         """A route pulled straight: fewer turns, less time, no lethal cell and no corner that its steps may not cut.
 
         The cheapest chain of segments between the route's own cells, by dynamic programming over some of them:
-        those up to 64 cells back, ever farther apart, and where the way to the cell before turned.
+        those up to 64 cells back, with growing gaps, and the turn before.
 
         Raises ValueError where uphill is not downhill on the ground, on a route that does not lead to a target, and
         on one that the map's changes have shut.
@@ -214,7 +214,7 @@ class RouteFinder:
         return Puller(self._pace, self.grid.resolution_m, self._config, self._climb)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:
-        """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""
+        """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no path."""
         costs: NDArray[np.float32] = self._tree.cost_to_go_at(np.arange(self.grid.cells))
         return costs.reshape(self.grid.rows, self.grid.cols)
 
@@ -231,7 +231,7 @@ class RouteFinder:
 
 
 def _whole(row: Any, col: Any) -> tuple[int, int]:
-    """A place as a cell. Raises TypeError between cells: half a row may be half a map away."""
+    """A place as a cell. Raises TypeError if row or column is not whole: half a row may be half a map away."""
     try:
         return operator.index(row), operator.index(col)
     except TypeError as error:

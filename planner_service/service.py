@@ -54,9 +54,9 @@ from swarm.wire.topics import (
 log = logging.getLogger(__name__)
 
 _PRESENCE_NS = 5 * NS_PER_S
-"""A vehicle of which nothing was heard for so long sees nothing."""
+"""A vehicle that was silent for this time sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
-"""A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
+"""A query waits at most this time for a tree to answer from, and of more the oldest are answered at once."""
 _AT_ONCE, _ROUTE_COST = 1 << 16, 64
 """Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
 
@@ -264,7 +264,7 @@ class PlannerService(PlanningProcess):
         self._search.hear_vehicles(*self._presence.columns())
 
     def _listen(self, listens: bool) -> None:
-        """Receives from vehicles where they are and what they see, or do not."""
+        """Receives positions and sightings of vehicles, or stops receiving them."""
         if listens == self._listens:
             return
         self._listens = listens
@@ -278,8 +278,8 @@ class PlannerService(PlanningProcess):
     def _answer(self, now_ns: int) -> None:
         """Answers queries. If there will be a tree to answer from soon, a query waits for that, but not long.
 
-        A query for one class never waits for the tree of another. Agents come first. After `_AT_ONCE` costs
-        the others wait for the next call. Of others than agents one query a tick may force the tree to grow.
+        A query for one class never waits for the tree of another. Agents come first. After `_AT_ONCE` units of work
+        the others wait for the next call. Only one query a tick that is not an agent's may force a growth.
         """
         held, self._held = self._held, []
         spent = 0

@@ -41,9 +41,8 @@ class OnMove(Enum):
 class StrategyRow:
     """One strategy.
 
-    renews_within_budget  full searches at the rate which `planner.cpu_budget` allows, beside windows that cannot be
-                        searched. If not, section 3.3.2, the passive strategy: only when a vehicle whose route has
-                        run out asks
+    renews_within_budget  full searches at the rate of `planner.cpu_budget`, if windows cannot be searched. If
+                          False, only when a vehicle whose route ran out asks (section 3.3.2, the passive strategy)
     thins_far_cells     section 3.3.3, multi-resolution: far from the target only the ways between blocks of 16,
                         32, ... cells are grown, a stride that doubles with the distance. Scheduled windows reach a
                         16th of the map's side then: what lies beyond belongs to the strides
@@ -135,8 +134,7 @@ HYSTERESIS = 0.7
 
 
 class Auto:
-    """Returns which stage `auto` is in: a function of the times observed alone, so that a model decides alike
-    everywhere.
+    """Chooses the stage of `auto` from observed times alone, so that a model decides alike everywhere.
 
     stage  what to do now; `row` alone changes it
     """
@@ -159,7 +157,8 @@ STRATEGIES: Mapping[str, Callable[[], Strategy]] = {
 
 
 def strategy_of(plugin: Plugin, world: StrategyWorld, tell: Tell) -> Strategy:
-    """The strategy that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    """The strategy that a scenario names. Raises ConfigError if it cannot be made; `tell` is called with a later
+    fault."""
     if plugin.factory is None:
         return STRATEGIES[plugin.named.name]()
     return PluginStrategy(plugin.make(world), Guard(plugin, tell))

@@ -56,8 +56,8 @@ class Update:
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
     wants_full  please run `full_job` on a worker, and `adopt` what it returns
-    repair_ns   CPU time of the repair after map changes that came first, by the tree's stopwatch: of a move or a
-                growth it says nothing
+    repair_ns   CPU time of the repair after map changes that came first, by the tree's stopwatch; excludes moves
+                and growths
     """
 
     kind: Kind
@@ -240,7 +240,8 @@ class TargetTree:
         return self.strategy.thins_far_cells and self._loaded and not self._seeks_network
 
     def stride_job(self) -> Callable[[], StrideNetwork]:
-        """Returns the one search of this tree, for a worker: marks make its result less good, never wrong."""
+        """Returns the search for this tree's stride network, for a worker: marks make its result less good, never
+        wrong."""
         self._seeks_network = True
         return partial(find_strides, self._costs.snapshot())
 
@@ -257,7 +258,7 @@ class TargetTree:
         map_version: int,
         followed_cells: Any,
     ) -> Update:
-        """Replaces the tree by a grown one and bring it up to date; measure `last_gaps` over `followed_cells`.
+        """Replaces the tree by a grown one and brings it up to date; measures `last_gaps` over `followed_cells`.
 
         dirty  covers every cell that changed since the snapshot of `grown` was taken
         """
@@ -287,7 +288,7 @@ class TargetTree:
         return Update("full", self._grid.window, self._grid.cells + then.cells, then.wants_full)
 
     def force(self, cells: Any) -> Update:
-        """Force the range to cover these cells (section 3.3.2): what they get afterwards is the best there is.
+        """Forces the range to cover these cells (section 3.3.2): their routes are optimal afterwards.
 
         If a full search would hold up answers for long, a worker does it, and they get their routes when that tree
         is adopted; until then, the best inside a window that holds them and the target, if that is quick enough.
@@ -330,7 +331,7 @@ class TargetTree:
         return routes
 
     def cost_to_go_at(self, cells: Any) -> Floats:
-        """float32, s, per cell; inf where there is no way or the cell is outside."""
+        """float32, s, per cell; inf where there is no path or the cell is outside."""
         asked = np.asarray(cells, np.int64).reshape(-1)
         costs: Floats = np.full(asked.size, np.inf, np.float32)
         if self.ready:
@@ -460,7 +461,7 @@ class TargetTree:
         return self.times.is_quick(self._grid.cells)
 
     def _prepared(self, tree: CostToGoTree) -> CostToGoTree:
-        """A tree before a window makes its costs upper bounds: they are taken for a heuristic if they are exact."""
+        """Prepares a tree before a window loosens its costs: exact costs are kept as a heuristic."""
         if tree.fine:
             if not tree.precise:
                 tree.mend()
@@ -470,16 +471,16 @@ class TargetTree:
         return tree
 
     def _grow_or_leave(self, target_cell: int) -> Update:
-        """Grows the whole tree here, or leave that to the worker and lead to the old root until it is adopted."""
+        """Grows the whole tree here, or leaves that to the worker; routes lead to the old root until it is
+        adopted."""
         if self._is_quick and self._state is not State.BEHIND:
             return self._grow_full(target_cell)
         self.target_cell, self._state = self._tree.root, State.BEHIND
         return Update("none", wants_full=not self._job_out)
 
     def _grow_full(self, target_cell: int) -> Update:
-        """Grows the whole tree: here or, where that would take too long, on the worker. The one that there is
-        serves no more. Where growths can stop, and the row asks for no more or the worker has to grow the rest, it
-        goes as far as the askers are."""
+        """Grows the whole tree: here or, where that would take too long, on the worker. The old tree is dropped. If
+        growths can stop, and more is not needed here, it grows only up to the askers."""
         if self._growth.usable and (self._stops or not self._is_quick):
             near = self._grow_near(target_cell, rest=not self._stops)
             if near is not None:
@@ -514,7 +515,7 @@ class TargetTree:
 
     @property
     def _is_whole(self) -> bool:
-        """Returns True if a cell without a cost has no way."""
+        """Returns True if a cell without a cost has no path."""
         return isinstance(self._tree, PieceTree) or self._tree.bound == np.inf
 
     def _follow_near(self, target_cell: int, changes: Changes | None) -> Update | None:
@@ -559,7 +560,7 @@ class TargetTree:
         return self.ready
 
     def _reach(self, asked: NDArray[np.int64]) -> None:
-        """Goes on with a growth that has stopped as far as these cells."""
+        """Continues a stopped growth up to these cells."""
         if not self.times.may_stop and self._is_whole:
             return
         tree, starts = self._tree, self._open(self._inside(asked))
@@ -574,7 +575,8 @@ class TargetTree:
         self._note(starts)
 
     def expect(self, cells: Any) -> None:
-        """Notes cells that will be asked from, as those of a standby's followers: a growth goes as far."""
+        """Notes cells from which queries will come, such as those of a standby's followers: growths will reach
+        them."""
         if self.ready and self._growth.usable:
             self._note(self._open(self._inside(cells)))
 

@@ -12,7 +12,7 @@ from swarm.config.vehicle_classes import GROUND
 UNUSED_NS = 60 * NS_PER_S
 """A tree without a query for this time is dropped."""
 _BEGINS_NS = NS_PER_S
-"""A query waits so long at most for the first tree of its class."""
+"""A query waits at most this time for the first tree of its class."""
 
 
 class ClassPlanners:
@@ -20,7 +20,7 @@ class ClassPlanners:
 
     make   makes the planner of a class
     known  the classes that there are, beside "ground"
-    ready  whether the kernels are there by which the trees of a class are grown
+    ready  whether the kernels which grow the trees of a class are loaded
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class ClassPlanners:
         return self._by_class.get(name)
 
     def begun_ns(self, name: str) -> int:
-        """Time when the planner of a class was made, which tells it from one that was dropped; 0 of "ground"."""
+        """Time when the planner of a class was made, which tells it from one that was dropped; 0 for "ground"."""
         return self._begun_ns.get(name, 0)
 
     def used(self, name: str, now_ns: int) -> Planner:

@@ -105,7 +105,7 @@ class Presence:
     A message lists an author's vehicles in one region, and replaces the author's last message of that region.
     Presence therefore needs no merging, and a lost message needs no repeat.
 
-    lease_ns  a message is forgotten so long after it came
+    lease_ns  a message is forgotten this time after it came
     filter    whose vehicles count; None: everybody's
     """
 

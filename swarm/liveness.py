@@ -70,7 +70,7 @@ class Roster:
 
 
 SILENCE_NS = 3_000_000_000
-"""A stream that has been silent for so long is heard again from wherever it goes on."""
+"""A stream that has been silent for this time is heard again from wherever it goes on."""
 POSE_SILENCE_NS = 2_000_000_000
 """The same of target poses, which come twice a second at least."""
 

@@ -67,7 +67,7 @@ class Agent:
     plan       which vehicles, of which group
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
-    obstacles  what they must not drive into, and takes no part in right of way
+    obstacles  what they must avoid and has no part in right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
     group      costs published by the other agents of the group, if the assigner asks for them
@@ -246,7 +246,7 @@ class Agent:
         return self._steering.shut_in & self.vehicles.keys()
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
-        """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        """Takes the cells closed only by an operator's zone, with the number of steps from each to its edge."""
         self.seen_lethal.intersection_update(ways_out)
         self._go_out(ways_out)
 
@@ -303,7 +303,7 @@ class Agent:
         return driven
 
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, by_others: bool = False) -> None:
-        """Ends routes before cells that are lethal now, and paths also before corners that are.
+        """Ends routes before cells that are lethal now, and paths also before corners that are lethal now.
 
         changed    the windows with all cells that have changed
         by_others  others may have changed the map: compare the view with it again
@@ -411,7 +411,7 @@ class Agent:
         return actions
 
     def decide_anew(self, target: str | None = None) -> None:
-        """Something has changed by which `decide` goes, for all vehicles or those with a target."""
+        """Notes that an input of `decide` has changed, for all vehicles or those with a target."""
         for vehicle in self.vehicles.values():
             if target is None or vehicle.target == target:
                 vehicle.decided = None

@@ -33,7 +33,8 @@ _SAMPLE = 1 << 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
+    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. The owners of the arrays change them in
+    place.
 
     pace       cost of a cell to its vehicles' class, with marks and inflation
     ground     the map's cells for the class "ground", before inflation, with which findings are compared
@@ -52,7 +53,7 @@ class LocalMap:
     own_prior: NDArray[np.float32] | None = None
 
     def cell_s(self, share: float) -> float:
-        """Returns the time of a cell (s) than which this share of cells takes less, by a sample of them."""
+        """Returns this quantile of the times of cells (s), from a sample of them."""
         paces = self.physics.reshape(-1)[:: max(self.physics.size // _SAMPLE, 1)]
         paces = paces[np.isfinite(paces)]
         return self.grid.resolution_m * float(np.quantile(paces, share)) if len(paces) else math.inf
@@ -93,7 +94,7 @@ class AgentMaps:
     vehicles of "ground" both are one.
 
     common, own   the ground for "ground", and for the vehicles' class
-    class_number  of that class, 0 of "ground"
+    class_number  of that class, 0 for "ground"
 
     common    the cost map of "ground"
     own       that of the vehicles' class
@@ -135,7 +136,7 @@ class AgentMaps:
         own_kinds: NDArray[np.uint8],
         own_paces: Floats,
     ) -> tuple[NDArray[np.uint8], Floats]:
-        """Kinds and paces that hold for the vehicles' class, of statements for all and for that class alone."""
+        """Combines statements for all classes with those for the vehicles' class. Returns kinds and paces."""
         if self.own is self.common:
             return kinds, paces
         read = read_marks(self.own.terrain, self.common.terrain, cells, kinds, paces)
@@ -213,8 +214,8 @@ class ZonesAround:
             self.ways_out = self._find_ways_out(shut)
 
     def free(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Returns which cells are in no zone for all vehicles. In one an operator's mark holds, against any view of
-        a vehicle; in a zone for one class the others go by findings."""
+        """Returns which cells are in no zone for all vehicles. There an operator's mark overrules findings; in a
+        zone for one class the other classes use findings."""
         return ~np.isin(cells, self._cells)
 
     def _find_zones(self) -> None:
@@ -287,7 +288,7 @@ class ZonesAround:
         return found
 
     def _said_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
-        """Returns the marks of a tile beside its zones, and the cells in it of each zone."""
+        """Returns the marks of a tile without its zones, and the cells in it of each zone."""
         sets, now_ns = self._replica.held.of_tile(tile), self._replica.now_ns
         zones = [standing(each, now_ns).cells for each in sets if is_zone(each.author)]
         return winners([each for each in sets if not is_zone(each.author)], now_ns), zones

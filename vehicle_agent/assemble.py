@@ -1,4 +1,4 @@
-"""Assembles the parts of an agent process of the scenario, the terrain and the file of promises. `AgentService`
+"""Builds the parts of an agent process from the scenario, the terrain and the file of promises. `AgentService`
 carries messages between them and the bus."""
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class AgentParts:
     author      under which it writes marks and reports
     flies       True if its vehicles are in the air, where no obstacles are
     near_marks  which tiles of the map concern the vehicles
-    untracked   the targets of which only vehicles tell
-    costs       what the group's agents tell each other; None if the assigner does not ask for it
+    untracked   targets known only from sightings
+    costs       costs that the group's agents exchange; None if the assigner does not use them
     spawning    lets the vehicles of an added agent enter; None for an agent of the scenario
     faults      faults of plug-ins that are not reported yet
 

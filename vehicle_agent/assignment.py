@@ -49,7 +49,7 @@ class AssignmentWorld:
 class CostTable:
     """Costs from each vehicle to each target.
 
-    targets   whose planners have replied; with shared costs, ascending, also those from others
+    targets   targets with a reply of their planner; with shared costs also others' targets, then ascending
     vehicles  those that have a choice
     costs_s   (targets, vehicles) float64, inf where there is no route
     current   (vehicles,) index of the target of each now, -1 for none
@@ -94,9 +94,8 @@ class Cheapest:
 class Balanced:
     """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
 
-    All agents solve one problem, which does not depend on who solves it or in which order words came, and each
-    takes what it says of its own vehicles. If they hold different messages, a target may have more pursuers for a
-    period.
+    All agents solve the same problem, independent of message order, and each applies its own vehicles' part. If
+    they hold different messages, a target may have more pursuers for a period.
     """
 
     shares_costs = True
@@ -133,7 +132,8 @@ def shares_costs(assigner: Assigner) -> bool:
 
 
 def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
-    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` is called with a later
+    fault."""
     if plugin.factory is None:
         return ASSIGNERS[plugin.named.name](world)
     return PluginAssigner(plugin.make(world), Guard(plugin, tell))
@@ -211,13 +211,13 @@ def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | N
 def need_first(costs_s: Costs, current: Sequence[int], pursuers: int) -> NDArray[np.int64]:
     """Returns which vehicles the targets need as pursuers.
 
-    Each target gets `pursuers` of them, or as many as there are for each where vehicles are fewer, one at least;
-    the sum of their costs is the least. If not all needed vehicles have a path, as many targets as possible get
-    their first pursuer, then as many their second. Ties go by index, so that equal orders give equal results.
+    Each target gets `pursuers` vehicles or, if there are too few, an equal share, at least one; the sum of their
+    costs is the least. If not all needed vehicles have a path, as many targets as possible get their first pursuer,
+    then as many their second. Ties go by index, so that the result is the same everywhere.
 
     Parameters
     ----------
-    costs_s : (targets, vehicles) float64, s, inf where there is no way
+    costs_s : (targets, vehicles) float64, s, inf where there is no path
     current : (vehicles,) the target of each now, -1 for none; another must be cheaper by `HYSTERESIS`
 
     Returns
@@ -246,11 +246,11 @@ def need_first(costs_s: Costs, current: Sequence[int], pursuers: int) -> NDArray
 class _Matching:
     """Vehicles matched to targets at least total cost, grown by one place of a target at a time.
 
-    Successive shortest paths (Busacker and Gowen, 1960) over the targets alone: target a is followed by b at what
-    it costs more to have one of b's vehicles chase a. There are few targets and the paths are short, so relaxing
-    all pairs at once (Bellman and Ford) takes a few calls of NumPy, whatever the number of vehicles. Costs are
-    whole multiples of a number greater than that of targets, so that sums are exact: no rounding makes a circle of
-    exchanges look like a gain.
+    Successive shortest paths (Busacker and Gowen, 1960) over the targets alone: the edge a-b costs what it adds to
+    let a vehicle of b chase a. There are few targets and the paths are short, so relaxing all pairs at once
+    (Bellman and Ford) takes a few calls of NumPy, whatever the number of vehicles. Costs are whole multiples of a
+    number greater than that of targets, so that sums are exact: no rounding makes a circle of exchanges look like a
+    gain.
 
     owner   (vehicles,) int64, the target of each, -1 for none
     filled  (targets,) int64, how many vehicles each has
@@ -304,7 +304,7 @@ class _Matching:
             dist = low
 
     def _compare(self, target: int) -> None:
-        """Computes the bids of others for a vehicle of this target."""
+        """Computes what each other target adds by taking a vehicle of this one."""
         self._swap[:, target] = np.inf
         own = np.flatnonzero(self.owner == target)
         if own.size:

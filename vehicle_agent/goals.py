@@ -3,7 +3,7 @@
 `VehicleGoals.done` is the whole progress of a vehicle. It grows by one when the vehicle is at rest at its place.
 The agent tells it, and keepers store it: a later generation of the agent goes on where this one ended. Pure.
 
-A place that many vehicles share is reached within the fewest steps that give each vehicle a cell. Else all but one
+A place that several vehicles share counts as reached on the nearest cells, one per vehicle. Otherwise all but one
 would push for ever.
 """
 
@@ -95,8 +95,8 @@ class GoalQueues:
         return cell in self._arrivals[goal]
 
     def reached(self, vehicle: str, cell: int, now_ns: int) -> bool:
-        """A vehicle is at rest at its place. Returns True if that is news: one that goes round has to move for it,
-        as places may lie so close that one cell counts for both."""
+        """A vehicle is at rest at its place. Returns True if that is new: a vehicle on a loop must move first, as
+        one cell may count for two places."""
         goals = self.book.in_force(vehicle)
         if goals is None or is_over(goals) or (goals.then == "repeat" and self._arrived.get(vehicle) == cell):
             return False

@@ -2,8 +2,8 @@
 
 A report closes the cells that its disc touches, and those that it touches within `REACTION_S` if it keeps its
 speed and heading. Until the next report it may have continued as stated, so the closed area grows with its age. A
-cell is open again only if a newer report of the same obstacle leaves it, or its lease ends. Leases count by the
-receiver's clock, from when a report was heard; nothing depends on what the sender's clock says.
+cell is open again only if a newer report of the same obstacle no longer covers it, or the report's lease ends.
+Leases count by the receiver's clock, from the receipt of a report; nothing depends on the sender's clock.
 
 If reports contradict each other, all cells of both are closed: two senders under one id are two obstacles, and an
 obstacle that leaps keeps its old position closed until that report's lease ends. A report is refused, and changes
@@ -68,8 +68,8 @@ class Capsule:
         return flat
 
     def depth(self, grid: GridSpec, cell: int) -> float:
-        """Returns the depth of a cell's middle in it, widened by half a cell's diagonal: 0 outside, 1 on its
-        line."""
+        """Returns how deep a cell's centre lies in the capsule, widened by half a cell's diagonal: 0 outside, 1 on
+        its line."""
         u0, v0, u1, v1, radius = self._in_cells(grid)
         row, col = divmod(cell, grid.cols)
         u, v = col + 0.5, row + 0.5
@@ -125,7 +125,7 @@ REACTION_S = 0.5
 MAKE_WAY_S = 2.0
 """Vehicles at rest leave cells to which an obstacle comes within this time."""
 STANDS_NS = NS_PER_S
-"""An obstacle that has kept its place for so long is driven around, not waited for."""
+"""An obstacle that has kept its place for this time is driven around, not waited for."""
 MOST_OBSTACLES = 256
 MOST_CELLS = 100_000
 """Limit for all obstacles together: bounds time and memory, and the effect of false reports."""
@@ -151,7 +151,8 @@ _NOTHING = Window(0, 0, 0, 0)
 
 
 def capsule_of(report: Obstacle, grid: GridSpec, ahead_m: float, margin_m: float = 0.0) -> Capsule:
-    """Returns the area that an obstacle touches on a distance: by its heading, or in any direction without one."""
+    """Returns the area that an obstacle touches within `ahead_m` along its heading, or in any direction without
+    one."""
     ahead_m = min(ahead_m, _FURTHEST_CELLS * grid.resolution_m)
     radius_m = report.radius_m + margin_m
     if report.heading_rad is None:
@@ -164,8 +165,8 @@ def capsule_of(report: Obstacle, grid: GridSpec, ahead_m: float, margin_m: float
 class _Known:
     """State of one report.
 
-    heard_ns  when it was heard; later where the process has not listened meanwhile, `came_ns` never
-    cells     closed now; `ahead_m` is the length of the way to which they belong
+    heard_ns  when it was received, shifted by pauses in listening; `came_ns` is not shifted
+    cells     closed now; `ahead_m` is the distance ahead for which they are computed
     coming    where it comes to within `MAKE_WAY_S`; None if it stands
     window    holds all that it closes or comes to
     charge    cells of the box that holds all that it can ever close
@@ -306,8 +307,8 @@ class Obstacles:
         return None
 
     def _outgrown(self, id: str, is_new: bool, more: int) -> str | None:
-        """Reason why a report would give an id more than its share, which holds for all its senders and for the
-        places that they have left by a leap: an id is what a certificate names."""
+        """Reason why a report would give an id more than its share. It is counted over all senders of the id and
+        the places that they have left by a leap, because certificates name ids."""
         own = [each for n in self._senders.get(id, ()) if (each := self._known.get((id, n))) is not None]
         if is_new and len(own) >= _MOST_SENDERS:
             return f"{len(own)} senders have this id already"

@@ -131,10 +131,10 @@ def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bo
 
 
 _FOUND_NS = NS_PER_S
-"""A new generation waits so long for its vehicles of an earlier one to be found in the tables, before others
+"""A new generation waits this time for its vehicles of an earlier one to be found in the tables, before others
 enter."""
 _ANOTHER_CELL_NS = NS_PER_S
-"""A cell that is not granted for so long is taken: the next one is tried."""
+"""A cell that is not granted for this time is taken: the next one is tried."""
 
 
 class Spawning:
@@ -164,9 +164,8 @@ class Spawning:
         self._waiting = [vehicle for vehicle in self._waiting if vehicle not in gone]
 
     def may_stand(self, vehicle: str, cell: int) -> bool:
-        """Returns True if a vehicle that has found its place may take it. One of an earlier generation stands there
-        already; one that would enter has an obstacle there that came while the cell was asked for, and goes
-        elsewhere."""
+        """Returns True if a vehicle that has found its place may take it. A vehicle of an earlier generation may; a
+        new one may not if an obstacle came meanwhile."""
         asked_cell, _ = self._asked.get(vehicle, (None, 0))
         return cell != asked_cell or self._is_open(cell)
 
@@ -176,7 +175,7 @@ class Spawning:
         return not self._waiting
 
     def tick(self, informed: bool, now_ns: int) -> None:
-        """Asks for cells. `informed`: whether those could answer who know what earlier generations held."""
+        """Asks for cells. `informed`: whether agents that know earlier generations' cells could answer."""
         holdings = self._holdings
         if not holdings.generation or holdings.replaced:
             return
@@ -193,7 +192,7 @@ class Spawning:
                 self._ask(vehicle, now_ns)
 
     def _ask(self, vehicle: str, now_ns: int) -> None:
-        """For the next cell that is open. Without one, a requested cell is not taken once it is granted."""
+        """Asks for the next open cell. Without one, a requested cell is not taken once it is granted."""
         for _ in range(len(self._cells)):
             cell = self._cells[0]
             self._cells.rotate(-1)

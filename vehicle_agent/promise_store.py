@@ -1,4 +1,4 @@
-"""The file of an agent for right of way: its own lives, and its promises and tables as a member."""
+"""The file of an agent for right of way: its own generations, and its promises and tables as a member."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PromiseStore:
 
     @property
     def ready(self) -> bool:
-        """True if all that one event can bring will find space. While it will not, nothing may be promised."""
+        """True if there is space for one event's records; if not, nothing may be promised."""
         return True
 
     def reserve(self) -> str | None:
@@ -78,7 +78,7 @@ class FilePromiseStore(PromiseStore):
     """A journal of promises. Records before a `sync` survive a kill and a loss of power.
 
     waits    for the end of a process that has locked it
-    network  with the certificate beside which revoked names are listed
+    network  names the certificate; the revocation list lies beside it
 
     Raises StoreError if the file is in use, is damaged or cannot be written.
     """

@@ -25,7 +25,7 @@ HEARTBEAT_NS = NS_PER_S
 class ChasersReport:
     """Makes the messages of one author.
 
-    A planner reads pushed routes from the published cells, and a vehicle can take a route that begins anywhere on
+    Pushed routes start at the published cells, and a vehicle can take a route that begins anywhere on
     its path. Each vehicle therefore publishes the end of its path, and again when its path no longer has the cell:
     seldom for one that is slow on a map of large cells, and never for one that waits.
     """
@@ -38,8 +38,8 @@ class ChasersReport:
         all that have chasers."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
-        """Returns due messages: about targets that a vehicle has taken or left, whose planner knows a cell that a
-        vehicle has left behind, or without a message for `HEARTBEAT_NS`.
+        """Returns the messages that are due: about targets which a vehicle took or left, which have a vehicle that
+        left its published cell, or for which `HEARTBEAT_NS` passed without a message.
 
         vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
         """

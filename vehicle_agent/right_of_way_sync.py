@@ -38,7 +38,7 @@ class OwnTime:
     """A clock that counts at most one period between two ticks.
 
     A process that comes late to its ticks has not heard the others meanwhile, so it cannot say that they were
-    silent; and where one is late, for want of processors, the others are. By wall time, on a machine on which ticks
+    silent; and if one process is late for lack of CPU, all are. By wall time, on a machine on which ticks
     come seconds apart, every lease had expired at each tick: leaders were replaced before they could grant, for
     ever. With punctual ticks it equals wall time. Safety does not depend on it.
 
@@ -66,7 +66,7 @@ class OwnTime:
 log = logging.getLogger(__name__)
 
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
-"""A new generation waits so long for the others' answers before it begins. What comes later counts as well."""
+"""A new generation waits this time for the others' answers before it begins. What comes later counts as well."""
 _LATE_ANSWERS_S = 10.0
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
@@ -78,10 +78,10 @@ _MOST_REFUSALS_TOLD = 100
 _MOST_DIGITS = 9
 """Digits of a shard's number in a key, and of a certificate's."""
 _RESERVE_NS = NS_PER_S
-"""Space for promises is looked for so often: a check costs a system call."""
+"""Space for promises is looked for at this interval: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _SLOW_FOR_NS = 5 * NS_PER_S
-"""A link is reported once it has been slow for so long: at a start all are, for a moment."""
+"""A link is reported once it has been slow for this time: at a start all are, for a moment."""
 _WAITING_AGAIN_NS = 10 * NS_PER_S
 """Interval of repeated events: a late watcher receives them, and the log stays readable."""
 
@@ -196,7 +196,7 @@ class RightOfWaySync:
                 yield self.hear(heard.message, now_ns)
 
     def is_awaited(self, message: Message) -> bool:
-        """Returns True if a vehicle may stand because it waits for what this says."""
+        """Returns True if a vehicle may be waiting for this message."""
         holdings = self.core.holdings
         match message:
             case Left():
@@ -259,7 +259,7 @@ class RightOfWaySync:
             )
 
     def _look_after_store(self, now_ns: int) -> None:
-        """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
+        """Stops a member that cannot file promises, notes it, and lets it act again when there is space."""
         if now_ns >= self._reserve_due_ns:
             self._reserve_due_ns = now_ns + _RESERVE_NS
             self._take_revoked(now_ns)
@@ -275,7 +275,7 @@ class RightOfWaySync:
         self.core.silent = not self._store.ready
 
     def _take_revoked(self, now_ns: int) -> None:
-        """Tells the members of agents whose certificates were revoked since the last look."""
+        """Tells members which agents' certificates were revoked since the last look."""
         revoked: dict[str, int] = {}
         for name in self._store.revoked():
             base, _, number = name.partition("~")  # a0~2 is the second certificate of a0
@@ -307,7 +307,7 @@ class RightOfWaySync:
             self._perform(self.core.begin(self._chance))
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
-        """A claim is answered to the member whose epoch it is, under its own name."""
+        """Answers a claim only if the asking member leads that epoch."""
         if not asked.fields["shard"].isdecimal() or len(asked.fields["shard"]) > _MOST_DIGITS:
             return
         shard, shards = int(asked.fields["shard"]), self.core.shards
@@ -333,7 +333,7 @@ class RightOfWaySync:
                 self._bus.publish(topic, message, shard=message.shard, member=member, agent=self._id)
 
     def _perform(self, actions: Sequence[Action]) -> None:
-        """Performs what one event or tick has brought: what is to be on file first, with one sync for all of it."""
+        """Performs the actions of one event or tick: writes first, with one sync for all."""
         filed = [action for action in actions if isinstance(action, Save | OwnRecord)]
         for each in filed:
             if isinstance(each, Save):

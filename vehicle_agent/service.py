@@ -66,7 +66,7 @@ from vehicle_agent.target_choice import AskCosts
 log = logging.getLogger(__name__)
 
 _ANSWER_S = 2.0
-"""A planner's answer is waited for so long, or for several round trips where the link is slow."""
+"""A planner's answer is waited for at most this time, or for several round trips where the link is slow."""
 _TRIPS = 3.0
 _LONGEST_ANSWER_S = 8.0
 _PLACE = "place"
@@ -212,7 +212,7 @@ class AgentService:
                 pass
 
     def _act(self, now_ns: int) -> None:
-        """Goes on between two ticks by what others have said, a few times in the time of a cell."""
+        """Acts on messages between two ticks, a few times per driven cell."""
         acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns
         if acts and not self.agent.holdings.replaced:
             self._acted_ns = now_ns
@@ -357,7 +357,7 @@ class AgentService:
             log.info("%d vehicles have their places", len(self.agent.vehicles))
 
     def _on_leave(self, asked: Sequence[str]) -> Removed:
-        """Makes vehicles leave, all if none is named; of those that have left already say how far it is."""
+        """Makes vehicles leave, all if none is named; for those already leaving reports the progress."""
         ours = self.agent.plan.vehicle_ids
         left = [id for id in ours if id in asked or not asked]
         self.agent.remove([id for id in left if id not in self._removed])
@@ -463,7 +463,7 @@ class AgentService:
             self._roster.gone(event.peer)
 
     def _set_planners(self, now_ns: int) -> None:
-        """Gives each target the planner of the best rank that lives, once at a tick, as names cost nothing."""
+        """Gives each target its living planner of best rank, once a tick, as anyone can announce names."""
         if self._planners_changed:
             self._planners_changed = False
             alive = self._roster.alive("planner")

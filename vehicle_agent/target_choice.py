@@ -23,9 +23,9 @@ from vehicle_agent.driving.driven_vehicle import Vehicle
 _RETRY_NS = NS_PER_S // 2
 """Vehicles for which no planner has answered ask again so soon: a planner needs about that long to start."""
 _STRANDED_RETRY_NS = 3 * NS_PER_S
-"""Vehicles without a way ask again so soon: only a changed map gives them one."""
+"""Vehicles without a path ask again so soon: only a changed map gives them one."""
 _JUMPS_APART_NS = NS_PER_S // 50
-"""For each target: so long after a request a jump of a target may cause the next. With many targets one always
+"""For each target: this time after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
 """An agent of the group without costs for this number of periods has ended."""
@@ -34,9 +34,9 @@ _MOST_AGENTS = 256
 
 
 class GroupCosts:
-    """The newest words of the other agents of a group.
+    """The newest messages of the other agents of a group.
 
-    agent   id of this agent; messages under it are not another's
+    agent   id of this agent; its own messages are ignored
     """
 
     def __init__(self, author: str, group: str, agent: str) -> None:
@@ -55,7 +55,7 @@ class GroupCosts:
     ) -> SharedCosts:
         """The message with the costs of our vehicles.
 
-        costs_s  target -> float32 (vehicles,), s, inf where there is no way
+        costs_s  target -> float32 (vehicles,), s, inf where there is no path
         chased   the target of each vehicle
         """
         targets = sorted(costs_s)[:MOST_SHARED_TARGETS]
@@ -72,7 +72,7 @@ class GroupCosts:
         )
 
     def receive(self, message: SharedCosts, now_ns: int) -> None:
-        """Another agent's word; of two generations of an agent the one that spoke last counts."""
+        """Takes another agent's message; of two generations of an agent the latest message counts."""
         agent = message.agent
         if agent == self._agent or message.group != self._group:
             return
@@ -152,8 +152,7 @@ def choose(
 
 
 def have_answered(costs_s: Collection[str], allowed: Collection[str], alive: Collection[str]) -> bool:
-    """True if a planner of these targets has answered, and each of theirs that lives has: what none of them has a
-    way to is then out of reach."""
+    """True if every living planner of these targets answered, and at least one did: then no route means no path."""
     return any(target in costs_s for target in allowed) and all(
         target in costs_s for target in allowed if target in alive
     )
@@ -165,8 +164,8 @@ class Assignment:
     vehicles    those of the agent, which changes them in place
     targets     those that the vehicles may go for; the agent sets others
     assigner    which of them each goes for
-    stagger     share of the period by which the first request is followed early, so that agents ask one after the
-                other
+    stagger     how much earlier the second request comes, as a share of the period, so that agents ask one after
+                the other
     group       costs of the group's other agents; None if the assigner does not ask for them
     """
 
@@ -239,7 +238,7 @@ class Assignment:
         """All planners that will answer have: each vehicle takes its target. Returns what to tell the group.
 
         planners  target -> incarnation of its planner, of those which live
-        empty     targets that are not at their planners' positions: a vehicle with a path to another goes for that
+        empty     targets not found where their planner has them; vehicles prefer any other that they can reach
         standing  vehicles that an operator lets stand: no target's pursuers where costs are shared
         """
         asked = self._open

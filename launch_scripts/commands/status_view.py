@@ -42,8 +42,8 @@ _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
 _SHOWN_GOALS = 24
 """Vehicles that were sent to places, of `status`."""
 _LISTEN_S, _TOP_LISTEN_S, _MOST_S = 1.5, 2.2, 4.0
-"""A picture is drawn after so long, and that of `top`, whose rates need two of the figures that each process tells
-once a second; later while a process that has answered has not said how it is."""
+"""A picture is drawn after this time, and that of `top`, whose rates need two of the figures that each process
+sends once a second; later while a process that has answered has not said how it is."""
 _EVERY_S = 1.0
 """Processes tell their figures once a second: in between there is nothing new to draw."""
 

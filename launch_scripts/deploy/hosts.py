@@ -71,7 +71,7 @@ class HostsConfig(Section, frozen=True, kw_only=True):
 
 
 def load_hosts(path: Path) -> HostsConfig:
-    """Reads and check a file of machines. Raises ConfigError that names the file and the key."""
+    """Reads and checks a file of machines. Raises ConfigError that names the file and the key."""
     return parse_hosts(read_text(path, FileKind.HOSTS), str(path))
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 STILL_S = 60.0
-"""A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes fail:
+"""A loop that has not ticked for this time does not recover. Much longer than `HUNG_S`, from which on probes fail:
 restarts do not help an overloaded machine."""
 LOOK_EVERY_S = 1.0
 """A sixtieth of `STILL_S`, so what hangs is found in time; the launcher's loop turns ten to twenty times as

@@ -17,7 +17,7 @@ from swarm.runtime.order_book import OrderBook
 log = logging.getLogger(__name__)
 
 LEAVES_TO_OTHERS_S = 3.0
-"""A launcher of a part of a swarm starts such a planner only if none has appeared for so long."""
+"""A launcher of a part of a swarm starts such a planner only if none has appeared for this time."""
 
 _BEGIN_AT_ONCE = 2
 _BEGINS_WITHIN_S = 10.0

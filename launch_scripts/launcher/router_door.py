@@ -20,7 +20,7 @@ from swarm.bus.endpoints import why_not_listening
 from swarm.errors import BusError
 
 PROVED_AFTER_S = 1.5
-"""A connection that Zenoh keeps for so long has a certificate: Zenoh ends a handshake that takes `HANDSHAKE_S`."""
+"""A connection that lasts for this time has a certificate: Zenoh ends a handshake that takes `HANDSHAKE_S`."""
 HANDSHAKE_S = 1.0
 PROVED_BY_REPLIES = 4
 """A router replies three times at most to a handshake that fails: HelloRetryRequest, its own part, an alert."""

@@ -36,7 +36,7 @@ from vehicle_agent.obstacles import Obstacles
 MOST_LABELS = 40
 """With more labels nothing can be read."""
 OVER_S = 8.0
-"""An alarm that is over is seen for so long."""
+"""An alarm that is over is shown for this time."""
 _SHOWN = 256
 """Targets whose searches are shown, as names cost a sender nothing."""
 _MOST_MARKS = 24

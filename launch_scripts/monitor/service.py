@@ -57,7 +57,7 @@ _READ: dict[Topic, float] = {
 """Topics on show, and the interval at which the newest of each key is taken; 0 for each frame. Marks come by way of
 the map's sync."""
 _ROUTES_SEEN_S = 0.5
-"""For those who look routes are taken so often."""
+"""Interval at which routes are taken for viewers."""
 _UNSEEN = 2
 """Without viewers every second frame is left out: frames are drawn for the recording only."""
 _EVERY_S = {"anew": 10.0, "figures": 1.0}

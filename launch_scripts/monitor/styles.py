@@ -145,8 +145,8 @@ class Level(NamedTuple):
     radius_px       of a vehicle's ball, in points of the viewer's window
     line_px         of trails and routes
     frames          vehicles are drawn in every n-th frame
-    trail_every_s   a piece of each trail is drawn so often
-    trail_s         so long a trail is seen
+    trail_every_s   a piece of each trail is drawn at this interval
+    trail_s         a trail is shown for this time
     details_s       interval of each vehicle's description and state
     routes_s        all routes are drawn once in this time
     route_stride    cells between two points of a route

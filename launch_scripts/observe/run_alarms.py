@@ -24,7 +24,7 @@ from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 SILENT_NS = 4 * NS_PER_S
-"""Every process tells its counts once a second: one that has not for so long hangs, or cannot be heard."""
+"""Every process publishes its counts once a second: one that has not done so for this time hangs, or is cut off."""
 _OLD_NS = 30 * NS_PER_S
 """Evidence that is older is said to be so. Clocks of machines in one swarm differ by less."""
 STARTING_S = 30.0

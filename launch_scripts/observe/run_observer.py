@@ -43,7 +43,7 @@ from swarm.wire.topics import (
 from swarm.wire.versions import are_neighbours
 
 TRACK_S = 0.5
-"""Places are sampled so often."""
+"""Places are sampled at this interval."""
 ROUTES_S = 2.0
 """The newest route that a vehicle begins within this time is kept."""
 HEARD: Mapping[Topic, float] = {
@@ -124,7 +124,7 @@ class RunObserver:
         self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_TIMEOUT_S, **of)
 
     def pace(self, topic: Topic, every_s: float, now_ns: int) -> None:
-        """Takes a topic so often from now on."""
+        """Takes a topic at this interval from now on."""
         self._every_ns[topic.name] = int(every_s * NS_PER_S)
         self._due_ns[topic.name] = now_ns + self._every_ns[topic.name]
 

@@ -55,7 +55,7 @@ _PROFILE, _SCHEMAS, _MESSAGES = "ros2", "ros2msg", "cdr"
 """Words of MCAP's registry: what the file is for, how types are written in it, how messages."""
 _CAPTURE: Colour = (1.0, 0.85, 0.1, 1.0)
 _SHOWN_NS = 5 * NS_PER_S
-"""Captures are drawn for so long."""
+"""Captures are drawn for this time."""
 _MOST_POINTS, _MOST_CELLS = 2_000_000, 64_000_000
 """Limits for all routes drawn, and for all grids of marks, in a recording: 48 MB and 64 MB before compression."""
 _LEAST, _MOST = 8, 600

@@ -168,7 +168,7 @@ PLOTS = (
          "Share of the routes that are proven to be at most so far above the optimum.",
          {"followed_gap_excess": ("routes", palette.BLUE)}, _shares,
          lambda excess: np.maximum(100 * excess, _LEAST_PERCENT), _percent, least=_MOST_PERCENT),
-    Plot("timings", "How long it takes", "Share of the times that are at most so long.",
+    Plot("timings", "How long it takes", "Share of the times that are at most this long.",
          {"growth_ms": ("tree growth", palette.GREEN), "route_query_ms": ("route query", palette.BLUE),
           "mark_to_tree_ms": ("mark to tree", palette.VIOLET)},
          _shares, lambda ms: np.maximum(ms, 1e-3), _ms, least=1e-3),

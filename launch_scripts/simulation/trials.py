@@ -114,7 +114,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run_trial(trial: Trial) -> Result:
-    """Simulate. A service that raises is a broken law; raises SwarmError on what the study, its files or this
+    """Simulates. A service that raises is a broken law; raises SwarmError on what the study, its files or this
     worker have wrong."""
     if trial.version is not None and (own := code_version()) != trial.version:
         raise ConfigError(

@@ -42,7 +42,7 @@ _POLLED_WITHIN_S = 5.0
 """Pages poll once a second; a machine that draws without a graphics card is late at times."""
 _READY_WITHIN_S = 20.0
 PORT_PATIENCE_S = 3.0
-"""A port that is in use is waited for so long: after a restart the one before may still have it."""
+"""A port that is in use is waited for at most this time: after a restart the one before may still have it."""
 _LASTS_S = 120.0
 """The page has 40 MB, and a tunnel may be slow."""
 

@@ -28,7 +28,7 @@ MOST_CONNECTIONS = 24
 _MOST_PEEKED = 1 << 13
 """Bytes of a request that are looked at before its thread reads them: a browser's has 1 kB, a probe's 100 bytes."""
 SEND_WITHIN_S = 20.0
-"""A reader of the stream that takes nothing for so long is cut off."""
+"""A reader of the stream that takes nothing for this time is cut off."""
 _AUTHORITY = r"(?:([A-Za-z0-9.]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?"
 _SAYS_HOST = {"host": re.compile(_AUTHORITY), "origin": re.compile(f"https?://{_AUTHORITY}")}
 """A name or address and a port, and nothing else: parsers of URLs disagree about all other forms."""
@@ -108,7 +108,7 @@ class Server(socketserver.ThreadingTCPServer):
     port     0 is any
     pages    path -> what answers it
     address  one beyond loopback serves visitors from elsewhere, too
-    lasts_s  a connection that does not take the stream is cut after so long
+    lasts_s  a connection that does not take the stream is cut after this time
 
     Requests are short: beyond the bound the slowest connection which has not taken the stream is closed for the new
     one, so that no client keeps others out by holding connections open: first one that has not finished its

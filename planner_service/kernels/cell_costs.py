@@ -150,7 +150,7 @@ def merge_window(part, box, offset, old_root, cost, stride):
 
 @kernel(f"(f4[::1], {BOX}, i8, i8, i8[::1], f8[::1])")
 def find_rim(part, box, rows, stride, rim, rim_cost):
-    """The cells of a window that have a way and from which a step leads out of it.
+    """The cells of a window that have a path, and from which a step leads out of it.
 
     rim, rim_cost  int64 cells, padded in the whole grid of `rows` rows, and float64 costs (s); written, both with
                    room for all of the window's border

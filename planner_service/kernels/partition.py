@@ -67,7 +67,7 @@ CHECK, RELINK, RELINK_INTO, CUT_OFF, RECHECK, CHECKED_CUT_OFF, RECONNECTED = (
 CHECK            it may hold a cell that is offered less than it costs
 RELINK           its pieces may have another successor, or another way to it
 RELINK_INTO      those of its pieces may that lead into a tile with `RELINK`
-CUT_OFF          it has pieces without a way to the root
+CUT_OFF          it has pieces without a path to the root
 RECHECK          it is to be checked as long as it has
 CHECKED_CUT_OFF  it was checked while it or a tile about it had
 RECONNECTED      a piece of it has found a way; said while changes are noted
@@ -94,9 +94,9 @@ class Tree(NamedTuple):
     """Parent of each cell, and cost of each piece."""
 
     parent: Bytes
-    """(size,) padded; direction of the next cell, NONE at the root and where there is no way."""
+    """(size,) padded; direction of the next cell, NONE at the root and where there is no path."""
     piece: Bytes
-    """(n * CELLS,) of each cell, tile by tile, the rows of one behind each other; NO_PIECE where there is no way,
+    """(n * CELLS,) of each cell, tile by tile, the rows of one behind each other; NO_PIECE where there is no path,
     and beyond the grid."""
     rim: Doubles
     """(n * PIECES,) s; from each cell on the border of a tile to its piece's exit, by the name that a piece has
@@ -418,7 +418,7 @@ def store_offsets(t, tree, scratch):
 @helper
 def relabel_tile(t, grid, tree, tiles, scratch):
     """Writes which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
-    one that has no parent have no way."""
+    one that has no parent have no path."""
     piece, root = tree.piece, tree.root
     exits, many, across = tiles.exits, tiles.many, tiles.across
     names, inner, code, name = scratch.border, scratch.inner, scratch.code, scratch.name

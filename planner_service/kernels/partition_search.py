@@ -150,8 +150,8 @@ def _relax(at, t, cell, grid, tree, tiles, scratch):
 
 @helper
 def _spread(t, grid, tree, tiles, scratch, count):
-    """Spread what the `count` cells of the heap cost, inside the tile, the least first: most cells are then written
-    once. Cells around that are offered less have their tile looked at."""
+    """Spreads what the `count` cells of the heap cost, inside the tile, the least first: most cells are then
+    written once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece = tree.parent, tree.piece
     wanted, across = tiles.wanted, tiles.across
@@ -373,7 +373,7 @@ def cut_parents(grid, tree, across, cells, before, changed):
 
 @kernel(GRID, partition.TREE, partition.TILES, "i8[::1]")
 def drop_cut_off(grid, tree, tiles, which):
-    """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
+    """Cells of these tiles that have no path lose their parent, and pieces that lead nowhere go."""
     _, _, stride, _, _ = grid
     parent, piece, root = tree.parent, tree.piece, tree.root
     total = tree.total

@@ -37,7 +37,7 @@ def settle(t, tiles):
 @helper
 def _change(total, y):
     """By how much the total of a piece has changed in the last evaluation, if its tile's totals have; 0 of one that
-    has no way, or never had one."""
+    has no path, or never had one."""
     cost, before = total[y, TOTAL], abs(total[y, partition.BEFORE])
     return cost - before if cost < np.inf and before < np.inf else 0.0
 
@@ -381,7 +381,7 @@ def add_up(grid, tree, tiles, scratch, schedule):
 
 @kernel(GRID, partition.TREE, partition.SCRATCH, "i8", "i8[::1]", "f8[::1]")
 def costs_at(grid, tree, scratch, across, cells, costs):
-    """costs := float64, s, of padded cells; inf where there is no way. Raises ValueError where one is no cell."""
+    """costs := float64, s, of padded cells; inf where there is no path. Raises ValueError where one is no cell."""
     cell_cost, offsets, stride, rule, _ = grid
     parent, piece = tree.parent, tree.piece
     total, steps_s, kept, place = tree.total, scratch.cost, scratch.kept, scratch.place

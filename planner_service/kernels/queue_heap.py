@@ -66,7 +66,7 @@ def arrivals(cell_cost, offsets, diagonal, start, cost, heap):
     """Writes how soon something that begins on a cell can be on each other one, by Dijkstra's algorithm.
 
     cell_cost  float32 (n,), padded; inf is lethal, and the border
-    cost       float32 (n,), written, from the start to each cell; inf where there is no way
+    cost       float32 (n,), written, from the start to each cell; inf where there is no path
     heap       (keys, items, place), each (n,); place is -1 everywhere
     Trees lead to their root: a step is priced by the cell that it enters on the way there. A path away from a cell
     pays for the cells entered on the way out, which no tree knows. Corners of lethal cells are cut: nothing comes

@@ -159,8 +159,8 @@ def sweep(grid, climbs, cost, parent, rows, floor, best, lowered, count):
 
 @helper
 def _begin_anew(keys, behind, heads, overflow, inverse):
-    """Spread the overflow over the buckets, the first of which begins with its lowest key. Returns that key, or inf
-    if nothing waits."""
+    """Spreads the overflow over the buckets, the first of which begins with its lowest key. Returns that key, or
+    inf if nothing waits."""
     top = np.float32(overflow)
     rest = heads[overflow]
     heads[overflow] = _NOBODY

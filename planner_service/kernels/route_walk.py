@@ -79,7 +79,7 @@ def _find_starts(cell_cost, ways, starts, status):
 def walk_routes(cell_cost, climbs, ways, starts, most, metres, walks, directions):
     """The routes from `starts` to the root.
 
-    starts      padded cells that have a way; or, if `status` is not empty, any numbers of cells of the grid. Then
+    starts      padded cells that have a path; or, if `status` is not empty, any numbers of cells of the grid. Then
                 these become padded cells, and `status` is written
     most        (steps of a route, 0 for all of it; the longest possible route)
     metres      (resolution, m; length of a diagonal in straight steps)

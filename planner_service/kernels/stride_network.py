@@ -3,7 +3,7 @@ them.
 
 At stride s the map is cut into blocks of s x s cells. A *node* is a connected component of a block: passable cells
 that legal steps inside the block join, so that a wall through a block makes two nodes of it. Each has a centre, one
-of its cells. A *link* joins two nodes where a legal step leads from one to the other, and has the cheapest way
+of its cells. A *link* joins two nodes where a legal step leads from one to the other, and has the cheapest path
 between their centres through that step and otherwise inside the two. Cut so, no wall is jumped, and whatever single
 steps connect is connected at every stride: `docs/method/certificates.md` has the proof.
 

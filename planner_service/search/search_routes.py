@@ -109,7 +109,7 @@ class Ways:
 
     @property
     def costs_s(self) -> Floats:
-        """float32 (rows, cols), s: from the cell of the last growth to all others; inf where there is no way."""
+        """float32 (rows, cols), s: from the cell of the last growth to all others; inf where there is no path."""
         grid = self.grid
         costs_s: Floats = self._cost.reshape(grid.rows + 2, self._costs.stride)[1:-1, 1:-1]
         return costs_s

@@ -109,7 +109,7 @@ class Searcher:
         return blocks.middles[best], np.minimum(total[best], np.float32(1.0)), blocks.side_m
 
     def begin(self, pace_s_per_m: Floats, cell: int | None, age_s: float) -> None:
-        """Search from now on.
+        """Searches from now on.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Searcher:
 
     def _arrivals(self, blocks: Blocks, cell: int) -> Floats:
         """float32 (rows, cols), s after the target was on a cell when it can be in each block at the earliest: on
-        any cell of it, by the cheapest way."""
+        any cell of it, by the cheapest path."""
         # It was somewhere in the cell, half a step on its way into the next at most, and it is in another one half
         # a step before its middle.
         paces = self._ways.diagonal_steps_s

@@ -25,10 +25,10 @@ UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is published twice a second: one that is not published for this time, though a vehicle is at
 its position, is not there (docs/design/search.md)."""
 LOST_NS = 30 * NS_PER_S
-"""A target whose tracker is lost is searched for after so long: most trackers are back by then
+"""A target whose tracker is lost is searched for after this time: most trackers are back by then
 (docs/design/search.md)."""
 LISTEN_NS = 5 * NS_PER_S
-"""A planner that has just begun listens for so long before it takes its target for never seen
+"""A planner that has just begun listens for this time before it takes its target for never seen
 (docs/design/search.md)."""
 _TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
@@ -182,7 +182,7 @@ class TargetSearch:
     def costs_s(self, to_last_s: Floats, open_: NDArray[np.bool_]) -> Floats:
         """float32, s: what it takes to find the target, so that it is compared with others.
 
-        to_last_s  to where it was last; inf where there is no way, or none is known
+        to_last_s  to where it was last; inf where there is no path, or none is known
         open_      whether the cell asked for can be driven from
         """
         known: Floats = np.where(np.isfinite(to_last_s), to_last_s, np.float32(OFFSET_S)) + np.float32(OFFSET_S)

@@ -366,7 +366,7 @@ class CostGrid:
         cell_cost: Floats,
         statuses: NDArray[np.uint8] = _NO_STATUSES,
     ) -> Walks:
-        """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
+        """Routes from padded cells with a path to a padded root, over the cell costs of this or an earlier map.
 
         most      steps of a route; 0 for all of it
         statuses  (n,), written: then `starts` are any numbers of cells of the grid, which become padded ones.

@@ -45,11 +45,11 @@ class CostToGoTree:
         self.cost_grid = cost_grid
         """The map that the tree lies on. A caller that changes it calls `repair`, or rebuilds the tree."""
         self.cost: Floats = np.empty(0, np.float32)
-        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
+        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no path. Empty
         before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten` and `repair`
         change it."""
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
-        """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
+        """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no path."""
         self.root = -1
         """The target's cell, of the grid; -1 before the first growth. `grow`, `take` and `move` set it."""
         self.offset = 0.0
@@ -73,7 +73,7 @@ class CostToGoTree:
         self._walk: Walk | None = None
         """Scratch of `mend`. None until needed."""
         self._stamps: NDArray[np.uint8] | None = None
-        """uint8, padded: `_now` where a cost was recomputed since ways changed last. None until
+        """uint8, padded: `_now` where a cost was recomputed since paths changed last. None until
         needed."""
         self._now = 1
         """Raised whenever paths change, so that all stamps are old; starts again with new stamps at 255."""
@@ -156,7 +156,7 @@ class CostToGoTree:
         return self.cost, self.parent, self.cost_grid.pad(self.root)
 
     def grow_strides(self, window: Window, network: StrideNetwork, far: int) -> int:
-        """After a window around the root was grown: renew what lies beyond, on the ways of ever wider strides only.
+        """Renews the costs beyond a window that was grown around the root, on the paths of ever wider strides only.
         All other cells keep their parents.
 
         far  cells; how far from the root
@@ -180,7 +180,7 @@ class CostToGoTree:
         """Leads to a new root, by growing only a window that holds it and the old root.
 
         Costs outside become upper bounds: the old ones plus the cost from the old root to the new. Returns cells
-        grown, or 0 if nothing was done because the old root has no way to the new one inside the window. Raises as
+        grown, or 0 if nothing was done because the old root has no path to the new one inside the window. Raises as
         `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both roots.
         """
         grid = self.cost_grid
@@ -252,7 +252,7 @@ class CostToGoTree:
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
         """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
-        there is no way. Raises ValueError where one is no padded cell.
+        there is no path. Raises ValueError where one is no padded cell.
 
         With `time_at` the one way to ask a tree what a cell costs: labels are upper bounds, rounded to float32.
         """

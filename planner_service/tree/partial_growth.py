@@ -27,7 +27,7 @@ class CutTree(NamedTuple):
     root    padded cell
     box     padded rows and columns (row0, col0, row1, col1), around all cells with a cost and their neighbours
     cost    float32 (rows, cols), s; inf or less where a cell has none
-    bound   s; no cell without a cost costs less. inf: it has no way
+    bound   s; no cell without a cost costs less. inf: it has no path
     width   s, of the buckets of the growth
     parent  uint8, padded, of a whole tree that costs alone do not tell; None of all others
     """

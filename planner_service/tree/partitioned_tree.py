@@ -50,7 +50,7 @@ class PieceTree:
     """The exact tree of one root on a `CostGrid` without climbs.
 
     cost_grid  the map that the tree lies on. A caller that changes it calls `repair`, or `take`
-    parent     uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way. Empty
+    parent     uint8, padded: direction of each cell's next cell; NONE at the root and where there is no path. Empty
                before the first `take`
     root       the target's cell, of the grid; -1 before the first `take`
     exact      whether all costs are the least there are. `grow`, `take` and `mend` set it, `move` to another root
@@ -128,7 +128,7 @@ class PieceTree:
     def move(self, root: int, window: Window) -> int:
         """Leads to a new root, by a window that holds it and the old one; `mend` makes the tree exact again.
 
-        Returns cells grown, or 0 if nothing was done because the old root has no way to the new one inside the
+        Returns cells grown, or 0 if nothing was done because the old root has no path to the new one inside the
         window. Raises as `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both
         roots.
         """
@@ -160,8 +160,8 @@ class PieceTree:
     def repair(self, changes: Changes) -> int:
         """Brings the tree up to date after the map changed, and makes it exact, or gives way: `exact` tells.
 
-        Returns cells looked at; -1 if it gave way and cells may be without a way that have one: then it must be
-        grown before anything else.
+        Returns the number of cells examined; -1 if it gave way and cells may lack a path that have one: then it
+        must be grown before anything else.
         """
         if changes.cells.size == 0:
             return 0
@@ -176,7 +176,7 @@ class PieceTree:
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
         """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
-        there is no way. Raises ValueError where one is no padded cell."""
+        there is no path. Raises ValueError where one is no padded cell."""
         if self._moved:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
@@ -328,7 +328,7 @@ def growth_job(
 def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
     """Driven cost over optimum of what the earlier tree offered cells of the grid, on the snapshot of `grown`.
 
-    Cells without a way in either tree are left out. An offer may be better than the exact tree's by a difference
+    Cells without a path in either tree are left out. An offer may be better than the exact tree's by a difference
     that float32 takes for equal, and is then 1; a value below 1 contradicts the exact tree: a bug.
     """
     offered = grown.offered

@@ -39,7 +39,8 @@ class LowerBounds:
         self._heuristic = None
 
     def learn(self, changes: Changes) -> None:
-        """The map changed: lower the heuristic where ways became cheaper. Costlier cells leave it consistent."""
+        """Lowers the heuristic after the map changed, where paths became cheaper. Costlier cells leave it
+        consistent."""
         if self._heuristic is None or not changes.any_lower:
             return
         grid = self._grid

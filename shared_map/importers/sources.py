@@ -58,7 +58,7 @@ class Source:
 
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
-    """Reads or make what the scenario names.
+    """Reads or makes the source that the scenario names.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ _MOST_AUTHORS = 1 << 14
 class CompactionPlan:
     """Dead authors, and tiles that may need compaction. Core: time is an argument.
 
-    after_ns   an author of which nothing was heard for so long counts as dead. If it lives after all, it hears the
+    after_ns   an author that was silent for this time counts as dead. If it is alive after all, it receives the
                compacted sets, and states everything again under a higher epoch
     set_aside  tiles of which something was dropped before: whom an earlier life of the keeper took for dead is
                forgotten, so they are due

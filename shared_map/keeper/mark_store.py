@@ -140,7 +140,7 @@ class KeeperStore(SealedDatabase):
         return next(self._sets(table, "WHERE tile = ? AND author = ?", tile, author), None)
 
     def save(self, sets: Iterable[MarkSet], now_ns: int = 0) -> None:
-        """Commit all or none. Marks which a compacted set lacks of the set that it replaces are archived. A
+        """Commits all or none. Marks which a compacted set lacks of the set that it replaces are archived. A
         StoreError leaves the store usable."""
         given = list(sets)
         own = [each for each in given if each.seq % SEQ_STEP == 0]

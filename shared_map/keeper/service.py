@@ -287,8 +287,8 @@ class KeeperService:
         asked.end()
 
     def _compact(self, now_ns: int) -> None:
-        """Compact what dead authors left, a few tiles at a time. The store is written before any set is published,
-        so that it can always restore dropped marks."""
+        """Compacts the marks of dead authors, a few tiles at a time. The store is written before any set is
+        published, so that it can always restore dropped marks."""
         plan = self._plan
         plan.update(self.replica.held.ledger, now_ns)
         # Measurements of a dead author stay as they are: no set overrules them.
@@ -322,7 +322,7 @@ class KeeperService:
         self.counters.count("sets_folded", len(compacted))
 
     def _save(self, now_ns: int) -> None:
-        """Commit what waits. If the disk refuses, say so once, go on serving and try again."""
+        """Commits the sets that wait. If the disk refuses, reports it once, continues to serve and tries again."""
         try:
             for batch in self._keeper.batches():
                 self._store.save(batch, now_ns)

@@ -5,7 +5,7 @@ on each cell that it drives for the first time, and its author states, of each k
 and variance of y (`measurements`). The measurements of all authors give one factor per kind of ground, by which the
 cost map multiplies the prior (`learned_factors`). Three promises:
 
-- Replicas that hold the same measurements have the same factors, bit for bit: all of it is arithmetic of integers.
+- Replicas that hold the same measurements have the same factors, bit for bit: it is all integer arithmetic.
 - No author moves a factor by more than its share: five or more are judged by their median, fewer by capped weights.
 - A factor lies between 1/4 and 4, and lethal ground stays lethal.
 """

@@ -1,7 +1,8 @@
 """One factor per kind of ground (class and slope) from the measurements of all authors, in integers: no step of
 `log_steps` depends on a machine's rounding.
 
-The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
+The estimate assumes a normal distribution, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section
+2.5).
 """
 
 from __future__ import annotations
@@ -168,8 +169,8 @@ def learned_kinds(sets: Iterable[MarkSet]) -> list[LearnedKind]:
 
 
 class LearnedGauges:
-    """Publishes by what the prior pace of each class is multiplied: the mean over its cells, of all slopes. A class
-    whose prior stands has no gauge.
+    """Publishes each class's factor: the mean over its cells, of all slopes. A class whose factor is 1 has no
+    gauge.
 
     keys  the kind of ground of each cell; None if nothing is learned
     """
@@ -196,8 +197,8 @@ class LearnedGauges:
 
 
 def _voices(sets: Iterable[MarkSet]) -> list[Voice]:
-    """The measurements of authors, those of all lives of one process together: it has one voice, however often it
-    was started, or says that it was."""
+    """The measurements of authors, those of all generations of one process together: it has one vote, however often
+    it was started, or says that it was."""
     lives = _grouped((owner_of(each.author), stated) for each in sets if (stated := measurements_in(each)))
     return [
         of[0] if len(of) == 1 else {k: _together(parts) for k, parts in _by_key(of).items()}

@@ -96,7 +96,7 @@ class TrimmedMean:
     few of its cells.
 
     A road with rubble on every tenth cell is not a slower road: the rubble is marked, cell by cell. The mean of all
-    cells would say that each of the others is slower, and every vehicle that sees one would mark that it is not.
+    cells would slow each of the others, and vehicles would then mark every clear cell as faster.
 
     A quarter is left out at each end. The variance is that of the Winsorized numbers, so that variance / cells is
     the square of the mean's standard error (Tukey and McLaughlin 1963).

@@ -6,8 +6,8 @@
 2. *The merge law* (`merge`): of all statements about a cell that have not ended the newest wins, of two with one
    stamp that of the larger author; an operator's zone wins over all. It reads nothing but the sets that are held,
    so order, grouping and repetition of what arrives cannot matter: replicas that hold the same sets have the same
-   winners. The map is a state-based CRDT: a last-writer-wins register for each (tile, author) below, for each cell
-   above.
+   winners. The map is a state-based CRDT: a last-writer-wins register for each (tile, author) in storage, for each
+   cell in the map.
 3. Stamps are *hybrid logical clocks*, one for each cell: an author that has seen a statement can overrule it,
    however far the clock of the other is ahead.
 4. Sets are published when they change (`replica_sync`). A process that starts asks for all held sets (*late join*).

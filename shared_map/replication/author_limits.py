@@ -76,8 +76,7 @@ class Capacity:
         return not self._fits(owner_of(author), 1, TILE_AREA)
 
     def _fits(self, owner: str, sets: int, marks: int) -> bool:
-        """Returns True if this number more stays within the bounds; a bound of sets matters to those that add
-        one."""
+        """Returns True if these additions stay within the bounds; set bounds apply only if a set is added."""
         own_sets, own_marks = self._owners.get(owner, _NOTHING)
         return (
             self.marks + marks <= self._max_marks
@@ -211,7 +210,7 @@ class _Bucket:
 class _Budget:
     """
     own       fills at the rate of one process
-    share     fills at this process's part of the total rate: no need of others takes from it
+    share     fills at this process's part of the total rate: others cannot use it
     heard_ns  when a set of it was merged last
     """
 

@@ -59,7 +59,7 @@ class Ledger:
         return sorted(self._numbers)
 
     def authors_from(self, place: int, most: int) -> list[str]:
-        """Authors of whom a set is held, in order of their first one, from a place in that order on."""
+        """Authors with a held set, ordered by their first set, from position `place` on."""
         return list(islice(self._numbers, place, place + most))
 
     def held(self, authors: list[str] | None = None) -> dict[str, bytes]:
@@ -184,7 +184,7 @@ _MAX_PARTS = 128
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""
 _FORGET_NS = 60 * NS_PER_S
-"""A sender that was silent for so long loses its place in the order."""
+"""A sender that was silent for this time loses its place in the order."""
 _AT_ONCE = 1024
 """Authors, and every `_ROWS` rows, that are compared in one tick: some 5 ms."""
 _ROWS = 16
@@ -220,8 +220,7 @@ class PendingDigest:
 class PendingDigests:
     """The newest digest of each sender until nothing that it names is missing. Bounded in senders and bytes.
 
-    The digests that are due are compared by turns of their senders, in each turn that of the sender first which was
-    heard first. Senders with names that were made up later therefore delay none that was there before.
+    Senders of due digests take turns, the longest known first; so newly invented names delay no known sender.
     """
 
     def __init__(self) -> None:
@@ -254,7 +253,7 @@ class PendingDigests:
         return True
 
     def _knows(self, sender: str, now_ns: int) -> bool:
-        """Returns True if a sender is known, now at least."""
+        """Registers a sender. Returns False if there is no room."""
         known = self._senders.get(sender)
         if known is None:
             if len(self._senders) >= _MAX_SENDERS and now_ns >= self._forget_due_ns:
@@ -291,7 +290,7 @@ class PendingDigests:
             pending.due_ns = now_ns + _RETRY_NS
 
     def hasten(self, now_ns: int) -> None:
-        """Compare all of them at once: a link has come back."""
+        """Compares all of them at once: a link has come back."""
         for pending in self._pending.values():
             pending.due_ns = now_ns
 

@@ -49,7 +49,7 @@ class Tombstones:
         return tombstone is not None and tombstone[:2] >= number
 
     def add(self, tombstone: MarkSet, now_ns: int) -> None:
-        """Remember a tombstone; beyond 65,536 the oldest is forgotten."""
+        """Remembers a tombstone; beyond 65,536 the oldest is forgotten."""
         self._deleted[tombstone.tile, tombstone.author] = (tombstone.epoch, tombstone.seq, now_ns)
         if len(self._deleted) > _MAX_TOMBSTONES:
             del self._deleted[next(iter(self._deleted))]
@@ -124,7 +124,7 @@ class HeldSets:
         return True
 
     def delete(self, tombstone: MarkSet, now_ns: int) -> None:
-        """Deletes what its author stated about a tile, and remember under which number."""
+        """Deletes what its author stated about a tile, and remembers the number."""
         assert is_tombstone(tombstone)
         self.tombstones.add(tombstone, now_ns)
         held = self.get(tombstone.tile, tombstone.author)
@@ -152,8 +152,7 @@ class HeldSets:
         return [(author, tiles) for author, tiles in possible if tiles]
 
     def lacking(self, author: str, rows: bytes) -> list[int]:
-        """Tiles of which neither the author's set is held under the number in these rows, or above, nor a tombstone
-        that came after it."""
+        """Tiles without the author's set at the number in these rows or above, and without a later tombstone."""
         if len(rows) % DIGEST_ROW_BYTES:
             return []
         newer = [tile for _, tiles in self.ledger.missing({author: rows}) for tile in tiles]
@@ -187,7 +186,7 @@ class HeldSets:
         return [each for each in self.asked(request, author) if each is not None]
 
     def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
-        """The sets of `answer`, and None after those of each tile, found as they are needed."""
+        """The sets of `answer`, lazily, with None after each tile."""
         wanted = frozenset(request.authors)
         every = self.tiles if author is None else self.ledger.tiles_of(author)
         for tile in sorted(set(request.tiles)) if request.tiles else every:

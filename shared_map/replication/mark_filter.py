@@ -78,7 +78,7 @@ class MarkFilter:
         self._tiles = frozenset([beyond_tile(self._grid), *of_all_classes(self._grid, tiles)])
 
     def accepts_author(self, author: str, group: str) -> bool:
-        """Returns True if the policy of groups lets us read this author, which states to be of this group."""
+        """Returns True if the policy of groups lets us read this author, which claims this group."""
         return self.groups is None or (group in self.groups and author.startswith(f"{group}."))
 
     def accepts_tile(self, tile: int) -> bool:
@@ -98,7 +98,7 @@ class MarkFilter:
 
 
 class Interest:
-    """The regions within `enter_cells` of any cell, and of the regions before those still within twice as many.
+    """The regions within `enter_cells` of any cell, and those of the last update that are within twice that.
 
     The hysteresis keeps a vehicle at a border from subscribing again with every crossing. Squares are numbered
     row by row, as regions are.

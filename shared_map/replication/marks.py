@@ -234,7 +234,7 @@ _BULK_SETS = 4096
 
 
 def packed(sets: Iterable[MarkSet]) -> Iterator[MarkSets]:
-    """Sets, no two of one tile and author, as few messages, each of one author and group."""
+    """Packs sets, no two of one tile and author, into few messages, each of one author and group."""
     together: dict[tuple[str, str], list[MarkSet]] = {}
     for each in sets:
         together.setdefault((each.author, each.group), []).append(each)

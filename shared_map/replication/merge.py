@@ -3,7 +3,7 @@
 The newest unexpired mark of a cell wins; of two with one timestamp, that of the larger author id. An operator's
 statement (a zone) wins over all others: a vehicle that sees open ground must not open what people have closed. The
 law reads nothing but the sets that are held, so the order, grouping and repetition in which they arrived cannot
-matter. A newer set, a tombstone, an expiry and a region that is left are all one `TileChange`: the sets of a tile
+matter. A newer set, a tombstone, an expiry and a region that is left are each a `TileChange`: the sets of a tile
 before and after.
 """
 

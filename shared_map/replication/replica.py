@@ -205,7 +205,7 @@ class MapReplica:
         return won.counts
 
     def _learn(self) -> None:
-        """Brings the cost map to the words that are held; later if it was changed by words just now."""
+        """Applies the held measurements to the cost map, at most once per `_LEARN_EVERY_NS`."""
         if self._cost_map is None:
             return
         self._learn_due_ns = self._learned_ns + _LEARN_EVERY_NS
@@ -312,14 +312,14 @@ class MapReplica:
         *,
         lifetime_s: float | None = None,
     ) -> list[MarkSet]:
-        """State something about cells; of a cell named twice the last counts. The own cost map changes at once.
-        Returns the sets that may be published now; `tick` returns the others later.
+        """States something about cells; of a cell named twice the last statement counts. The own cost map changes
+        at once. Returns the sets that may be published now; `tick` returns the others later.
 
         cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
         kinds       uint8 (cells,)    MarkKind, or one for all
         paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
                     of marks (`swarm.wire.messages.map_data`)
-        lifetime_s  the statements expire so long after their stamps, by the reader's clock; None: never
+        lifetime_s  the statements expire this time after their stamps, by the reader's clock; None: never
 
         Raises RuntimeError if the replica has no author.
         """
@@ -411,8 +411,8 @@ class MapReplica:
         return [tile for _, tiles in wanted for tile in tiles]
 
     def has_ended(self, author: str) -> bool:
-        """Returns True if all marks of an author in some tile have expired: immediately if our clock is far ahead
-        of its."""
+        """Returns True if all marks of an author in some tile have expired: too early if our clock is ahead of
+        its."""
         sets = (self.held.get(tile, author) for tile in self.held.tiles)
         return any(each and each.kinds and not len(standing(each, self._now_ns).cells) for each in sets)
 

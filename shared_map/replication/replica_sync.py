@@ -51,7 +51,7 @@ _MAX_ASKS = 16
 """Limit of authors that are asked together: the most that a false digest with thousands of rows can start."""
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
-"""A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
+"""A set that was put is named in digests of changes so often and for this time: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _LOOKS_PER_TICK = 1024
@@ -149,7 +149,7 @@ class MapSync:
         self._heard_ns: dict[str, int] = {}  # sender -> when its last digest came
 
     def start(self, now_ns: int) -> None:
-        """Subscribe, serve, and ask for all that was stated before."""
+        """Subscribes, serves, and requests all earlier statements."""
         if self._regions is None:
             self._listen()
             self._join()
@@ -454,7 +454,8 @@ class MapSync:
         self._bus.publish(DIGEST, digest, author=self._name)
 
     def _compare(self, pending: PendingDigest, now_ns: int) -> None:
-        """Asks for what they hold and we miss; give a keeper what it misses of authors that are gone."""
+        """Requests the sets that the sender holds and we lack; gives keepers the sets of dead authors that they
+        lack."""
         digest = pending.digest
         missing = self.replica.missing(digest.held)
         for author, tiles in missing:
@@ -487,8 +488,7 @@ class MapSync:
             log.info("gave the keeper %d sets of authors that are gone", len(lost))
 
     def _next_silent(self, now_ns: int) -> list[str]:
-        """Authors that are gone, for one digest: all, unless this tick's work is done before. The next digest then
-        goes on behind them."""
+        """Dead authors, for one digest: all, or as many as this tick allows; the next digest continues there."""
         most = self._looks_left if self._offers_left else 0
         authors = self.replica.held.ledger.authors_from(self._offer_place, most)
         self._looks_left -= len(authors)

@@ -32,7 +32,7 @@ def region_of(grid: GridSpec, tile: int) -> int:
 
 
 def of_all_classes(grid: GridSpec, tiles: Iterable[int]) -> list[int]:
-    """These tiles as every class has them, and all vehicles."""
+    """The numbers of these tiles for all vehicles and for each class."""
     return [grid.tile_for(tile, number) for number in range(MOST_CLASSES + 1) for tile in tiles]
 
 

@@ -106,7 +106,7 @@ def paint_zones(
     classes: Bytes | None = None,
     key: str = "cost.zones",
 ) -> list[ZoneFacts]:
-    """Paint zones onto a pace, in place: step 3 of the merge rule in `layers`.
+    """Paints zones onto a pace, in place: step 3 of the merge rule in `layers`.
 
     classes  of the cells: those of roads and water from files are entered, if given
     key      where the zones stand in a scenario, for errors

@@ -350,7 +350,7 @@ class Bus(Protocol):
         timeout_s: float = 2.0,
         **fields: str | int,
     ) -> None:
-        """Query all servers of the key, this process included. Posts `Replied` for each reply and then always one
+        """Queries all servers of the key, this process included. Posts `Replied` for each reply and then always one
         `AskEnded`, after `timeout_s` at the latest."""
         ...
 
@@ -377,7 +377,7 @@ class Worker(Protocol):
     """Runs long jobs beside the process's own thread, one after the other."""
 
     def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
-        """Runs `job`, then post `WorkDone`. A job that raises ends the process.
+        """Runs `job`, then posts `WorkDone`. A job that raises ends the process.
 
         model_ns  what the job is taken to cost in a simulation, whose clock does not see it
         """

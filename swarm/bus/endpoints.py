@@ -55,7 +55,7 @@ def keeps_open(endpoint: str) -> bool:
 
 
 def wait_for_router(endpoints: Sequence[str]) -> None:
-    """Block until something listens at one of the endpoints, however long it takes; say once that it waits.
+    """Blocks until something listens at one of the endpoints, however long it takes; reports the wait once.
 
     A signal whose handler raises ends it, as Ctrl-C does.
     """

@@ -191,7 +191,7 @@ class Observer:
         pass
 
     def leave(self) -> None:
-        """Watch no more. May be repeated."""
+        """Ends the observation. May be repeated."""
         with self._session.lock:
             self.notes.close()
             for topic in _HEARD:

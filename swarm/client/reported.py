@@ -169,5 +169,5 @@ class Target(Reported):
             self._session.problem("doubles_heard", f"{who} reports target {self.id} too: our poses count")
 
     def leave(self) -> None:
-        """Hand it over: the next tracker's poses count at once. May be repeated."""
+        """Hands the target over: the next tracker's poses count at once. May be repeated."""
         super().leave()

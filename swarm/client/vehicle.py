@@ -146,7 +146,7 @@ class OwnMarks:
 _REPEAT_NS = NS_PER_S // 2
 """Time between two reports of a vehicle that stands. A new agent listens for a second before it drives."""
 _ASK_AGAIN_NS = NS_PER_S
-"""A follower asks again so often, from where it is: planners forget vehicles that were silent for five seconds."""
+"""A follower asks again at this interval: planners forget vehicles that were silent for five seconds."""
 _DIGEST_NS = NS_PER_S
 """Time between two digests of marks, by which replicas notice what they have missed."""
 _TIMEOUT_S = 5.0
@@ -161,7 +161,7 @@ class Vehicle(Reported):
     id             of the vehicle; no other process may report one of the same id
     group          group that owns the vehicle and reads its marks
     radius_m       radius of the circle around its position which others keep clear
-    lease_s        others avoid its last place for so long after they hear nothing more
+    lease_s        others avoid its last place for this time after its last message
     vehicle_class  vehicle class for which it requests routes
     incarnation    when it joined, in ns: tells it from an earlier generation under the same id
     """
@@ -379,12 +379,12 @@ class Vehicle(Reported):
         for_s: float | None = None,
         only_for: str | None = None,
     ) -> int:
-        """State something about cells, for all vehicles and planners. Returns how many cells were stated. Without
+        """States something about cells, for all vehicles and planners. Returns how many cells were stated. Without
         certificates it counts only from the user of the swarm.
 
         cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)`
         lethal        no vehicle may enter them
-        pace_s_per_m  they take so long to drive
+        pace_s_per_m  pace that the cells have
         clear         they are as the map had them before
         for_s         lifetime of the mark; None: it holds until another mark replaces it
         only_for      vehicle class to which the statement applies; there it overrides non-lethal marks for all

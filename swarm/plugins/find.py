@@ -58,8 +58,8 @@ class Plugin:
 
 
 def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
-    """Imports what a scenario names, and check its options. Raises ConfigError with the key, the value found and
-    the value expected.
+    """Imports the plug-in that a scenario names, and checks its options. Raises ConfigError with the key, the value
+    found and the value expected.
 
     folder  where modules lie that are not installed
     """

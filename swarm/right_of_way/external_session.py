@@ -31,7 +31,7 @@ from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, WORD
 _NOBODY_NS = 10 * NS_PER_S
 """Time without a reply after which an external vehicle is informed of it."""
 _ANSWERS_S = 0.3
-"""A new generation waits so long for the agents' answers before it begins."""
+"""A new generation waits this time for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
 """Time until agents are asked again what they know, where too few have answered."""
 _ROLE = "rover"
@@ -347,7 +347,7 @@ class ExternalSession:
         return self._wait(lambda: self._service.external is None or self._service.external.gone, timeout_s)
 
     def close(self) -> None:
-        """Leave, and end the session."""
+        """Leaves, and ends the session."""
         if not self._closed.is_set():
             self.leave()
             with self._changed:
@@ -393,7 +393,7 @@ class ExternalSession:
 
 
 _WORDS_S = 0.5
-"""An operator waits for agents' answers for so long, and asks again: one round is enough where no agent hangs."""
+"""An operator waits for agents' answers for this time, and asks again: one round is enough where no agent hangs."""
 
 
 def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:

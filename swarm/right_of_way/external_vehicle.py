@@ -19,7 +19,7 @@ from swarm.wire.messages.traffic import Granted, Known, Left, Word
 _QUERIES_ALONE = 5
 """Queries that only one agent answers before it is believed: another that runs answers one within seconds."""
 _PATIENCE_NS = 3 * NS_PER_S
-"""For so long it waits behind others that do not go on; then it gives its place behind them back."""
+"""For this time it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
 """Greatest age that is sent: half of the message's range, so that a push may still add to it."""
 

@@ -16,7 +16,7 @@ from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
-"""A host that has not heard a shard's leader for so long speaks to all members of the shard."""
+"""A host that has not heard a shard's leader for this time speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
 MOST_AHEAD = 16
@@ -130,7 +130,7 @@ class Holdings:
         self.end()
 
     def end(self) -> None:
-        """Holds nothing and know nothing, as before the first generation."""
+        """Resets to the state before the first generation: holds nothing and knows nothing."""
         self.generation = self.newest = 0
         self.replaced = False
         self.shards: dict[int, None] = {}
@@ -285,7 +285,7 @@ class Holdings:
             self._views.setdefault(shard, _View())
 
     def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """Act on what a leader says to us, if it is newer than what we know. Returns the vehicles that have found
+        """Acts on a leader's message to us, if it is newer than what we know. Returns the vehicles that have found
         their place."""
         view = self._views.setdefault(granted.shard, _View())
         knows = self._entries.knows.get(granted.shard, BEFORE_ALL)

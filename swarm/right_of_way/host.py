@@ -16,9 +16,9 @@ from swarm.wire.messages.traffic import Granted, Left, Word
 GENERATIONS_KEPT = 32
 """Numbers of generations on file, as many as a `HostState` has room for."""
 _ALONE_NS = NS_PER_S // 2
-"""A generation that has been replaced begins again once no other process of its host has been alive for so long."""
+"""A replaced generation begins again once no other process of its host has been alive for this time."""
 _UNLED_NS = 2 * NS_PER_S
-"""A shard that is silent for so long has no leader; another one takes over within a second where it can."""
+"""A shard that is silent for this time has no leader; another one takes over within a second where it can."""
 
 
 @dataclass(frozen=True, slots=True)

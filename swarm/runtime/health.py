@@ -96,7 +96,7 @@ def _opened() -> socket.socket:
 
 
 HUNG_S, HUNG_PERIODS = 10.0, 20
-"""A loop that has not ticked for so long hangs: longer than a busy machine keeps a process from its tick."""
+"""A loop that has not ticked for this time hangs: longer than a busy machine keeps a process from its tick."""
 SLOT_BYTES = 1024
 """Bytes of one record: a head of 23 and the missing needs, some ten of `_LONGEST_NEED` characters at most."""
 BOARD_BYTES = 2 * SLOT_BYTES
@@ -192,7 +192,7 @@ class Health:
         self._supervisor.says(what)
 
     def begins(self, tick_hz: float) -> None:
-        """The loop turns from now on, so often."""
+        """The loop ticks from now on, at this rate."""
         self._limit_ns = int(max(HUNG_S, HUNG_PERIODS / tick_hz) * NS_PER_S)
 
     def turned(self, lacks: Sequence[str]) -> None:

@@ -199,7 +199,7 @@ class Member:
         return False
 
     def tick(self, now_ns: int) -> None:
-        """Name new strangers; publish the counters once a second."""
+        """Names new strangers; publishes the counters once a second."""
         if not self._now_ns and self.info.restarts:
             text = f"{self._name} was started again, restart {self.info.restarts}"
             self.alarms.happened("restarted", self._name, text, now_ns)
@@ -240,7 +240,7 @@ class Member:
         self._bus.publish(STATS, stats, role=self.info.role, id=self.info.id)
 
     def _measure(self, counts: Mapping[str, int], now_ns: int) -> None:
-        """Measure what only this process can: all who watch then have the same rate, whenever they looked."""
+        """Measures what only this process can: all observers then have the same rate, whenever they joined."""
         passed_s = (now_ns - self._rate_ns) / NS_PER_S
         if passed_s < _RATE_LEAST_S:
             return

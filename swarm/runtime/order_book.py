@@ -25,7 +25,7 @@ MOST_SENT = 4096
 """Vehicles with goals of their own, recalled ones included."""
 
 FRESH_NS = 60 * NS_PER_S
-"""An authenticated order counts for so long before and after its timestamp: a copy of it must not count again."""
+"""An authenticated order counts for this time before and after its timestamp: a copy of it must not count again."""
 
 Key = tuple[Subject, str]
 

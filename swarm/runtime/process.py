@@ -62,7 +62,7 @@ class JobSlots:
 
     @contextmanager
     def one(self, expected_ns: int = LONG_NS) -> Iterator[None]:
-        """Have a turn, for a job that is expected to take so long."""
+        """Takes a turn, for a job of this expected duration."""
         with ExitStack() as held:
             if expected_ns >= LONG_NS:
                 try:
@@ -126,7 +126,7 @@ class Service(Protocol):
         ...
 
     def start(self, now_ns: int) -> None:
-        """Subscribe, serve, raise the token. Called once, before all others."""
+        """Subscribes, serves and raises the token. Called once, before all others."""
         ...
 
     def handle(self, event: Event, now_ns: int) -> None:

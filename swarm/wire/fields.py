@@ -122,7 +122,7 @@ Millis = Annotated[float, Meta(ge=0, le=1e12)]
 AgeMillis = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Age in ms; inf if it does not exist yet."""
 LONGEST_LEASE_S = 60.0
-"""For so long a single lie may stand."""
+"""For this time a single lie may stand."""
 LeaseSeconds = Annotated[float, Meta(ge=0, le=LONGEST_LEASE_S)]
 """For how long a sender counts as alive after each message."""
 AgeSeconds = Annotated[float, Meta(ge=0, le=1e10)]

@@ -36,7 +36,7 @@ class Hostile:
         self._keys: list[str] = []
 
     def heard(self, key: str, payload: bytes, code: bytes | None = None) -> None:
-        """Keep a genuine message as material. `code` came with it, and proves who said it."""
+        """Keeps a genuine message as material. `code` came with it, and proves who said it."""
         kept = self._heard.get(key)
         if kept is None:
             if len(self._keys) >= _KEYS:

@@ -56,7 +56,7 @@ class Options:
     """Options of a run under faults.
 
     scenario  a file or a built-in name
-    seconds   the run ends after so long; None: with the messages
+    seconds   the run ends after this time; None: with the messages
     messages  number of hostile messages after which the run ends; None: it ends with the seconds
     every_s   from one fault to the next, at least
     kinds     which faults
@@ -212,7 +212,7 @@ class ChaosRun:
             self.results.left_behind += launcher.end()
 
     def _join(self, launcher: UpProcess) -> Attacker:
-        """Wait until the swarm is up and every vehicle has been heard of."""
+        """Waits until the swarm is up and every vehicle has been heard of."""
         began_s = time.monotonic()
         attacker: Attacker | None = None
         try:

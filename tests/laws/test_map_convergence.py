@@ -34,7 +34,7 @@ def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0
 
 
 def scribble(swarm: SwarmModel, chance: random.Random, author: SyncService, marks: int) -> None:
-    """Say something about cells of one place, as a vehicle does."""
+    """Says something about cells of one place, as a vehicle does."""
     grid = swarm.terrain.grid
     row, col = chance.randrange(grid.rows), chance.randrange(grid.cols)
     near = [(row + chance.randrange(32), col + chance.randrange(32)) for _ in range(marks)]

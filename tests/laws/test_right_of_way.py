@@ -46,7 +46,7 @@ def borders_of(seed: int) -> TrafficWorld:
 
 
 def check(world: TrafficWorld, settle_s: float = 8.0, move_s: float = 10.0) -> None:
-    """Run through the faults, and then until everybody must have moved again."""
+    """Runs through the faults, and then until everybody must have moved again."""
     world.run(QUIET_S + settle_s)
     world.assert_all_move(move_s)
 

@@ -97,7 +97,7 @@ class Load:
 
 
 def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
-    """Kill a keeper so often; returns how much was put, acknowledged and lost."""
+    """Kills a keeper so often; returns how much was put, acknowledged and lost."""
     chance = random.Random(seed)
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))

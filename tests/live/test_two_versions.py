@@ -49,7 +49,7 @@ def check_understood(network: NetworkConfig, processes: int) -> None:
 
 
 def take_over(machine: Machine, tree: Path) -> None:
-    """Go over to the version in `tree`, beside the one that runs."""
+    """Goes over to the version in `tree`, beside the one that runs."""
     before = machine.process
     machine.start(tree, "--take-over")
     eventually(lambda: machine.lives and before.poll() is not None, 120, "the end of the launcher before")
@@ -58,7 +58,7 @@ def take_over(machine: Machine, tree: Path) -> None:
 
 
 def stop_first(machine: Machine, tree: Path) -> None:
-    """Go over to the version in `tree` once the one that runs has ended."""
+    """Goes over to the version in `tree` once the one that runs has ended."""
     assert machine.stop() == 0, machine.said()
     machine.start(tree)
     eventually(machine.up, 120, "the successors")

@@ -28,7 +28,7 @@ def external(
 
 
 def drive(simulation: OrderedSimulation, rovers: list[ExternalVehicle], seconds: float) -> None:
-    """Drive on, and look that all vehicles are on cells of their own."""
+    """Drives on, and looks that all vehicles are on cells of their own."""
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:
         for rover in rovers:

@@ -14,7 +14,7 @@ SECONDS = 24.0
 
 
 def check_all(simulation: Simulation) -> LawBook:
-    """Run to the end; every law holds."""
+    """Runs to the end; every law holds."""
     trial = LawBook(simulation)
     assert trial.run(SECONDS) == []
     planners: list[np.ndarray] = [

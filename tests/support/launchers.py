@@ -64,7 +64,7 @@ class Machine:
         return self.started[-1]
 
     def start(self, tree: Path, *more: str) -> None:
-        """Start its part of the swarm with the version in `tree`."""
+        """Starts its part of the swarm with the version in `tree`."""
         options = [option for role in self._part.roles for option in ("--only", role)]
         if "router" not in self._part.roles:
             options += ["--connect", self._endpoint]
@@ -79,7 +79,7 @@ class Machine:
             )
 
     def stop(self) -> int:
-        """End it in order. Returns its exit code."""
+        """Ends it in order. Returns its exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(60)
 
@@ -150,7 +150,7 @@ class Routed:
         return any(last_s > began_s for last_s in dict(self._last_s).values())
 
     def again(self, within_s: float) -> float:
-        """Wait until all are on a route from now on. Returns how long that took, s."""
+        """Waits until all are on a route from now on. Returns how long that took, s."""
         began_s = time.monotonic()
         eventually(lambda: self.all_since(began_s), within_s, "routes for all vehicles")
         return time.monotonic() - began_s

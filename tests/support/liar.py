@@ -34,7 +34,7 @@ class Liar:
         self.serving = True
 
     def listen(self) -> None:
-        """Hear everything from now on, and tell it again with one thing in it altered, half of the time."""
+        """Hears everything from now on, and tells it again with one thing in it altered, half of the time."""
         for topic in published():
             self.bus.subscribe(topic, self.hear)
 
@@ -70,7 +70,7 @@ class Liar:
         self.told += 1
 
     def serve(self, topics: Iterable[Topic], *, refuses: bool = True) -> None:
-        """Answer everybody's questions with lies, several at a time."""
+        """Answers everybody's questions with lies, several at a time."""
 
         def answer(event: Event) -> None:
             assert isinstance(event, Asked)

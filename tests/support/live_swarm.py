@@ -79,7 +79,7 @@ def folders_of_runs(runs: Path) -> list[Path]:
 
 
 def swarm(*arguments: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
-    """Run the command `swarm` to its end."""
+    """Runs the command `swarm` to its end."""
     command = [*SWARM, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
 

@@ -59,7 +59,7 @@ def swarm_peer(
     network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float, run_id: str = "bench"
 ) -> None:
     """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, and a target,
-    for so long. Answers which run it is."""
+    for this time. Answers which run it is."""
     inbox, now_ns = Inbox(), time.time_ns()
     info = RunInfo(
         run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,

@@ -42,7 +42,7 @@ class Vehicle:
         say("armed", int(asked.arm))
 
     def drive(self, distance_m: float) -> None:
-        """Go on so far along the mission, if armed."""
+        """Goes on so far along the mission, if armed."""
         while self.armed and self.items and distance_m > 0:
             lat_deg, lon_deg = self.items[0]
             north_m = (lat_deg - self.lat_deg) * _M_PER_DEG

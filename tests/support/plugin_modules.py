@@ -11,7 +11,7 @@ from pathlib import Path
 
 @contextmanager
 def forgotten_afterwards(folder: Path) -> Iterator[None]:
-    """Leave no module of this folder behind, nor the folder on the path."""
+    """Leaves no module of this folder behind, nor the folder on the path."""
     path = list(sys.path)
     try:
         yield

@@ -13,7 +13,7 @@ _BLOCK = re.compile(r'^```(\w+) title="([\w.]+)"\n(.*?)^```$', re.MULTILINE | re
 
 
 def write_example(kind: str, folder: Path, more: str = "") -> Path:
-    """Write the files of a kind's page into a folder, and `more` in front of its scenario; returns that."""
+    """Writes the files of a kind's page into a folder, and `more` in front of its scenario; returns that."""
     page = PAGES / f"{_PAGES_OF.get(kind, kind)}.md"
     for _, name, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
         (folder / name).write_text(more + text if name == "scenario.toml" else text, encoding="utf-8")

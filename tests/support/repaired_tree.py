@@ -52,7 +52,7 @@ class Patchwork:
         return costs
 
     def change(self, factor: float, side: int, near_root: bool = False) -> Window:
-        """Change a square somewhere, or around the root. The root stays passable."""
+        """Changes a square somewhere, or around the root. The root stays passable."""
         rows, cols = self.grid.rows, self.grid.cols
         row, col = int(self.rng.integers(rows)), int(self.rng.integers(cols))
         if near_root:

@@ -185,7 +185,7 @@ class World:
         self.planner.on_chasers(told, self.now_ns)
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
-        """Do a growth that was asked for."""
+        """Does a growth that was asked for."""
         assert isinstance(action, Work)
         return self.planner.adopt(action.job(), took_ns, self.now_ns)
 

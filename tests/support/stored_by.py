@@ -34,7 +34,7 @@ def _examples(name: str) -> list[Any]:
 
 
 def write(folder: Path) -> None:
-    """Leave a keeper's store and an agent's promises."""
+    """Leaves a keeper's store and an agent's promises."""
     # By name, as the modules of messages differ between versions.
     [marks], [sighted], [table] = map(_examples, ("MarkSet", "Sighted", "Table"))
     orders = [order for each in _examples("Orders") for order in each.orders]

@@ -124,7 +124,7 @@ class SwarmModel:
         self.run(0.05)
 
     def until(self, true: Callable[[], object], within_s: float = 5.0, step_s: float = 0.001) -> float:
-        """Run until a condition holds; returns the seconds that it took."""
+        """Runs until a condition holds; returns the seconds that it took."""
         began_ns = self.now_ns
         while not true():
             if self.now_ns - began_ns > within_s * NS_PER_S:
@@ -157,7 +157,7 @@ class SwarmModel:
     def start(
         self, node: str, make: Callable[[MemoryBus, Post], S], hz: float = 10.0, phase_ns: int | None = None
     ) -> S:
-        """Start a service on a bus of its own; its first tick is after phase_ns, or a whole period."""
+        """Starts a service on a bus of its own; its first tick is after phase_ns, or a whole period."""
         bus = self.buses[node] = self.bus(node, authenticator=self.authenticator)
         period_ns = int(NS_PER_S / hz)
 

@@ -394,7 +394,7 @@ class TrafficWorld:
         self.send(source, member, ask)
 
     def ask_known(self, source: Process, first: bool = False) -> None:
-        """Ask everybody what they know of us, again and again as long as it is needed."""
+        """Asks everybody what they know of us, again and again as long as it is needed."""
 
         own = source.disk.own
         request = KnownRequest(agent=source.agent, disk=own.disk, shard_cells=source.rights.shards.side)
@@ -421,7 +421,7 @@ class TrafficWorld:
         return Process(self, agent, disk)
 
     def start(self, agent: str, disk: Disk) -> None:
-        """Start a process, which begins a generation."""
+        """Starts a process, which begins a generation."""
         process = self.process_of(agent, disk)
         self.processes.append(process)
         self.begin(process)
@@ -439,7 +439,7 @@ class TrafficWorld:
         self.at(self.chance.randrange(TICK_NS), tick)
 
     def begin(self, process: Process) -> None:
-        """Ask everybody, then begin a generation."""
+        """Asks everybody, then begins a generation."""
         self.ask_known(process, first=True)
         self.at(200 * MS, lambda: process.begin() if process.alive else None)
 

@@ -63,7 +63,7 @@ class Findings:
     stated: float = 0.0
 
     def note(self, law: str, off: Seconds, allowed: float, seed: int) -> None:
-        """Count those of `off` (relative) that are more than allowed, or no number."""
+        """Counts those of `off` (relative) that are more than allowed, or no number."""
         broken = ~(off <= allowed)
         many = int(np.count_nonzero(broken))
         if many:

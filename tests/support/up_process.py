@@ -53,7 +53,7 @@ class UpProcess:
         return []
 
     def check(self) -> None:
-        """Raise SwarmError, with the launcher's exit code and last sentence, if it has ended."""
+        """Raises SwarmError, with the launcher's exit code and last sentence, if it has ended."""
         code = self.process.poll()
         if code is not None:
             last = (self.lines() or ["it said nothing"])[-1]
@@ -69,7 +69,7 @@ class UpProcess:
         return None
 
     def end(self) -> list[str]:
-        """Ask the launcher to end and wait for it. Returns the names of processes that had to be killed."""
+        """Asks the launcher to end and waits for it. Returns the names of processes that had to be killed."""
         left_behind = []
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)

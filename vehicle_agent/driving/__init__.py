@@ -1,23 +1,23 @@
-"""One vehicle: its route, its motion, and what it makes of answers and of silence.
+"""One vehicle: its route, its motion, and its reaction to replies and to their absence.
 
-`Vehicle` holds a vehicle's state and says when it needs a route. `Follower` is its route while it is driven,
+`Vehicle` holds a vehicle's state and decides when it needs a route. `Follower` is its route while it is driven,
 `Motion` its place between two cells. `Driver` moves the vehicles of an agent along the cells that they were
-granted, in the time of a tick; `dynamics` says how fast.
+granted, in the time of a tick; `dynamics` computes how fast.
 
 A vehicle is in one of eight states, which each report tells (`VehicleState`):
 
 - IDLE: it has no target. Initial state, and the state after `release`.
 - WAITING: it has a target and no route to it, and asks for one.
-- FOLLOWING: it has a route to a target whose tracker lives.
-- ARRIVED: its target is within capture range and has a tracker that lives.
+- FOLLOWING: it has a route to a target whose tracker is alive.
+- ARRIVED: its target is within capture range and has a living tracker.
 - STRANDED: no planner knows a way from here. It asks again every few seconds.
 - LOST: its target's planner has ended. It drives on along the route that it has.
 - OUTDATED: as FOLLOWING or ARRIVED, by the last pose of a target whose tracker is lost.
 - SEARCHING: it has a route to a cell where its unseen target may be.
 
-The state follows from known facts: capture range takes precedence over an ended planner, that over a search, that
-over a route (`Vehicle._settle`). Only IDLE and STRANDED are kept. These are all transitions: the method of
-`Vehicle` that is called, the states before it, and the state after it. Any other call changes no state.
+The state follows from known facts, in this precedence: capture range, ended planner, search, route
+(`Vehicle._settle`). Only IDLE and STRANDED are stored; the others are derived. These are all transitions: the
+method of `Vehicle` that is called, the states before it, and the state after it. Any other call changes no state.
 
     assign          ARRIVED, LOST, SEARCHING -> FOLLOWING
     assign          LOST, SEARCHING -> OUTDATED
@@ -52,5 +52,6 @@ over a route (`Vehicle._settle`). Only IDLE and STRANDED are kept. These are all
     target_jumped   SEARCHING -> OUTDATED
     target_jumped   FOLLOWING, OUTDATED, SEARCHING -> WAITING
 
-`route_request`, `no_answer` and `refuse_route` lead to WAITING where a route has run out, which is seen only then.
+`route_request`, `no_answer` and `refuse_route` lead to WAITING if a route has run out, because only these calls
+notice that.
 """

@@ -27,11 +27,12 @@ _LEAST_PART = 1e-9
 
 
 class Follower:
-    """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead.
+    """The cells of a vehicle's route and how far along it the vehicle is. Without a route no cell is ahead. Not the
+    `Follower` of `planner_service.followers`, a vehicle as its planner knows it.
 
     left     how many cells are ahead
-    changes  how often it has been another route: begun, dropped or cut
-    version  how often it, or how far along it the vehicle is, has changed
+    changes  how often the route was begun, dropped or cut
+    version  changes of the route or of the vehicle's progress
     """
 
     def __init__(self) -> None:
@@ -49,10 +50,10 @@ class Follower:
     def begin(
         self, cells: Sequence[int], path: Sequence[int], partial: bool = False, turns: Sequence[int] = ()
     ) -> bool:
-        """Follows a route from the first cell of a vehicle's path that it passes. False if it passes none; then
-        nothing changes.
+        """Follows a route from the first cell of the vehicle's path that lies on the route. Returns False, and
+        changes nothing, if none does.
 
-        turns  of a pulled route the indices of the cells in which it turns, its first and last included
+        turns  for a pulled route: indices of the cells in which it turns, first and last included
         """
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
@@ -89,21 +90,21 @@ class Follower:
             self.version += 1
 
     def after(self, cell: int, count: int) -> list[int]:
-        """The next `count` cells behind a cell of the route; none if the cell is not on it."""
+        """The next `count` cells after a cell of the route; none if the cell is not on it."""
         index = self._find(cell)
         return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
 
     def _find(self, cell: int) -> int | None:
-        """Returns the index on the route of a cell that the vehicle may enter next; None if it is not one of
-        those."""
+        """Returns the index on the route of a cell that the vehicle may enter next; None if the cell is not such a
+        cell."""
         try:
             return self._cells.index(cell, self._at, self._at + _SKIPPED_CELLS)
         except ValueError:
             return None
 
     def point(self, cell: int, cols: int) -> tuple[float, float] | None:
-        """Returns the point where an any-angle route passes one of its next cells, as row and col: the middle of
-        its segment's part in it. None where it is the middle of the cell.
+        """Returns the point where an any-angle route passes one of its next cells, as row and col: the midpoint of
+        the segment within the cell. None if it is the middle of the cell.
 
         A cell that the segment does not cross, whatever a planner says, is driven through its middle.
         """
@@ -148,7 +149,7 @@ class Follower:
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """Ends the route before the first step ahead that is not passable; True if there is one.
 
-        passable  how many steps from the first of some cells on are
+        passable  returns how many first steps of a cell list are passable
         """
         keep = self._at + 1 + passable(self._cells[self._at :])
         if keep >= len(self._cells):
@@ -176,7 +177,7 @@ def goal_name(cell: int) -> str:
 
 
 def goal_of(target: str | None) -> int | None:
-    """The cell of a place that a vehicle goes for like a target; None of a target."""
+    """The cell of a place to which a vehicle was sent; None for a target."""
     return int(target.removeprefix(PLACES)) if target is not None and target.startswith(PLACES) else None
 
 
@@ -208,7 +209,7 @@ class GivenRoute(msgspec.Struct, frozen=True):
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
     searching      whether it leads to a cell where the unseen target may be
-    turns          of a pulled route the indices of the cells in which it turns, its first and last included
+    turns          for a pulled route: indices of the cells in which it turns, first and last included
     """
 
     target: str
@@ -245,12 +246,12 @@ class Vehicle:
     target        the target, or the name of the place, that it goes for; None before the first assignment
     goal          the cell of that place; None of a target
     in_reach      whether that target is within capture range
-    tracked       whether that target has a tracker that lives; else it was in reach, and may be anywhere
+    tracked       whether that target has a living tracker; if not, `in_reach` refers to its last pose
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
     asked         the target of the open route request, None if there is none
     searching     whether its last route led to a cell where its unseen target may be
-    decided       the path and the version of the route for which its agent has decided what it needs: nothing else,
-                  while it only rolls on. None while that may change at any time
+    decided       path and route version of the agent's last decision: while both are unchanged, the vehicle needs
+                  nothing new. None while that may change at any time
     """
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
@@ -363,7 +364,7 @@ class Vehicle:
 
     @property
     def needs_nothing(self) -> bool:
-        """True if no time that passes lets `route_request` return a reason, while it rolls on."""
+        """True if `route_request` returns no reason however long the vehicle rolls on."""
         goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
         return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
 

@@ -1,4 +1,4 @@
-"""Vehicles along the cells that were granted to them, for the time of a tick."""
+"""Drives vehicles along their granted cells for one tick."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ class Driver:
 
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
-    pulled    whether routes are pulled: a step takes what each of both cells takes, as their segments are priced,
-              and not what the cell that it enters does
+    pulled    whether routes are pulled: each part of a step is then driven at its own cell's pace, not all at the
+              entered cell's
     measures  whether to note how fast they drove
 
-    patience_ns  how long one waits for others that do not go on
-    driven       (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs, and the
-                 wind, taken out:
+    patience_ns  how long a vehicle waits for others that do not move on
+    driven       (cell, s/m) of each step into a cell that was driven without a stop, corrected for climb and wind:
                  what vehicles measure; the owner empties it
     entered      cells that vehicles have entered and not looked around from; the owner empties it
     """
@@ -63,7 +62,8 @@ class Driver:
         """Vehicle -> the entry which waits for others, and since when nothing has changed."""
 
     def begin(self, vehicles: Mapping[str, Vehicle], seconds: float) -> None:
-        """Gives each of these so much time. Those which come to no end of a stretch in it have used it then."""
+        """Gives each of these vehicles this time. Rolls those that reach no end of a stretch; their time is
+        used."""
         if (driven := list(vehicles.values())) != self._vehicles:
             self._vehicles, self._rows = driven, together([vehicle.motion for vehicle in driven])
         comes = ~roll(self._rows, self._physics, max(seconds, 0.0))
@@ -72,8 +72,8 @@ class Driver:
             self._dynamics.begin(seconds)
 
     def drive(self, stopped: Callable[[str], bool]) -> None:
-        """Makes each with time left drive until it comes to another cell, or to the border of one that another has
-        not left, or its time is over.
+        """Makes each with time left drive until it comes to another cell, or to the border of a cell that another
+        vehicle has not left, or its time is over.
 
         stopped  whether a vehicle has to stand
         """
@@ -87,7 +87,7 @@ class Driver:
                 motion.roll_on(by, self._climbing(motion), counts=by == motion.head)
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
-        """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
+        """Drives one vehicle to its next cell at most. Returns the seconds that it has left then."""
         motion = vehicle.motion
         while left_s > 0.0:
             if motion.at_rest:
@@ -138,7 +138,7 @@ class Driver:
         return 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
 
     def end_path(self, vehicle: Vehicle) -> None:
-        """Gives back what lies behind a step that the map does not allow any more."""
+        """Gives back the cells after the first step that the map no longer allows."""
         path = self._holdings.path(vehicle.id)
         for index, (tail, head) in enumerate(pairwise(path), 1):
             if not self._passable(tail, head):
@@ -148,8 +148,8 @@ class Driver:
                 return
 
     def waits(self, vehicle: Vehicle, now_ns: int) -> bool:
-        """Returns True if a vehicle waits for others. Gives back entries behind those that have not gone on for
-        long, so that no circle of waiting lasts."""
+        """Returns True if a vehicle waits for others. Gives back entries after one that is stuck for long, so that
+        no waiting cycle lasts."""
         awaits = self._holdings.awaits(vehicle.id)
         if awaits is None:
             self._waits.pop(vehicle.id, None)
@@ -164,7 +164,7 @@ class Driver:
         return True
 
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
-        """Gives back all but the first cells, and the one that it drives into."""
+        """Gives back all but the first `keep` cells and the one being entered."""
         if self._holdings.awaits(vehicle.id) is not None:
             vehicle.motion.turn_back()  # else it would set out long after the order
         self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))

@@ -1,6 +1,6 @@
 """Speed of a vehicle on its granted path. The ground says how fast it may; a plug-in may slow it.
 
-The cells that a vehicle enters, and its stops, belong to `Motion` and right of way, whatever this returns.
+`Motion` and right of way decide which cells a vehicle enters and where it stops, whatever this returns.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Stretch:
 class Inertia:
     """The built-in dynamics of a class with limits of its own, in m/s2 and degrees/s; None is no limit.
 
-    Its distances are feasible from tick to tick: at the end of each it can still brake for everything ahead. A turn
-    is driven on the half of a cell behind it.
+    Its speeds are feasible at every tick: at the end of each it can still brake for everything ahead. A turn is
+    driven on the half cell after it.
     """
 
     def __init__(self, grid: GridSpec, accel: float | None, turn_rate_deg_per_s: float | None) -> None:
@@ -88,8 +88,8 @@ class Inertia:
 
     def _down_to(self, then: float, ahead_m: float, seconds: float) -> float:
         """Returns the speed from which it can brake to another within a distance (m), after some seconds at this
-        speed: the v of v seconds + (v^2 - then^2) / 2 accel = ahead. A speed that it loses within that time may be
-        driven immediately."""
+        speed: the v of v * seconds + (v^2 - then^2) / (2 * accel) = ahead_m. A speed that it loses within that time
+        may be driven immediately."""
         if math.isinf(then):
             return math.inf
         room = 2 * self._accel * ahead_m + then * then

@@ -32,8 +32,8 @@ _COLUMNS = 14
 
 
 class Motion:
-    """A step from a point of cell `tail` to a point of cell `head`: their middles, but on a pulled route. At rest
-    both are the same cell.
+    """A step from a point of cell `tail` to a point of cell `head`: their middles, except on a pulled route. At
+    rest both are the same cell.
 
     The vehicle is a point. It occupies `tail` up to their border, or the corner that they share, and `head` from
     there on.
@@ -128,7 +128,7 @@ class Motion:
             self._settle(self.length_m - self.done_m)
 
     def advance(self, seconds: float, pace_s_per_m: float, *, enters: bool = True) -> float:
-        """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to the end.
+        """Drives for some seconds at a pace in s/m, at most to the border of `head` or, beyond it, to the end.
 
         enters  whether it may enter `head`; else it stops before the border
 
@@ -172,7 +172,7 @@ def together(motions: Sequence[Motion]) -> Rows:
 
 
 def roll(rows: Rows, paces: NDArray[np.floating], seconds: float) -> NDArray[np.bool_]:
-    """Drives all for some seconds which come to no end of a stretch by that, and returns which these are.
+    """Drives those that reach no end of a stretch in this time; returns which.
 
     paces  s/m, by cell
     """

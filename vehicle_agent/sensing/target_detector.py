@@ -23,7 +23,7 @@ SIGHTING_LASTS_S = 30.0
 """A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
 _IN_SIGHT_NS = 2 * _TELL_NS
 _RETELL_NS = NS_PER_S
-"""A planner that appears hears sightings after so long."""
+"""A planner that appears hears sightings after this time."""
 
 
 class TargetDetector:
@@ -33,7 +33,7 @@ class TargetDetector:
     received none. A target that was captured in sight is somewhere else, and its sighting is forgotten.
 
     range_m  of the sensor
-    lasts_s  a sighting expires after so long
+    lasts_s  a sighting expires after this time
     """
 
     def __init__(

@@ -250,7 +250,7 @@ class Orders:
         self.newest = max(self.newest, seq)
 
     def generations_of(self, host: str) -> set[int]:
-        """Returns the fenced lives of a host."""
+        """Returns the fenced generations of a host."""
         return {generation for name, generation in self.fenced if name == host}
 
     def end(self, host: str, generation: int) -> bool:

@@ -22,7 +22,7 @@ from vehicle_agent.traffic.cell_orders import cells_beside
 from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S
-"""For a vehicle's wish time stands still for so long: then its age grows, by a step in which leaders compare ages.
+"""A vehicle's wish does not age for this time: then its age grows by a step, in which leaders compare ages.
 Each vehicle's turns begin at another time, so that no tick has all wishes to make
 (docs/design/zenoh-topology-and-inboxes.md)."""
 _WAITING_TURN_NS = NS_PER_S

@@ -1,6 +1,6 @@
 """Ways around obstacles that stand on routes. Planners know no obstacles, so the host drives around them itself.
 
-A route that passes a standing obstacle is replaced by the cheapest way from where the vehicle's path ends back
+A route that passes a standing obstacle is replaced by the cheapest path from where the vehicle's path ends back
 onto the route behind the obstacle: A* on the host's own map, with the cells of all obstacles closed.
 """
 
@@ -24,10 +24,10 @@ _LOOK_CELLS = 200
 _CELLS_PER_TICK = 400
 """Expanded by all searches of a host: some 4 ms (docs/design/reported-obstacles.md)."""
 _MOST_CELLS = 20_000
-"""Expanded by one search: then there is no way around that is worth it (docs/design/reported-obstacles.md)."""
+"""Expanded by one search: then there is no path around that is worth it (docs/design/reported-obstacles.md)."""
 _AGAIN_NS = NS_PER_S
 _RARELY_NS = 16 * NS_PER_S
-"""A vehicle without a way around is tried again after one second, then after twice as long, up to this."""
+"""A vehicle without a path around is tried again after one second, then after twice as long, up to this."""
 _DIAGONAL = math.sqrt(2.0)
 
 
@@ -58,10 +58,10 @@ class Detours:
         self._searches: dict[str, tuple[int, Iterator[list[int] | None]]] = {}
         """Vehicle -> the search under way for it, and the route for which it was begun."""
         self._waits: dict[str, tuple[int, int]] = {}
-        """Vehicle without a way around -> when it is tried again, and the pause before that."""
+        """Vehicle without a path around -> when it is tried again, and the pause before that."""
 
     def tick(self, vehicles: Iterable[Vehicle], path: Callable[[str], Sequence[int]], now_ns: int) -> None:
-        """Begins and continue searches; vehicles for which one has ended follow what it has found."""
+        """Begins and continues searches; vehicles for which one has ended follow what it has found."""
         standing = self._obstacles.standing if self._obstacles.any else ()
         if not standing:
             self._searches.clear()

@@ -17,7 +17,7 @@ from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
 from vehicle_agent.traffic.witness import Witness, agreed
 
 LEASE_NS = 3 * HEARTBEAT_NS
-"""A leader that is silent for so long may be replaced, later where answers take long. Until then its members refuse
+"""A leader that is silent for this time may be replaced, later if answers take long. Until then its members refuse
 every claim (docs/design/right-of-way.md)."""
 _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
@@ -133,7 +133,7 @@ class Member:
         self._promises: dict[str, Table] = {}
         self._claim_above = 0
         self._leader = ""
-        self._led_until_ns = now_ns  # the leader that we know of is in charge at least so long
+        self._led_until_ns = now_ns  # the leader that we know of is in charge at least this time
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
         self._acked_ns = dict.fromkeys(self._others, now_ns)

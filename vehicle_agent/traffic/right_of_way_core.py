@@ -187,7 +187,7 @@ class RightOfWay:
         return stored
 
     def _generations_of(self, agent: str) -> list[int]:
-        """All lives of an agent that stored tables name, the newest ones."""
+        """Generations of an agent that stored tables name, the newest ones."""
         generations = {table.hosts[agent][0] for table in self._stored().values() if agent in table.hosts}
         generations.update(
             each.generation for table in self._stored().values() for each in table.fences if each.agent == agent

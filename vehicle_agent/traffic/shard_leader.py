@@ -188,7 +188,7 @@ class Leader:
             and len(fenced) >= GENERATIONS_KEPT
             and fenced.isdisjoint(standing.dead)
         ):
-            self.refused.append(f"{host} has {len(fenced)} lives here which are not known to have ended")
+            self.refused.append(f"{host} has {len(fenced)} generations here which are not known to have ended")
             return
         if standing.generation != generation:
             known.told = None

@@ -33,7 +33,7 @@ FAR_CELLS = 8
 """A vehicle with no more cells than these ahead requests as many more: half of what a statement has room for."""
 _UNDER_WAY = Wish()
 _BLOCKED_NS = 3 * NS_PER_S
-"""A vehicle that has stood for so long on its way asks its planner for another route."""
+"""A vehicle that has stood for this time on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
 """Above the age of any wish, and within a column of uint32."""
 

@@ -51,7 +51,7 @@ class Wishes:
     arm         it may be armed, and its mode changed
     altitude_m  of one that flies
     above       what the altitude is above
-    lost_s      after so long without a heartbeat or a position the link counts as lost
+    lost_s      after this time without a heartbeat or a position the link counts as lost
     id          who it is in the swarm; None: `mav` and its number on the link
     group, radius_m, vehicle_class  as `Swarm.vehicle` has them
     """

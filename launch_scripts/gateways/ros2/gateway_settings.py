@@ -262,7 +262,7 @@ def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_ta
 
 
 def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
-    """Reads and check a file of settings, or none, and what options say over them. Raises ConfigError that names
+    """Reads and checks a file of settings, or none, and applies options over them. Raises ConfigError that names
     the file, or options, and the key.
 
     options  key -> value, such as {"ros.domain": 3}; None changes nothing

@@ -27,7 +27,7 @@ from swarm.wire.messages.map_data import MarkSet
 QUICK_S_PER_M = 0.1
 """The pace of the quickest ground where the terrain is not known: 10 m/s."""
 _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
-"""The whole map is due so long after it was put last if anything has changed, and as many times longer as it has
+"""The whole map is due this time after it was put last if anything has changed, and as many times longer as it has
 more cells than a million."""
 _META = "terrain.json"
 _NEWEST = 50

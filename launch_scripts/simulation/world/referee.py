@@ -261,9 +261,9 @@ class Referee:
 
 
 IN_TIME_NS = NS_PER_S // 5
-"""Two ticks of an agent: a cell that an obstacle has closed for so long is closed to every vehicle."""
+"""Two ticks of an agent: a cell that an obstacle has closed for this time is closed to every vehicle."""
 _LATE_NS = 3 * NS_PER_S // 20
-"""Shorter overlaps are no hit: the referee and an agent may hear of the same report so long after each other."""
+"""Shorter overlaps are no hit: the referee and an agent may hear of the same report this time after each other."""
 
 
 @dataclass(slots=True, eq=False)

@@ -43,10 +43,10 @@ from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Obstacle, VehicleStat
 from vehicle_agent.obstacles import TargetObstacles
 
 LISTEN_NS = NS_PER_S
-"""A starting process asks planners where their targets are before it places them itself: it waits so long for a
+"""A starting process asks planners where their targets are before it places them itself: it waits this time for a
 planner to appear."""
 PATIENCE_NS = 5 * NS_PER_S
-"""It waits so long for the answer of a planner that is alive."""
+"""It waits this time for the answer of a planner that is alive."""
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
@@ -193,7 +193,7 @@ class TargetWorld:
         return actions
 
     def lead(self, leads: bool) -> None:
-        """Takes over where the poses of the one before ended, or leave it to another.
+        """Takes over where the poses of the previous one ended, or leaves the lead to another.
 
         Takes the lead: poses from now on supersede those, with an incarnation above theirs. One that leaves no room
         above it is no process's; what follows it is heard once it has been silent.

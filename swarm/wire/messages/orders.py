@@ -50,7 +50,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
     polygon_m     corners [x_m, y_m] instead, as poses have them
     corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
-    lasts_s       after so long the zone ends by itself; without it never
+    lasts_s       after this time the zone ends by itself; without it never
     vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
     stamp_ns      when it was given, as in `GiveOrder`
     holes         parts of the polygon which are not of the zone, each as corners [row, col]; only with `polygon`

@@ -240,7 +240,7 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
                  incarnation is a tracker of its own
     incarnation  when the tracker began to track this target, by the clock of `stamp_ns`
     seq          grows within an incarnation
-    lease_s      the tracker counts as lost when no pose of it has arrived for so long; 0 hands the target over
+    lease_s      the tracker counts as lost when no pose of it has arrived for this time; 0 hands the target over
     cell         the cell of the place; left out it is that of `x_m`, `y_m`
     captures     how often it was captured
     jumps        how often it was put somewhere else, as after a capture

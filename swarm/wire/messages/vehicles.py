@@ -185,7 +185,7 @@ class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     heading_rad    clockwise from north; None if it may go any way
     speed_m_per_s  by the wall clock
     radius_m       around the place
-    lease_s        the obstacle is forgotten so long after this message was heard; 0 takes it away at once
+    lease_s        the obstacle is forgotten this time after this message was heard; 0 takes it away at once
     """
 
     id: VehicleId

@@ -14,7 +14,7 @@ from bench.harness import benchmark, track
 @benchmark(fails=("violations",))
 def certificates(
     checks: Annotated[int, typer.Option(min=1, help="Routes to check.")] = 1_000_000,
-    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were checked.")] = 600,
+    seconds: Annotated[float, typer.Option(min=1, help="End after this time, however many were checked.")] = 600,
     seed: Annotated[int, typer.Option(min=0, help="Of the first life; the next one's is one more.")] = 1,
 ) -> dict[str, Any]:
     """Random rules, strategies and lives: is each route what its planner says?

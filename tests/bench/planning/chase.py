@@ -149,9 +149,9 @@ _SHARES = {"p50": 0.5, "p95": 0.95, "max": 1.0}
 
 
 def chase(field: Field, entrants: Mapping[Strategy, PlannerConfig], plan: Plan) -> dict[Strategy, Tally]:
-    """Measure each entrant. Targets that do not fit into half of the free memory at once follow in batches: they do
-    not depend on each other, and a frame's time is the sum over them. Raises ConfigError on more targets or
-    vehicles than there are cells to stand on."""
+    """Measures each entrant. Targets that do not fit into half of the free memory follow in batches: they do not
+    depend on each other, and a frame's time is the sum over them. Raises ConfigError on more targets or vehicles
+    than there are cells to stand on."""
     home = len(field.terrain.home)
     for name, count in (("targets", plan.targets), ("vehicles", plan.vehicles)):
         if count > home:

@@ -33,7 +33,7 @@ def pulled(
         str, typer.Option(help="open, terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces.")
     ] = "terrain",
     size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; of a file, its middle.")] = 256,
-    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were pulled.")] = 100,
+    seconds: Annotated[float, typer.Option(min=1, help="End after this time, however many were pulled.")] = 100,
     seed: Seed = 1,
 ) -> dict[str, Any]:
     """Routes of straight segments beside those over neighbours: savings and time; none is more expensive.

@@ -259,7 +259,7 @@ class _Run:
             raise BusError(f"gave up waiting until {what} after {UP_WITHIN_S:g} s; the launcher said last: {last}")
 
     def _listen(self, for_s: float) -> None:
-        """Take in what processes publish for some seconds."""
+        """Takes in what processes publish for some seconds."""
         until_s = time.monotonic() + for_s
         while (left_s := until_s - time.monotonic()) > 0:
             match self._inbox.take(left_s):

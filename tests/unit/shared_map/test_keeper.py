@@ -28,7 +28,7 @@ def some_sets(count: int = 5) -> list[MarkSet]:
 
 
 def fill(store: KeeperStore) -> None:
-    """Make the next page that the store needs one too many: a full disk."""
+    """Makes the next page that the store needs one too many: a full disk."""
     pages = store._db.execute("PRAGMA page_count").fetchone()[0]
     store._db.execute(f"PRAGMA max_page_count = {pages}")
 

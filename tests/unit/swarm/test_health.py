@@ -210,7 +210,7 @@ def falls_silent(manager: socket.socket) -> bool:
 
 
 def fill(manager: socket.socket) -> None:
-    """Send as many datagrams as there is space for."""
+    """Sends as many datagrams as there is space for."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as filler:
         filler.setblocking(False)
         with contextlib.suppress(BlockingIOError):

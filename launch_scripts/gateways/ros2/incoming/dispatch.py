@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 MOST_ROBOTS = 256
 _LOOK_NS = NS_PER_S // 2
-"""The swarm's own vehicles are looked at so often."""
+"""Interval of looks at the swarm's own vehicles."""
 _MOST_ASKED = 16
 """All askers get a reply at the next tick, 0.02 s later: more than a few that wait come from a peer that floods,
 and each of them is a copy of the map on the network."""

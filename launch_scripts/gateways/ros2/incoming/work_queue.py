@@ -58,7 +58,7 @@ class WorkQueue:
 
 
 class Input:
-    """The newest message of a topic, taken at ticks and at most so often.
+    """The newest message of a topic, taken at ticks and at most at this interval.
 
     take   is called with it, and the time by time.monotonic_ns. Raises SwarmError on a refused message
     queue  `take` may wait, and is called by its thread; None: it is called by `tick`
