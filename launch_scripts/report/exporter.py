@@ -160,7 +160,7 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
     from pyogrio.errors import DataLayerError, DataSourceError
 
     degrees = form.degrees and frame.grid.crs != "local"
-    options, more = {"DESCRIPTION": layer.about or layer.name}, dict[str, tuple[FieldKind, Value]]()
+    options, more = {"DESCRIPTION": layer.described() or layer.name}, dict[str, tuple[FieldKind, Value]]()
     match form.driver:
         case "GeoJSON":
             more = {"layer": ("text", layer.name), **({"times": ("json", None)} if _is_timed(layer) else {})}

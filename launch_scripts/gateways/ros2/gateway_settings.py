@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -15,7 +15,7 @@ from msgspec import Meta
 from launch_scripts.gateways.ros2 import topic_table
 from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
 from launch_scripts.gateways.ros2.ros_types import Distribution
-from swarm.config.explain import choice, explain
+from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import is_loopback
 from swarm.config.setting_types import Metres, Name, Positive, Section
@@ -200,16 +200,6 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
         return self.set_pose.replace(topic_table.TARGET, ros_name(target))
 
 
-EXAMPLE = IncomingSettings(
-    robots=(Robots(),),
-    targets=("ID",),
-    zones=(ZoneSettings(name="works", topic="/works"),),
-    grids=(GridSettings(name="seen", topic="/seen"),),
-    orders=True,
-)
-"""One of each, with the names that they have unless settings say otherwise."""
-
-
 class Settings(Section, frozen=True, kw_only=True):
     """Settings of `swarm gateway ros2`. An empty file is valid.
 
@@ -238,29 +228,6 @@ class Settings(Section, frozen=True, kw_only=True):
         return replace(row, topic=before + (changes.topic or row.topic), hz=changes.hz or row.hz)
 
 
-def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_table.TopicRow]:
-    """Returns all that these settings let in, and what robots get.
-
-    has_map  whether there is a map to be asked for
-    """
-    rows: list[topic_table.TopicRow] = []
-    for robots in settings.robots:
-        own: dict[str, dict[str, Any]] = {
-            "robot": {"topic": robots.topic, "type_name": topic_table.POSE_TYPES[robots.type], "hz": robots.hz},
-            "goal": {"topic": robots.goal},
-            "robot_goal": {"topic": robots.goal},
-            "robot_plan": {"topic": robots.plan},
-        }
-        for row in topic_table.ROBOT_TABLE:
-            named = replace(row, **own.get(row.name, {}))
-            rows.append(replace(named, topic=robots.own(named.topic)))
-    rows += [replace(topic_table.SET_POSE, topic=settings.set_pose_of(each)) for each in settings.targets]
-    rows += [replace(topic_table.ZONE, topic=each.topic) for each in settings.zones]
-    rows += [replace(topic_table.GRID, topic=each.topic) for each in settings.grids]
-    rows += topic_table.ORDER_TABLE if settings.orders else ()
-    return [*rows, topic_table.MAP_SERVER] if has_map and rows else rows
-
-
 def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
     """Reads and check a file of settings, or none, and what options say over them. Raises ConfigError that names
     the file, or options, and the key.
@@ -281,10 +248,7 @@ def parse_settings(text: str, source: str = "settings", options: Mapping[str, ob
         if isinstance(inside, dict):
             inside[name] = value
     source += " with options" if said else ""
-    try:
-        settings = msgspec.convert(raw, Settings)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {explain(str(error), raw, Settings)}") from error
+    settings = converted(raw, Settings, source)
     check(settings, source)
     return settings
 
