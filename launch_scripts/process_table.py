@@ -19,7 +19,7 @@ from swarm.wire.fields import check_id
 class Role:
     """Properties of a role.
 
-    entry       `module:function` of its `run(setup, stop_when)`
+    entry       `module:function` of its `run(setup, built)`: `built` is called once the role is built
     jobs        ids of the processes that a scenario has of it, without ranks
     standbys    how many stand by for each of them, in ranks from 1 on; None: it has no ranks
     stops       place in the order of the end: each role stops after those which still talk to it
@@ -140,7 +140,7 @@ only. Every plan of machines has one, and keeps it on the machine of its store."
 class ProcessSpec:
     """One row of the table.
 
-    entry  `module:function`, called as function(setup, stop_when), in place of that of its role
+    entry  `module:function`, called as function(setup, built), in place of that of its role
     added  an operator's order started it: the run goes on without it, whatever keeps it from starting
     """
 

@@ -28,7 +28,7 @@ from swarm.runtime.role import RoleSetup
 log = logging.getLogger(__name__)
 
 
-def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+def run(setup: RoleSetup, built: Callable[[], None]) -> None:
     """Plan for one target, as its planner or a standby, until SIGTERM, SIGINT or the end of the launcher."""
     scenario = setup.scenario
     target = job_of(setup.id)
@@ -44,10 +44,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         all_kernels = boundary.function("all kernels", lambda: kernels.complete, bool)
         return PlannerService(planning, all_kernels, stopwatch, boundary.external(prepared, PREPARED_COSTS))
 
-    _serve(setup, terrain, stop_when, make, "grow-tree", JobSlots(setup.run_dir))
+    _serve(setup, terrain, built, make, "grow-tree", JobSlots(setup.run_dir))
 
 
-def run_places(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+def run_places(setup: RoleSetup, built: Callable[[], None]) -> None:
     """Plan to any place until SIGTERM, SIGINT or the end of the launcher."""
     terrain = _load_ground(setup)
     kernels = _load_kernels(place_kernels(setup.scenario), whole=False)
@@ -55,7 +55,7 @@ def run_places(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     def make(boundary: Boundary, planning: Planning) -> Service:
         return PlacesService(planning, boundary.function("all kernels", lambda: kernels.complete, bool))
 
-    _serve(setup, terrain, stop_when, make, "grow-places")
+    _serve(setup, terrain, built, make, "grow-places")
 
 
 def _load_ground(setup: RoleSetup) -> Terrain:
@@ -73,7 +73,7 @@ def _load_kernels(needed: NeededKernels, whole: bool) -> KernelLoader:
 def _serve(
     setup: RoleSetup,
     terrain: Terrain,
-    stop_when: Callable[[], None] | None,
+    built: Callable[[], None],
     make: Callable[[Boundary, Planning], Service],
     worker_name: str,
     slots: JobSlots | None = None,
@@ -84,6 +84,4 @@ def _serve(
         def service(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> Service:
             return make(boundary, Planning(setup, terrain, bus, inbox.post, boundary.worker(worker)))
 
-        run_role(
-            setup, terrain.digest, stop_when, service, inbox, setup.scenario.planner.tick_hz, tick_phase(setup.id)
-        )
+        run_role(setup, terrain.digest, built, service, inbox, setup.scenario.planner.tick_hz, tick_phase(setup.id))

@@ -18,10 +18,10 @@ from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, Promise
 from vehicle_agent.service import AgentService
 
 
-def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+def run(setup: RoleSetup, built: Callable[[], None]) -> None:
     """Drives the vehicles of one agent until it is told to stop.
 
-    stop_when  blocks until the process has to end; None to run until a signal comes
+    built  called once the service is there
     """
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
@@ -44,4 +44,4 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         return service
 
     tick_hz = setup.scenario.vehicles.tick_hz
-    run_role(setup, terrain.digest, stop_when, make, inbox, tick_hz, tick_phase(setup.id))
+    run_role(setup, terrain.digest, built, make, inbox, tick_hz, tick_phase(setup.id))

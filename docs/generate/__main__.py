@@ -22,8 +22,8 @@ from docs.generate import scenario_page, wire_page
 from docs.generate.templates import filled
 from launch_scripts import cli
 from launch_scripts.command_line import Family
-from launch_scripts.gateways.ros2.gateway_settings import EXAMPLE, Settings, incoming_rows
-from launch_scripts.gateways.ros2.topic_table import TABLE
+from launch_scripts.gateways.ros2.gateway_settings import Settings
+from launch_scripts.gateways.ros2.topic_table import INCOMING, TABLE
 from shared_map.importers.cover.cover_codes import TABLES
 from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 
@@ -81,9 +81,8 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
 
 def ros2() -> str:
     """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
-    incoming = incoming_rows(EXAMPLE, has_map=True)
     settings = scenario_page.settings(Settings)
-    return filled("ros2", outgoing=TABLE, incoming=incoming, qos=_QOS, settings=settings)
+    return filled("ros2", outgoing=TABLE, incoming=INCOMING, qos=_QOS, settings=settings)
 
 
 def design() -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check import Finding, Level, failure, warning
+from launch_scripts.observe.run_folder import version_of
 from launch_scripts.process_table import processes_of
 from swarm.config.agents import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
 from swarm.config.input_files import size
@@ -199,19 +200,12 @@ def _packages(runs: Path) -> Said:
         for wanted in every:
             if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
                 continue
-            here = _version(wanted.name)
+            here = version_of(wanted.name)
             if here is None or not wanted.specifier.contains(here, prereleases=True):
                 wrong[wanted.name] = f"{wanted.name} is {here or 'missing'}, expected {wanted.specifier} ({extra})"
     if wrong:
         return "failure", f"{'; '.join(wrong.values())}: install the extras in brackets (docs/start/install.md)"
-    return "ok", f"all fit; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    return "ok", f"all fit; {PACKAGE} {version_of(PACKAGE)}, zenoh {version_of('eclipse-zenoh')}"
 
 
 def _planner_kernels(runs: Path) -> Said:

@@ -188,7 +188,7 @@ def run_role(
         added=added,
         health=health,
     )
-    resolve_name(TABLE[role].entry)(setup, None, **role_options)
+    resolve_name(TABLE[role].entry)(setup, lambda: None, **role_options)
 
 
 def _health_of(name: str, part: Part) -> Health:

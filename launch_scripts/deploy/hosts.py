@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-import msgspec
 from msgspec import Meta
 
-from swarm.config.explain import explain
+from swarm.config.explain import converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import check_endpoint, is_loopback
 from swarm.config.setting_types import Section
@@ -77,11 +76,7 @@ def load_hosts(path: Path) -> HostsConfig:
 
 def parse_hosts(text: str, source: str = "hosts") -> HostsConfig:
     """Like `load_hosts`, from a text."""
-    raw = parse_toml(text, source, ConfigError)
-    try:
-        config = msgspec.convert(raw, HostsConfig)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {explain(str(error), raw, HostsConfig, 'machines')}") from error
+    config = converted(parse_toml(text, source, ConfigError), HostsConfig, source, "machines")
     for fault in _faults(config):
         raise ConfigError(f"{source}: {fault}")
     return config

@@ -74,7 +74,7 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)
     try:
-        resolve_name(entry)(setup, lambda: _run_until_launcher_ends(TABLE[setup.role].niceness))
+        resolve_name(entry)(setup, lambda: _give_way(TABLE[setup.role].niceness))
     except SwarmError as error:
         log.error("%s", error)
         pipe.send(ExitReason(str(error), error.exit_code, refused=True))
@@ -99,23 +99,24 @@ def wait_for_launcher() -> None:
         wait([parent.sentinel])
 
 
-def _run_until_launcher_ends(niceness: int) -> None:
-    """Blocks until the launcher has ended. A role calls it once it is built, and gives way to others from then
-    on."""
+def _give_way(niceness: int) -> None:
+    """Gives way to others from now on. A role calls it once it is built, not earlier: all wait for any process that
+    still starts."""
     import psutil  # the launcher, which imports this module too, needs none to start
 
     with contextlib.suppress(OSError):  # not every system lets a process choose
         for thread in psutil.Process().threads():
             now = os.getpriority(os.PRIO_PROCESS, thread.id)
             os.setpriority(os.PRIO_PROCESS, thread.id, min(now + niceness, 19))
-    wait_for_launcher()
 
 
 def _watch_launcher() -> None:
-    """Ends this process after the launcher, even if a role hangs in its start."""
+    """Ends this process after the launcher: in order where its loop turns, and in any case, also if a role hangs in
+    its start."""
 
     def watch() -> None:
         wait_for_launcher()
+        logging.getLogger(__name__).warning("the launcher has ended: stopping")
         os.kill(os.getpid(), signal.SIGTERM)
         threading.Event().wait(_GRACE_S)
         os._exit(CRASHED)

@@ -177,21 +177,18 @@ def _busy_line(
     began_s = time.monotonic()
     over = threading.Event()
 
-    def now() -> str:
-        return f"{text()}, {time.monotonic() - began_s:.0f} s"
-
     def tell() -> None:
         if over.wait(_PATIENCE_S):
             return
-        if not changes:
-            say(f"{now()} ...")
-            while not over.wait(_PLAIN_EVERY_S):
-                say(f"{now()} ...")
-            return
-        with contextlib.suppress(OSError), Live(console=console, auto_refresh=False, transient=True) as live:
+        line = Live(console=console, auto_refresh=False, transient=True) if changes else contextlib.nullcontext()
+        with contextlib.suppress(OSError), line as live:
             while True:
-                live.update(Text(f"{now()} ...", style="dim", overflow="ellipsis", no_wrap=True), refresh=True)
-                if over.wait(_BUSY_EVERY_S):
+                now = f"{text()}, {time.monotonic() - began_s:.0f} s ..."
+                if live is None:
+                    say(now)
+                else:
+                    live.update(Text(now, style="dim", overflow="ellipsis", no_wrap=True), refresh=True)
+                if over.wait(_BUSY_EVERY_S if changes else _PLAIN_EVERY_S):
                     return
 
     thread = threading.Thread(target=tell, name="busy-line", daemon=True)

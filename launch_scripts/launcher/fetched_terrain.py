@@ -58,9 +58,9 @@ def fetch_if_missing(
     *,
     roles: Collection[str],
     progress: Progress = no_progress,
-) -> bool:
+) -> None:
     """Fetches the terrain from a keeper if files of it are missing here, and saves it prepared in the run's folder
-    for every process of this machine. Returns True if the run's folder then holds a fetched terrain.
+    for every process of this machine.
 
     found  processes of runs in the namespace; the run's terrain is theirs
     roles  roles that this machine is about to start
@@ -68,7 +68,7 @@ def fetch_if_missing(
     """
     missing = missing_files(scenario)
     if not missing:
-        return False
+        return
     why = f"there is no file {missing[0]}"
     if not found:
         namespace = scenario.network.namespace
@@ -83,7 +83,7 @@ def fetch_if_missing(
         if here is not None and (here.photo.any() or not looks):
             costs = scenario.cost
             if here.digest == terrain_digest(here.grid, here.pace_s_per_m, costs, here.elevation_m):
-                return True
+                return
             log.warning("the terrain in %s is not as it was written: fetching it again", run_dir)
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
         layers = (*NEEDED, "photo") if looks else NEEDED
@@ -93,7 +93,6 @@ def fetch_if_missing(
             terrain = fetch_base_map(bus, wanted, why, progress)
         save_prepared(run_dir, terrain, build_truth(scenario, terrain), key)
         log.info("%s; terrain %s is as in the run", terrain.notes[-1], terrain.digest)
-    return True
 
 
 @contextlib.contextmanager

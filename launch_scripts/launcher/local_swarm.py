@@ -70,7 +70,6 @@ class Ending:
     spec: ProcessSpec
     sentence: str
     exit_code: int
-    refused: bool
     restart_in_s: float | None
     times: int
 
@@ -239,9 +238,7 @@ class LocalSwarm:
                 except SwarmError as error:  # its folder cannot be written
                     wait_s = running.backoff.crashed(0.0)
                     running.due_s = time.monotonic() + wait_s
-                    endings.append(
-                        Ending(running.spec, str(error), error.exit_code, True, wait_s, running.restarts + 1)
-                    )
+                    endings.append(Ending(running.spec, str(error), error.exit_code, wait_s, running.restarts + 1))
         return endings
 
     def _end_hung(self) -> None:
@@ -347,7 +344,7 @@ class LocalSwarm:
             wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
         if wait_s is not None:
             running.due_s = now_s + wait_s
-        return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
+        return Ending(running.spec, reason.sentence, reason.exit_code, wait_s, running.restarts + 1)
 
     def _is_final(self, running: Running, exit_code: int, ran_s: float, now_s: float) -> bool:
         """Returns True if a process that refused to run now would do so again. At the first start a refusal is

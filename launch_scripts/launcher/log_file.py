@@ -10,8 +10,7 @@ import sys
 from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from launch_scripts.plain_text import plain
 
@@ -19,9 +18,6 @@ LogFormat = Literal["text", "json"]
 
 MAX_BYTES = 16 << 20
 """A longer log is renamed to NAME.1, in the place of the previous one, and begun again."""
-
-
-_Raised = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
 
 
 class _Format(logging.Formatter):
@@ -35,7 +31,7 @@ class _Format(logging.Formatter):
         record.message = plain(record.message)
         return super().formatMessage(record)
 
-    def formatException(self, ei: _Raised) -> str:  # noqa: N802
+    def formatException(self, ei: Any) -> str:  # noqa: N802
         return "\n".join(map(plain, super().formatException(ei).split("\n")))
 
 

@@ -29,7 +29,7 @@ from launch_scripts.process_table import (
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.sources import FILE_KINDS, is_terrain
 from swarm.config.cost_rules import cost_of_preset
-from swarm.config.explain import choice, explain, nearest
+from swarm.config.explain import choice, converted, nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.load import check_endpoint, load_scenario
@@ -105,10 +105,7 @@ def with_network(
     if namespace is not None:
         changes["namespace"] = namespace
     raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
-    try:
-        return msgspec.structs.replace(scenario, network=msgspec.convert(raw, NetworkConfig))
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"network: {explain(str(error), raw, NetworkConfig)}") from error
+    return msgspec.structs.replace(scenario, network=converted(raw, NetworkConfig, "network"))
 
 
 def tls_of(ca: str | None, certificate: str | None, key: str | None, folder: str | None = None) -> TlsConfig | None:

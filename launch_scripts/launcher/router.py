@@ -28,7 +28,7 @@ from swarm.errors import BusError, SwarmError
 from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN, Member
-from swarm.runtime.process import Process, end_with
+from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.messages import WIRE_VERSION
@@ -153,7 +153,7 @@ def behind_door(network: NetworkConfig) -> tuple[Door | None, NetworkConfig]:
     return door, msgspec.structs.replace(network, listen=(*others, within))
 
 
-def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
+def run(setup: RoleSetup, built: Callable[[], None]) -> None:
     clock, inbox = MonotonicClock(), Inbox()
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each connection, silent ones included, is a file
@@ -163,8 +163,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
         service = RouterService(peer, admission.bus, inbox.post, admission.reopened, restarts=setup.restarts)
         process = Process(service, inbox, clock, tick_hz=2.0, health=setup.health)
         process.stop_on_signals()
-        if stop_when is not None:
-            end_with(stop_when, process.stop)
+        built()
         process.run()
     finally:
         admission.close()

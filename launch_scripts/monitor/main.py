@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 from collections.abc import Callable
 
 from launch_scripts.web.live_page import LivePage, when_free
@@ -12,7 +10,7 @@ from shared_map.terrain.store import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, end_with
+from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -20,15 +18,14 @@ FRAME_HZ = 10.0
 """Frame rate for viewers."""
 
 
-def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+def run(setup: RoleSetup, built: Callable[[], None]) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher.
 
     A run that ends before the view is loaded has none, and no recording: its end waits for neither.
     """
     terrain = load_terrain(setup)
     inbox = Inbox()
-    if stop_when is not None:  # from here on others go first: the view takes more CPU than the start of any of them
-        end_with(stop_when, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    built()  # from here on others go first: the view takes more CPU than the start of any of them
     with contextlib.ExitStack() as stack:
         view, page = setup.scenario.monitor, None
         if view.live:

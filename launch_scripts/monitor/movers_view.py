@@ -189,9 +189,8 @@ class MoversView:
         grid, row = self._mesh.grid, {id: n for n, id in enumerate(vehicles.ids)}
         ways = [(each, row[each.name], each.cell) for each in goals if each.name in row and each.cell is not None]
         ways = [way for way in ways if way[2] < grid.cells]
-        middles = [grid.row_col(cell) for _, _, cell in ways]
-        places_m = [((col + 0.5) * grid.resolution_m, (row + 0.5) * grid.resolution_m) for row, col in middles]
-        tops = self._pen.placed(places_m, _FLAG)
+        cells = np.array([cell for _, _, cell in ways], np.int64)
+        tops = self._mesh.place_cells(cells, _FLAG * self._mesh.scale_m)
         hues = [ALARM_COLOUR if each.state == "blocked" else styles.FLAG_COLOUR for each, _, _ in ways]
         colours: Bytes = np.array(hues, np.uint8).reshape(-1, 3)
         told = [f"{each.name}: {each.state}" for each, _, _ in ways]

@@ -15,7 +15,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.wire.messages.vehicles import VehicleState
 
 # Okabe and Ito's colours: safe for colour-blind readers, and of different lightness.
-GREEN, DARK_GREEN, RED, BLUE = "#009E73", "#00754f", "#D1330A", "#0072B2"
+GREEN, RED, BLUE = "#009E73", "#D1330A", "#0072B2"
 ORANGE, SKY, PINK, VIOLET = "#E69F00", "#56B4E9", "#CC79A7", "#4a1486"
 YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"
 INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"

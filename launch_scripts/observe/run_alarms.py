@@ -13,7 +13,7 @@ An observer opens an alarm only if it also receives the messages which close it,
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.plain_text import Duration, Moment, plain
@@ -128,11 +128,8 @@ class Alarm:
     def fields(self, grid: GridSpec) -> dict[str, object]:
         """For a report."""
         row, col = self.place(grid) or (None, None)
-        return {
-            "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
-            "over_s": self.over_s, "heard_s": self.heard_s, "row": row, "col": col, "cell": self.cell,
-            "target": self.target,
-        }  # fmt: skip
+        told = {**asdict(self), "row": row, "col": col}
+        return {name: value for name, value in told.items() if name not in ("began_ns", "is_old")}
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:

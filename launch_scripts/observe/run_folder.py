@@ -50,7 +50,7 @@ def begin_run(
         "simulated": simulated,
         "versions": {
             "python": platform.python_version(),
-            **{name: _version(package) for name, package in _PACKAGES.items()},
+            **{name: version_of(package) for name, package in _PACKAGES.items()},
         },
         "machine": {
             "system": f"{platform.system()} {platform.release()}",
@@ -147,7 +147,8 @@ def _number(text: str) -> float:
     return int(text) if text.lstrip("-").isdecimal() else value
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None where it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ Row = tuple[str, list[Any]]
 
 def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     """Keys of the scenarios whose values are not the same in all runs that have a scenario."""
-    found = _that_differ([None if run.settings is None else _flat(run.settings, "") for run in runs])
+    found = _that_differ([None if run.settings is None else dict(_flat(run.settings, "")) for run in runs])
     return [row for row in found if not row[0].startswith(_WHERE_ONLY)]
 
 
@@ -45,8 +45,8 @@ def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     told = []
     for report in (run.report for run in runs):
         made, digest = _table(report.get("made")), _table(report.get("terrain")).get("digest")
-        of = {name: _flat(made.get(name) or {}, name) for name in ("versions", "machine")}
-        told.append({**of["versions"], **of["machine"], "terrain": digest, "simulated": "simulated" in report})
+        of = [each for name in ("versions", "machine") for each in _flat(made.get(name) or {}, name)]
+        told.append({**dict(of), "terrain": digest, "simulated": "simulated" in report})
     return _that_differ(told)
 
 
@@ -69,7 +69,7 @@ def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:
     for report in (run.report for run in runs):
         named = _flat({label: report.get(name) for name, label in labels.items()}, "")
         told.append(
-            {key.replace(".", ", "): value for key, value in named.items()}
+            {key.replace(".", ", "): value for key, value in named}
             | {label: _sum(report.get("by_group"), name) for name, label in _SUMMED.items()}
             | {
                 f"captures of {id}": _table(row).get("captures")
@@ -91,20 +91,16 @@ def text_of(label: str, value: Any) -> str:
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
 
 
-def _flat(settings: Any, path: str) -> dict[str, Any]:
+def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
     """`terrain.hidden.closed_roads`, `targets[0].count`; a list of values is one value."""
-    if isinstance(settings, Mapping) and settings:
-        inside: Iterable[tuple[str, Any]] = (
-            (f"{path}.{key}" if path else str(key), value) for key, value in settings.items()
-        )
-    elif isinstance(settings, list) and settings and all(isinstance(each, Mapping) for each in settings):
-        inside = ((f"{path}[{n}]", value) for n, value in enumerate(settings))
+    if isinstance(value, Mapping) and value:
+        for key, each in value.items():
+            yield from _flat(each, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list) and value and all(isinstance(each, Mapping) for each in value):
+        for n, each in enumerate(value):
+            yield from _flat(each, f"{path}[{n}]")
     else:
-        return {path: settings}
-    flat: dict[str, Any] = {}
-    for deeper, value in inside:
-        flat |= _flat(value, deeper)
-    return flat
+        yield path, value
 
 
 def _differ(values: Iterable[Any]) -> bool:

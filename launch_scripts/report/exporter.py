@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.map_frame import MapFrame
 from swarm.errors import ConfigError, StoreError
-from swarm.files import check_writable, replacing
+from swarm.files import check_writable, replacing, write_file
 from swarm.grid import GridSpec
 
 COSTS = "Costs are seconds of travel: a step takes its length times the pace (s/m) of the cell that it enters."
@@ -160,7 +160,7 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
     from pyogrio.errors import DataLayerError, DataSourceError
 
     degrees = form.degrees and frame.grid.crs != "local"
-    options, more = {"DESCRIPTION": layer.about or layer.name}, dict[str, tuple[FieldKind, Value]]()
+    options, more = {"DESCRIPTION": layer.described() or layer.name}, dict[str, tuple[FieldKind, Value]]()
     match form.driver:
         case "GeoJSON":
             more = {"layer": ("text", layer.name), **({"times": ("json", None)} if _is_timed(layer) else {})}
@@ -466,8 +466,4 @@ def write_mission(path: Path, places: Sequence[tuple[float, float]]) -> None:
         rally = {"version": 2, "points": []}
         plan = {"fileType": "Plan", "version": 1, "groundStation": "QGroundControl"}
         text = json.dumps(plan | {"mission": mission, "geoFence": fence, "rallyPoints": rally}, indent=1)
-    try:
-        with replacing(path) as half:
-            half.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    write_file(path, text.encode())

@@ -22,7 +22,7 @@ TICK_HZ = 10.0
 
 def run(
     setup: RoleSetup,
-    stop_when: Callable[[], None] | None,
+    built: Callable[[], None],
     store_path: Path | None = None,
     rebuild: bool = False,
 ) -> None:
@@ -42,4 +42,4 @@ def run(
             modules = boundary.function("modules of zones", Modules(ZONE_MODULES).there, bool)
             return KeeperService(setup, terrain, bus, inbox.post, boundary.external(store, KEEPER_STORE), modules)
 
-        run_role(setup, terrain.digest, stop_when, make, inbox, TICK_HZ)
+        run_role(setup, terrain.digest, built, make, inbox, TICK_HZ)

@@ -14,12 +14,14 @@ import typing
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 from swarm.config.input_files import quoted
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, SwarmError
+
+T = TypeVar("T")
 
 # --- what a setting means and may be ------------------------------------------------------------------------------
 
@@ -199,6 +201,20 @@ def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario
         wanted = expected(_field_type(section, missing[1])) if hasattr(section, "__struct_fields__") else "a value"
         return f"{name or whole}: missing required field `{missing[1]}`, {wanted}"
     return _wrong(name or whole, value, hint)
+
+
+def converted(
+    raw: dict[str, Any], root: type[T], source: str, whole: str = "scenario", fault: type[SwarmError] = ConfigError
+) -> T:
+    """The content of a file as the type that it is to become. Raises `fault` in one sentence.
+
+    source  begins that sentence
+    whole   what the file is called
+    """
+    try:
+        return msgspec.convert(raw, root)
+    except msgspec.ValidationError as error:
+        raise fault(f"{source}: {explain(str(error), raw, root, whole)}") from error
 
 
 def _is_refused(value: Any, hint: Any) -> bool:

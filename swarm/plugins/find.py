@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from swarm.config.explain import explain, nearest
+from swarm.config.explain import converted, nearest
 from swarm.config.input_files import quoted
 from swarm.config.plugin_names import NamedPlugin, check_name, plugins_of
 from swarm.config.scenario import Scenario
@@ -121,10 +121,7 @@ def _options(named: NamedPlugin, wanted: Any) -> Any:
     key = f"{named.key.rpartition('.')[0]}.options" if named.kind.name == "cost_layer" else f"{named.key}_options"
     if not (isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)):
         raise ConfigError(f"{named.key}: Options of {named.name!r} is no msgspec Struct")
-    try:
-        options = msgspec.convert(dict(named.options), wanted)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{key} of {named.name}: {explain(str(error), dict(named.options), wanted)}") from error
+    options = converted(dict(named.options), wanted, f"{key} of {named.name}")
     allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
     for unknown in named.options.keys() - set(allowed):  # a struct that does not forbid them
         hint = nearest(unknown, allowed)

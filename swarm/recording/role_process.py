@@ -10,7 +10,7 @@ from swarm.clock import MonotonicClock
 from swarm.recording.recording import recorded
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, Service, end_with
+from swarm.runtime.process import Process, Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -21,17 +21,17 @@ Make = Callable[[Boundary, Bus, Callable[[], None]], Service]
 def run_role(
     setup: RoleSetup,
     terrain: str,
-    stop_when: Callable[[], None] | None,
+    built: Callable[[], None],
     make: Make,
     inbox: Inbox,
     tick_hz: float,
     phase: float | None = None,
 ) -> None:
-    """Runs a role's service until SIGTERM, SIGINT or the end of the launcher.
+    """Runs a role's service until SIGTERM or SIGINT.
 
-    terrain    digest (hash) of the terrain on which the role runs
-    stop_when  blocks until the process has to end; None to run until a signal comes
-    phase      as of `Process`
+    terrain  digest (hash) of the terrain on which the role runs
+    built    called once the service is there
+    phase    as of `Process`
     """
     network = setup.scenario.network
     with (
@@ -43,6 +43,5 @@ def run_role(
             boundary.service(service), inbox, MonotonicClock(), tick_hz, phase, setup.health, bus.gather
         )
         process.stop_on_signals()
-        if stop_when is not None:
-            end_with(stop_when, process.stop)
+        built()
         process.run()

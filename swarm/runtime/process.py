@@ -354,19 +354,3 @@ def _failing_with_threads(inbox: Inbox) -> Iterator[None]:
         yield
     finally:
         threading.excepthook = before
-
-
-def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:
-    """Stops when the parent process ends; after `grace_s` more seconds end this process with exit code 1.
-
-    parent_gone  blocks until the parent has ended, as `wait([parent_process().sentinel])` does
-    """
-
-    def watch() -> None:
-        parent_gone()
-        log.warning("the launcher has ended: stopping")
-        stop()
-        threading.Event().wait(grace_s)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent-watch", daemon=True).start()

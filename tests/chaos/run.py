@@ -25,7 +25,7 @@ from chaos.results import LAUNCHER, Ended, Outcome, Recovery, Results, Sample, n
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
-from launch_scripts.simulation.world.referee import Collision, Referee
+from launch_scripts.simulation.world.referee import Referee
 from shared_map.terrain.terrain import build_terrain, build_truth
 from shared_map.vehicle_class_grounds import class_truths
 from swarm.bus.endpoints import listening
@@ -353,13 +353,9 @@ class ChaosRun:
             fleet = decode(payload, FLEET.message)
             self._recovery.hear(fleet, self._now_s)  # type: ignore[arg-type]
             for broken in self._referee.on_fleet(fleet):  # type: ignore[arg-type]
-                if isinstance(broken, Collision):
-                    text = f"{broken.first} and {broken.second} on cell {broken.cell} at {self._now_s:.1f} s"
-                    self.results.collisions.append(text)
-                else:
-                    self.results.lethal_entries.append(
-                        f"{broken.vehicle} on cell {broken.cell} at {self._now_s:.1f} s"
-                    )
+                text = f"{broken.vehicles} on cell {broken.cell} at {self._now_s:.1f} s"
+                met = broken.count == "collisions"
+                (self.results.collisions if met else self.results.lethal_entries).append(text)
 
     def _scan(self) -> None:
         """Scans for processes that run now, and for those that have ended without being killed."""

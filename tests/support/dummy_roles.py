@@ -16,19 +16,18 @@ from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
 from swarm.plugins.guard import call_within
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, end_with
+from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 
-StopWhen = Callable[[], None] | None
+Built = Callable[[], None]
 
 
-def quiet(setup: RoleSetup, stop_when: StopWhen) -> None:
+def quiet(setup: RoleSetup, built: Built) -> None:
     """Runs until SIGTERM, and writes down when it began and ended."""
     ended: list[int] = []  # an Event would deadlock if the signal came in the middle of its wait
     signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
-    if stop_when is not None:
-        end_with(stop_when, lambda: ended.append(0))
+    built()
     _write(setup, "+")
     sys.stdout.write(f"hello from {setup.id}\n")
     while not ended:
@@ -42,14 +41,14 @@ def _write(setup: RoleSetup, sign: str) -> None:
         order.write(f"{sign}{setup.role}-{setup.id}\n")
 
 
-def crash_twice(setup: RoleSetup, stop_when: StopWhen) -> None:
+def crash_twice(setup: RoleSetup, built: Built) -> None:
     assert setup.run_dir is not None
     tries = setup.run_dir / "tries.txt"
     with tries.open("a") as file:
         file.write("x")
     if len(tries.read_text()) <= 2:
         raise ZeroDivisionError("a bug of ours")
-    quiet(setup, stop_when)
+    quiet(setup, built)
 
 
 class Idle:
@@ -81,37 +80,37 @@ class LosesAThread(Idle):
         threading.Thread(target=lambda: [][1], name="reader").start()
 
 
-def lose_a_thread(setup: RoleSetup, stop_when: StopWhen) -> None:
+def lose_a_thread(setup: RoleSetup, built: Built) -> None:
     Process(LosesAThread(), Inbox(), MonotonicClock(), tick_hz=20.0).run()
 
 
-def hang_in_native_code(setup: RoleSetup, stop_when: StopWhen) -> None:
+def hang_in_native_code(setup: RoleSetup, built: Built) -> None:
     call_within(0.1, lambda: sum(itertools.repeat(0)))
 
 
-def refuse(setup: RoleSetup, stop_when: StopWhen) -> None:
+def refuse(setup: RoleSetup, built: Built) -> None:
     raise ConfigError("the scenario is not to my liking")
 
 
-def stubborn(setup: RoleSetup, stop_when: StopWhen) -> None:
+def stubborn(setup: RoleSetup, built: Built) -> None:
     """Neither SIGTERM nor the end of the launcher moves it, from when it has written down that it began."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _write(setup, "+")
     time.sleep(1000)
 
 
-def fail_at_the_end(setup: RoleSetup, stop_when: StopWhen) -> None:
-    quiet(setup, stop_when)
+def fail_at_the_end(setup: RoleSetup, built: Built) -> None:
+    quiet(setup, built)
     raise RuntimeError("could not write the last page")
 
 
-def end_and_stay(setup: RoleSetup, stop_when: StopWhen) -> None:
+def end_and_stay(setup: RoleSetup, built: Built) -> None:
     """Ends as asked, and does not leave: as where a disk that stalls keeps the system from closing its files."""
-    quiet(setup, stop_when)
+    quiet(setup, built)
     os._exit = lambda code: time.sleep(1000)  # type: ignore[assignment, return-value]
 
 
-def leave_early(setup: RoleSetup, stop_when: StopWhen) -> None:
+def leave_early(setup: RoleSetup, built: Built) -> None:
     sys.exit(0)
 
 
@@ -121,7 +120,7 @@ def _run(setup: RoleSetup, service: Idle) -> None:
     process.run()
 
 
-def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
+def tick(setup: RoleSetup, built: Built) -> None:
     _run(setup, Idle())
 
 
@@ -143,6 +142,6 @@ class StandsStill(Idle):
         threading.Event().wait()
 
 
-def stand_still(setup: RoleSetup, stop_when: StopWhen) -> None:
+def stand_still(setup: RoleSetup, built: Built) -> None:
     assert setup.run_dir is not None
     _run(setup, StandsStill(setup.run_dir / "stood still"))

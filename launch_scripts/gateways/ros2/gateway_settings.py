@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -15,9 +15,9 @@ from msgspec import Meta
 from launch_scripts.gateways.ros2 import topic_table
 from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
 from launch_scripts.gateways.ros2.ros_types import Distribution
-from swarm.config.explain import choice, explain
+from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.config.load import is_loopback
+from swarm.config.load import is_loopback, with_settings
 from swarm.config.setting_types import Metres, Name, Positive, Section
 from swarm.errors import ConfigError
 from swarm.wire.messages.planning import GROUND
@@ -200,16 +200,6 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
         return self.set_pose.replace(topic_table.TARGET, ros_name(target))
 
 
-EXAMPLE = IncomingSettings(
-    robots=(Robots(),),
-    targets=("ID",),
-    zones=(ZoneSettings(name="works", topic="/works"),),
-    grids=(GridSettings(name="seen", topic="/seen"),),
-    orders=True,
-)
-"""One of each, with the names that they have unless settings say otherwise."""
-
-
 class Settings(Section, frozen=True, kw_only=True):
     """Settings of `swarm gateway ros2`. An empty file is valid.
 
@@ -238,29 +228,6 @@ class Settings(Section, frozen=True, kw_only=True):
         return replace(row, topic=before + (changes.topic or row.topic), hz=changes.hz or row.hz)
 
 
-def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_table.TopicRow]:
-    """Returns all that these settings let in, and what robots get.
-
-    has_map  whether there is a map to be asked for
-    """
-    rows: list[topic_table.TopicRow] = []
-    for robots in settings.robots:
-        own: dict[str, dict[str, Any]] = {
-            "robot": {"topic": robots.topic, "type_name": topic_table.POSE_TYPES[robots.type], "hz": robots.hz},
-            "goal": {"topic": robots.goal},
-            "robot_goal": {"topic": robots.goal},
-            "robot_plan": {"topic": robots.plan},
-        }
-        for row in topic_table.ROBOT_TABLE:
-            named = replace(row, **own.get(row.name, {}))
-            rows.append(replace(named, topic=robots.own(named.topic)))
-    rows += [replace(topic_table.SET_POSE, topic=settings.set_pose_of(each)) for each in settings.targets]
-    rows += [replace(topic_table.ZONE, topic=each.topic) for each in settings.zones]
-    rows += [replace(topic_table.GRID, topic=each.topic) for each in settings.grids]
-    rows += topic_table.ORDER_TABLE if settings.orders else ()
-    return [*rows, topic_table.MAP_SERVER] if has_map and rows else rows
-
-
 def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
     """Reads and checks a file of settings, or none, and applies options over them. Raises ConfigError that names
     the file, or options, and the key.
@@ -275,63 +242,58 @@ def parse_settings(text: str, source: str = "settings", options: Mapping[str, ob
     """Like `load_settings`, from a text."""
     raw = parse_toml(text, source, ConfigError)
     said = {key: value for key, value in (options or {}).items() if value is not None}
-    for key, value in said.items():
-        section, _, name = key.rpartition(".")
-        inside = raw.setdefault(section, {}) if section else raw
-        if isinstance(inside, dict):
-            inside[name] = value
+    raw = with_settings(raw, said, source)
     source += " with options" if said else ""
-    try:
-        settings = msgspec.convert(raw, Settings)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {explain(str(error), raw, Settings)}") from error
-    check(settings, source)
+    settings = converted(raw, Settings, source)
+    for fault in _faults(settings):
+        raise ConfigError(f"{source}: {fault}")
     return settings
 
 
-def check(settings: Settings, source: str = "settings") -> None:
-    """Raises ConfigError on what no single key shows."""
+def _faults(settings: Settings) -> Iterator[str]:
+    """Faults which no single key shows. Nothing behind the first one is to be relied upon."""
+    known = tuple(topic_table.ROWS)
     for key, given in (("forward", settings.forward), ("topics", tuple(settings.topics))):
-        for name in given:
-            if name not in topic_table.ROWS:
-                raise ConfigError(
-                    f"{source}: {key}: no topic {name!r} in the table{choice(name, tuple(topic_table.ROWS))}"
-                )
-    for name, changes in settings.topics.items():
-        where, row = f"{source}: topics.{name}", topic_table.ROWS[name]
-        if changes.topic:
-            _check_topic(changes.topic, row.per, f"{where}.topic")
-        if changes.hz and row.hz is None:
-            raise ConfigError(f"{where}.hz: {name} is put when something changes, and has no rate")
-    topics = Counter(row.topic for row in settings.rows())
-    if doubled := [topic for topic, many in topics.items() if many > 1]:
-        raise ConfigError(f"{source}: topics: two topics are called {doubled[0]}; rename one")
-    if settings.frames.map == TERRAIN_FRAME:
-        raise ConfigError(
-            f"{source}: frames.map is {TERRAIN_FRAME!r}, which is the frame of the terrain's coordinates"
+        yield from (
+            f"{key}: no topic {name!r} in the table{choice(name, known)}" for name in given if name not in known
         )
-    check_incoming(settings.incoming, f"{source}: incoming")
-    _check_ros_endpoint(settings.ros, f"{source}: ros.endpoint")
+    for name, changes in settings.topics.items():
+        row = topic_table.ROWS[name]
+        if changes.topic:
+            yield from _topic_faults(changes.topic, row.per, f"topics.{name}.topic")
+        if changes.hz and row.hz is None:
+            yield f"topics.{name}.hz: {name} is put when something changes, and has no rate"
+    topics = Counter(row.topic for row in settings.rows())
+    yield from (f"topics: two topics are called {topic}; rename one" for topic, many in topics.items() if many > 1)
+    if settings.frames.map == TERRAIN_FRAME:
+        yield f"frames.map is {TERRAIN_FRAME!r}, which is the frame of the terrain's coordinates"
+    yield from (f"incoming: {fault}" for fault in _incoming_faults(settings.incoming))
+    ros = settings.ros
+    match = re.fullmatch(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", ros.endpoint)
+    if match is None or not 0 < int(match[2]) <= 65535:
+        yield f"ros.endpoint: {ros.endpoint!r} is not an endpoint such as {ROS_ENDPOINT}"
+    elif not ros.in_the_clear and not is_loopback(match[1].strip("[]")):
+        yield (
+            f"ros.endpoint: {ros.endpoint} leaves this machine in the clear, as ROS nodes do not encrypt: run "
+            "rmw_zenohd beside the gateway, or set ros.in_the_clear = true"
+        )
 
 
-def check_incoming(settings: IncomingSettings, source: str = "settings") -> None:
-    """Raises ConfigError on what no single key shows."""
+def _incoming_faults(settings: IncomingSettings) -> Iterator[str]:
     for n, robots in enumerate(settings.robots):
-        where = f"{source}: robots[{n}]"
-        if (topic_table.ROBOT in robots.topic) != (robots.id is None):
-            raise ConfigError(
-                f"{where}: topic is {robots.topic!r}, expected {topic_table.ROBOT} in it, or an id and none in it"
-            )
+        where, part = f"robots[{n}]", topic_table.ROBOT
+        if (part in robots.topic) != (robots.id is None):
+            yield f"{where}: topic is {robots.topic!r}, expected {part} in it, or an id and none in it"
         own = {key: robots.own(getattr(robots, key)) for key in ("topic", "plan", "goal")}
         if len(set(own.values())) < len(own):
-            raise ConfigError(f"{where}: topic, plan and goal are {', '.join(own.values())}, expected three topics")
+            yield f"{where}: topic, plan and goal are {', '.join(own.values())}, expected three topics"
         for key, topic in own.items():
-            _check_topic(topic, None if robots.id else topic_table.ROBOT, f"{where}.{key}")
+            yield from _topic_faults(topic, None if robots.id else part, f"{where}.{key}")
     drawn = [*((f"zones[{n}]", each.topic) for n, each in enumerate(settings.zones)),
              *((f"grids[{n}]", each.topic) for n, each in enumerate(settings.grids))]  # fmt: skip
     for area, topic in drawn:
-        _check_topic(topic, None, f"{source}: {area}.topic")
-    _check_topic(settings.set_pose, topic_table.TARGET, f"{source}: set_pose")
+        yield from _topic_faults(topic, None, f"{area}.topic")
+    yield from _topic_faults(settings.set_pose, topic_table.TARGET, "set_pose")
     robot_ids = [each.id for each in settings.robots if each.id]
     robot_topics = [each.topic for each in settings.robots]
     for key, names in {
@@ -340,11 +302,11 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
         "zones": [each.name for each in settings.zones],
         "topics": [*robot_topics, *map(settings.set_pose_of, settings.targets), *(topic for _, topic in drawn)],
     }.items():
-        if doubled := [name for name, many in Counter(names).items() if many > 1]:
-            raise ConfigError(f"{source}: {key}: {doubled[0]!r} is there twice, expected once")
+        counts = Counter(names).items()
+        yield from (f"{key}: {name!r} is there twice, expected once" for name, many in counts if many > 1)
 
 
-def _check_topic(topic: str, part: str | None, where: str) -> None:
+def _topic_faults(topic: str, part: str | None, where: str) -> Iterator[str]:
     """Zenoh refuses invalid topics: empty parts between slashes, a slash at the end.
 
     part  what must stand in it once, such as VEHICLE; None: nothing
@@ -352,18 +314,4 @@ def _check_topic(topic: str, part: str | None, where: str) -> None:
     plain = topic if part is None else topic.replace(part, "x", 1)
     if len(topic) > 200 or not _TOPIC.fullmatch(plain) or (part is not None and part not in topic):
         once = f", with {part} once" if part else ""
-        raise ConfigError(
-            f"{where} is {topic[:60]!r}, expected a topic such as /a/b, of letters, digits and _{once}"
-        )
-
-
-def _check_ros_endpoint(ros: RosSide, where: str) -> None:
-    """Raises ConfigError on an invalid endpoint, and on another machine unless that is allowed."""
-    match = re.fullmatch(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", ros.endpoint)
-    if match is None or not 0 < int(match[2]) <= 65535:
-        raise ConfigError(f"{where}: {ros.endpoint!r} is not an endpoint such as {ROS_ENDPOINT}")
-    if not ros.in_the_clear and not is_loopback(match[1].strip("[]")):
-        raise ConfigError(
-            f"{where}: {ros.endpoint} leaves this machine in the clear, as ROS nodes do not encrypt: run "
-            "rmw_zenohd beside the gateway, or set ros.in_the_clear = true"
-        )
+        yield f"{where} is {topic[:60]!r}, expected a topic such as /a/b, of letters, digits and _{once}"

@@ -179,11 +179,7 @@ def windows(grid: GridSpec, windows: Iterable[Window]) -> Drawing:
 
 
 def corners(points_m: Points) -> Points:
-    """A line without the points at which it goes straight on: float64 (n, 2) to float64 (at most n, 2)."""
-    if len(points_m) < 3:
-        return points_m
-    steps = np.diff(points_m, axis=0)
-    turns = steps[1:, 0] * steps[:-1, 1] != steps[1:, 1] * steps[:-1, 0]
-    back = (steps[1:] * steps[:-1]).sum(axis=1) <= 0  # or it stands
-    kept = np.concatenate([[True], turns | back, [True]])
-    return np.asarray(points_m[kept])
+    """A line without the points after which it goes on as before: float64 (n, 2) to float64 (at most n, 2)."""
+    kept = np.ones(len(points_m), np.bool_)
+    kept[1:-1] = np.diff(points_m, 2, axis=0).any(axis=1)
+    return points_m[kept]

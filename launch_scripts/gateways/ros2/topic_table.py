@@ -107,11 +107,14 @@ ORDER_TABLE: tuple[TopicRow, ...] = (
 )  # fmt: skip
 SET_POSE = TopicRow("set_pose", "/targets/{target}/set_pose", _POSE, Qos.DEFAULT, _IN, 10.0,
                     "Moves an external target.")  # fmt: skip
-ZONE = TopicRow("zone", "", "geometry_msgs/msg/PolygonStamped", Qos.LATCHED, _IN, 1.0,
+ZONE = TopicRow("zone", "/works", "geometry_msgs/msg/PolygonStamped", Qos.LATCHED, _IN, 1.0,
                 "Draws a zone; without corners it is removed.")  # fmt: skip
-GRID = TopicRow("grid", "", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _IN, 1.0, "Closes cells by marks.")
+GRID = TopicRow("grid", "/seen", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _IN, 1.0, "Closes cells by marks.")
 MAP_SERVER = TopicRow("map_server", "/map_server/map", "nav_msgs/srv/GetMap", Qos.DEFAULT, _SERVICE, None,
                       "The current map.")  # fmt: skip
+INCOMING = (*ROBOT_TABLE, SET_POSE, ZONE, GRID, *ORDER_TABLE, MAP_SERVER)
+"""All that the settings may let in, and what robots get. The topics of zones and grids are examples: settings name
+them."""
 POSE_TYPES = {
     "odometry": "nav_msgs/msg/Odometry",
     "pose": "geometry_msgs/msg/PoseStamped",

@@ -25,7 +25,7 @@ from launch_scripts.deploy.kits import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
 from launch_scripts.simulation.trials import MIX, SECONDS, Trial, code_version, parse_seeds, world_of
 from launch_scripts.simulation.worlds import WORLDS
-from swarm.config.explain import choice, explain
+from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
 from swarm.config.load import flat, parse_scenario
 from swarm.config.scenario import Scenario
@@ -114,11 +114,7 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
     name  of the study if the text gives none
     """
     raw: dict[str, Any] = {"name": name, **parse_toml(text, source, ConfigError)}
-    try:
-        study = msgspec.convert(raw, Study)
-    except msgspec.ValidationError as error:
-        sentence = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
-        raise ConfigError(f"{source}: {sentence}") from error
+    study = converted(raw, Study, source, "study")
     seeds = parse_seeds(study.seeds, f"{source}: seeds")
     if wrong := next(_faults(study, len(seeds)), None):
         raise ConfigError(f"{source}: {wrong}")

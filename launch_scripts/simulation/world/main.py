@@ -16,7 +16,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.role import RoleSetup
 
 
-def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+def run(setup: RoleSetup, built: Callable[[], None]) -> None:
     """Moves all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
     modules = Modules(WAY_MODULES)
     modules.there()  # they begin to load
@@ -29,4 +29,4 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         modules.wait()
         return TargetsService(setup, terrain, truth, bus, inbox.post)
 
-    run_role(setup, terrain.digest, stop_when, make, inbox, TICK_HZ)
+    run_role(setup, terrain.digest, built, make, inbox, TICK_HZ)

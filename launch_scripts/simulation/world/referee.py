@@ -34,64 +34,45 @@ _APART_NS = 2 * NS_PER_S
 several reports state one encounter."""
 
 
-@dataclass(frozen=True, slots=True)
-class Collision:
-    """Two vehicles on one cell at one time; reported once per encounter. `evidence` are the stays that overlap."""
-
-    first: str
-    second: str
-    cell: int
-    stamp_ns: int
-    evidence: tuple[Stay, Stay] = field(compare=False)
-
-    def sentence(self, began_ns: int) -> str:
-        """Returns the finding and the reports which prove it; times are since the run began."""
-        return f"{self.first} and {self.second} on one cell{_proven(self.evidence, began_ns)}"
+ALARMS = {
+    "collisions": "collision",
+    "driven_into": "obstacle-collision",
+    "hit_by_obstacles": "obstacle-collision",
+    "lethal_entries": "lethal-entry",
+}
+"""Count of broken laws -> kind of the alarm about each."""
 
 
 @dataclass(frozen=True, slots=True)
-class LethalEntry:
-    """A vehicle entered a cell which is lethal in truth to its class."""
+class Broken:
+    """Two on one cell at one time, or a vehicle on a cell which is lethal in truth to its class. An encounter is
+    reported once.
 
-    vehicle: str
-    cell: int
-    stamp_ns: int
-    evidence: tuple[Stay] = field(compare=False)
-
-    def sentence(self, began_ns: int) -> str:
-        """Returns the finding and the report which proves it."""
-        return f"{self.vehicle} entered a lethal cell{_proven(self.evidence, began_ns)}"
-
-
-@dataclass(frozen=True, slots=True)
-class ObstacleHit:
-    """A vehicle and an obstacle on one cell at one time; reported once per encounter.
-
-    by_vehicle  the vehicle is at fault: it entered the cell, though the obstacle had closed it in time
-    closed_s    how long the obstacle had closed the cell when the vehicle entered it; negative if the vehicle was
-                first
+    count     a key of `ALARMS`: vehicles that met, that drove into an obstacle which had closed the cell in time,
+              that an obstacle hit by its own fault, or that entered a lethal cell
+    vehicles  one, or two with a blank between them
+    found     the finding in words
+    evidence  the stays which prove it, and where an obstacle was
     """
 
-    vehicle: str
-    obstacle: str
+    count: str
+    vehicles: str
     cell: int
     stamp_ns: int
-    by_vehicle: bool
-    closed_s: float
-    evidence: tuple[Stay, Cover] = field(compare=False)
+    found: str
+    evidence: tuple[Stay | Cover, ...] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
-        """Returns the finding and the reports which prove it."""
-        if self.by_vehicle:
-            found = f"{self.vehicle} drove into obstacle {self.obstacle}, known for {self.closed_s:.1f} s"
-        elif self.closed_s < 0.0:
-            found = f"obstacle {self.obstacle} drove into {self.vehicle}, which was there first"
-        else:
-            found = f"obstacle {self.obstacle} met {self.vehicle} {self.closed_s:.2f} s after its first report"
-        return found + _proven(self.evidence, began_ns)
+        """Returns the finding, and the reports which prove it: when each was on the cell, in seconds since the run
+        began, and the reports' numbers and key. A recording of the run has them."""
 
+        def on_cell(each: Stay | Cover) -> str:
+            begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
+            reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
+            name = each.vehicle if isinstance(each, Stay) else f"obstacle {each.obstacle}"
+            return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
 
-Broken = Collision | LethalEntry | ObstacleHit
+        return f"{self.found}: {' and '.join(map(on_cell, self.evidence))}"
 
 
 @dataclass(slots=True, eq=False)
@@ -117,19 +98,6 @@ class Stay:
     def key(self) -> str:
         """The key of the reports, below the namespace."""
         return FLEET.below({"region": str(self.region), "author": self.author})
-
-
-def _proven(evidence: tuple[Stay | Cover, ...], began_ns: int) -> str:
-    """Returns when each was on the cell, in seconds since the run began, and the reports that say so: their numbers
-    and their key. A recording of the run has them."""
-
-    def on_cell(each: Stay | Cover) -> str:
-        begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
-        reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
-        name = each.vehicle if isinstance(each, Stay) else f"obstacle {each.obstacle}"
-        return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
-
-    return f": {' and '.join(map(on_cell, evidence))}"
 
 
 def _started_ns(author: str) -> int:
@@ -234,9 +202,11 @@ class Referee:
         self._vehicles[entered.vehicle] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
         if not truth.item(entered.cell) < math.inf:
-            broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns, (replace(entered),)))
+            who = entered.vehicle
+            said, evidence = f"{who} entered a lethal cell", (replace(entered),)
+            broken.append(Broken("lethal_entries", who, entered.cell, fleet.stamp_ns, said, evidence))
 
-    def _meetings(self, stay: Stay) -> Iterator[Collision | ObstacleHit]:
+    def _meetings(self, stay: Stay) -> Iterator[Broken]:
         yield from self._obstacles.check(stay)
         for other in self._stays.get(stay.cell, ()):
             overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
@@ -246,7 +216,8 @@ class Referee:
             first, second = both[0].vehicle, both[1].vehicle
             until_ns = min(stay.end_ns, other.end_ns)
             if _is_new(self._encounters, (first, second), until_ns):
-                yield Collision(first, second, stay.cell, until_ns, (replace(both[0]), replace(both[1])))
+                evidence, said = (replace(both[0]), replace(both[1])), f"{first} and {second} on one cell"
+                yield Broken("collisions", f"{first} {second}", stay.cell, until_ns, said, evidence)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
@@ -346,18 +317,22 @@ class ObstacleReferee:
         """The cells on which an obstacle was lately: a live view."""
         return self._covers
 
-    def check(self, stay: Stay) -> Iterator[ObstacleHit]:
+    def check(self, stay: Stay) -> Iterator[Broken]:
         """Returns violations proven by a vehicle's stay on a cell."""
         for cover in self._covers.get(stay.cell, ()):
             end_ns = min(stay.end_ns, cover.end_ns)
             if end_ns - max(stay.begin_ns, cover.begin_ns) <= _LATE_NS:
                 continue
             if _is_new(self._met, (stay.vehicle, cover.obstacle), end_ns):
-                said_ns = stay.since_ns - cover.closed_ns
-                by_vehicle, evidence = said_ns >= IN_TIME_NS, (replace(stay), replace(cover))
-                yield ObstacleHit(
-                    stay.vehicle, cover.obstacle, stay.cell, end_ns, by_vehicle, said_ns / NS_PER_S, evidence
-                )
+                closed_ns, count = stay.since_ns - cover.closed_ns, "hit_by_obstacles"
+                closed_s, obstacle, vehicle = closed_ns / NS_PER_S, f"obstacle {cover.obstacle}", stay.vehicle
+                if closed_ns >= IN_TIME_NS:
+                    count, found = "driven_into", f"{vehicle} drove into {obstacle}, known for {closed_s:.1f} s"
+                elif closed_ns < 0:
+                    found = f"{obstacle} drove into {vehicle}, which was there first"
+                else:
+                    found = f"{obstacle} met {vehicle} {closed_s:.2f} s after its first report"
+                yield Broken(count, vehicle, stay.cell, end_ns, found, (replace(stay), replace(cover)))
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""

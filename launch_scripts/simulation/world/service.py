@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.simulation.world.referee import Collision, LethalEntry, ObstacleHit
+from launch_scripts.simulation.world.referee import ALARMS, Broken
 from launch_scripts.simulation.world.targets import Action, Captured, TargetWorld
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
@@ -97,7 +97,7 @@ class TargetsService:
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places of its targets", lambda: self._world.ready)
         self.counters = self._member.counters
-        for name in ("captures", "collisions", "driven_into", "hit_by_obstacles", "lethal_entries", "poses"):
+        for name in ("captures", *ALARMS, "poses"):
             self.counters.count(name, 0)
 
     def lacks(self) -> list[str]:
@@ -192,19 +192,11 @@ class TargetsService:
                     self.counters.count_by(CAPTURES_OF, target)
                     self.counters.count_by(CAPTURES_BY, vehicle)
                     self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell, target=target)
-                case Collision(first, second, cell):
-                    self.counters.count("collisions")
-                    self._alarm("collision", f"{first} {second}", action.sentence(self._began_ns), cell, now_ns)
                 case Obstacle():
                     self._bus.publish(OBSTACLE, action, id=action.id)
-                case ObstacleHit(cell=cell, by_vehicle=by_vehicle):
-                    self.counters.count("driven_into" if by_vehicle else "hit_by_obstacles")
-                    self._alarm("obstacle-collision", action.vehicle, action.sentence(self._began_ns), cell, now_ns)
-                case LethalEntry(vehicle, cell):
-                    self.counters.count("lethal_entries")
-                    self._alarm("lethal-entry", vehicle, action.sentence(self._began_ns), cell, now_ns)
-
-    def _alarm(self, kind: str, about: str, text: str, cell: int, now_ns: int) -> None:
-        """Something happened that must not: to the log of who watches now, and to those who come late."""
-        self._member.note(now_ns, kind, text, cell)
-        self._member.alarms.happened(kind, about, text, now_ns, cell)
+                case Broken(count=count, vehicles=vehicles, cell=cell):
+                    self.counters.count(count)
+                    kind, text = ALARMS[count], action.sentence(self._began_ns)
+                    # To the log of who watches now, and to those who come late.
+                    self._member.note(now_ns, kind, text, cell)
+                    self._member.alarms.happened(kind, vehicles, text, now_ns, cell)

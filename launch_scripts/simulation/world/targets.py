@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.simulation.world.referee import Collision, LethalEntry, ObstacleHit, Referee
+from launch_scripts.simulation.world.referee import Broken, Referee
 from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.walks import (
     Budget,
@@ -64,7 +64,7 @@ class Captured:
     cell: int
 
 
-Action = TargetPose | Captured | Collision | LethalEntry | ObstacleHit | Obstacle
+Action = TargetPose | Captured | Broken | Obstacle
 
 
 @dataclass(eq=False)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover import photo_rules as rules
 from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
-from swarm.config.explain import explain
+from swarm.config.explain import converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.setting_types import ClassName, Point, Polygon, Section
 from swarm.errors import TerrainError
@@ -314,10 +313,7 @@ def read_labels(path: Path, grid: GridSpec) -> Labels:
         one class.
     """
     raw = parse_toml(read_text(path, FileKind.LABELS), f"labels {path}", TerrainError)
-    try:
-        found = msgspec.convert(raw, _File)
-    except msgspec.ValidationError as error:
-        raise TerrainError(f"labels {path}: {explain(str(error), raw, _File, 'labels')}") from error
+    found = converted(raw, _File, f"labels {path}", "labels", TerrainError)
     classes = np.zeros((grid.rows, grid.cols), np.uint8)
     groups = np.full((grid.rows, grid.cols), -1, np.int32)
     count = 0

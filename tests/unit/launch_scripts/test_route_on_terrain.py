@@ -106,6 +106,9 @@ def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Pa
     with sqlite3.connect(tmp_path / "way.gpkg") as database:
         assert database.execute("PRAGMA user_version").fetchall() == [(10200,)]
         names = database.execute("SELECT srs_name FROM gpkg_spatial_ref_sys").fetchall()
+        told = str(database.execute("SELECT description FROM gpkg_contents").fetchall())
+    assert "seconds of travel" in told
+    assert "lower_bound_s: proven" in told
     assert ("unknown",) not in names
 
 

@@ -265,7 +265,7 @@ def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
             whole = bytearray((tmp_path / "pace.npy").read_bytes())
             whole[-1] ^= 1
             (tmp_path / "pace.npy").write_bytes(whole)
-        assert fetched_terrain.fetch_if_missing(scenario, tmp_path, [info], roles=["agent"])
+        fetched_terrain.fetch_if_missing(scenario, tmp_path, [info], roles=["agent"])
         assert len(fetched) == expected
     found = load_prepared(tmp_path)
     assert np.array_equal(found.pace_s_per_m, TERRAIN.pace_s_per_m)
