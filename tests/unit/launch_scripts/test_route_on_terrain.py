@@ -14,6 +14,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 from support import slow_twins as naive
+from support.height_models import written
 from typer.testing import CliRunner
 
 from launch_scripts.commands.ask_commands import app
@@ -44,12 +45,7 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heights = np.repeat(np.maximum(400.0 - 40.0 * across, 100.0)[None], 60, axis=0)
     heights[50:] = 100.0
     heights += np.random.default_rng(1).uniform(0, 0.5, heights.shape)
-    place = from_origin(ALPS.west_m, ALPS.north_m, 20, 20)
-    with rasterio.open(
-        path, "w", driver="GTiff", height=60, width=80, count=1, dtype="float32", crs=SYSTEM, transform=place
-    ) as file:
-        file.write(heights.astype(np.float32), 1)
-    return path
+    return written(path, heights, crs=SYSTEM, transform=from_origin(ALPS.west_m, ALPS.north_m, 20, 20))
 
 
 def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path) -> None:
