@@ -14,11 +14,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 from support import slow_twins as naive
+from support.command import Swarm
 from support.height_models import written
-from typer.testing import CliRunner
 
-from launch_scripts.commands.ask_commands import app
-from launch_scripts.commands.terrain_commands import app as terrain_app
 from launch_scripts.commands.terrain_routes import (
     DescribedRoute,
     corridor,
@@ -48,7 +46,7 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(path, heights, crs=SYSTEM, transform=from_origin(ALPS.west_m, ALPS.north_m, 20, 20))
 
 
-def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path) -> None:
+def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
     route = find_route(str(hill), "cell:10,5", "cell:10,75")
     assert (route.cells // route.grid.cols).max() >= 50
     assert route.gap == pytest.approx(1, abs=1e-3)
@@ -56,9 +54,10 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
     assert route.at_m[-1] == pytest.approx(route.length_m, rel=1e-6)
     assert (np.diff(route.at_s) > 0).all()
     for ending in ("geojson", "gpkg", "gpx", "kml", "csv", "png"):
-        line = f"route --terrain {hill} --from cell:10,5 --to cell:10,75 --out {tmp_path}/way.{ending} --json"
-        result = CliRunner().invoke(app, line.split(), catch_exceptions=False)
-        assert result.exit_code == 0, result.output
+        told = swarm(
+            f"route --terrain {hill} --from cell:10,5 --to cell:10,75 --out {tmp_path}/way.{ending} --json"
+        )
+        assert told[0] == 0, told
     many = len(route.at_m)
     (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
     lon, lat, height_m = feature["geometry"]["coordinates"][0]
@@ -102,7 +101,7 @@ def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Pa
     assert ("unknown",) not in names
 
 
-def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
+def test_what_cannot_be_is_said_in_a_sentence(hill: Path, swarm: Swarm) -> None:
     with pytest.raises(
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
@@ -112,20 +111,15 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
             find_route(str(hill), start, end)
         nearest = str(told.value).split("reached is ")[1].split()[0]
         assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
-    for words, complaint in (
-        (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
-        (["--from", "cell:1,1"], "give --from, and --target or --to"),
-    ):
-        result = CliRunner().invoke(app, ["route", *words])
-        assert isinstance(result.exception, SwarmError)
-        assert complaint in str(result.exception)
+    assert "give --from and --to" in swarm("route --from cell:1,1 --terrain", hill)[2]
+    assert "give --from, and --target or --to" in swarm("route --from cell:1,1")[2]
 
 
-def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(hill: Path, tmp_path: Path) -> None:
-    words = [str(hill), "--to", "cell:10,75", "--out"]
-    said = (
-        CliRunner().invoke(terrain_app, ["reach", *words, str(tmp_path / "s.tif")], catch_exceptions=False).output
-    )
+def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(
+    hill: Path, tmp_path: Path, swarm: Swarm
+) -> None:
+    line = f"terrain reach {hill} --to cell:10,75 --out {tmp_path}"
+    _, said, _ = swarm(f"{line}/s.tif")
     assert "from 8" in said or "from 9" in said
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
@@ -133,19 +127,16 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
     assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0
-    areas = [*words, str(tmp_path / "a.geojson"), "--every-s", "60", "--json"]
-    CliRunner().invoke(terrain_app, ["reach", *areas], catch_exceptions=False)
+    swarm(f"{line}/a.geojson --every-s 60 --json")
     features = json.loads((tmp_path / "a.geojson").read_text())["features"]
     assert max(each["properties"]["to_s"] for each in features) >= seconds.max()
     lon, lat = features[0]["geometry"]["coordinates"][0][0]
     assert (lat, lon) == pytest.approx((46.95, 9.0), abs=0.05)
-    with pytest.raises(SwarmError, match="areas, at most 200"):
-        CliRunner().invoke(terrain_app, ["reach", *areas[:-2], "0.001"], catch_exceptions=False)
-    with pytest.raises(SwarmError, match="--to is on lethal ground"):
-        CliRunner().invoke(terrain_app, ["reach", str(hill), "--to", "cell:10,35"], catch_exceptions=False)
+    assert "areas, at most 200" in swarm(f"{line}/a.geojson --every-s 0.001")[2]
+    assert "--to is on lethal ground" in swarm(f"terrain reach {hill} --to cell:10,35")[2]
 
 
-def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path) -> None:
+def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
     """Against all cheapest ways there and on, by their slow twin. Ways from a cell are ways to it turned round, on
     which a step has the pace of the cell that it leaves."""
     best = find_route(str(hill), "cell:20,5", "cell:30,75")
@@ -159,10 +150,9 @@ def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path:
     assert (truth[inside] <= best.cost_s * 1.1 + 1e-3).all()
     assert inside.reshape(-1)[best.cells].all()
     assert inside.sum() >= 0.95 * (truth <= best.cost_s * 1.1).sum() > 300
-    line = f"reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
+    line = f"terrain reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
     for more, fewest, most in ("", 3, 6), (" --every-s 5", 3, 99):
-        said = CliRunner().invoke(terrain_app, (line + more).split(), catch_exceptions=False).output
-        assert f"the best takes {best.cost_s:.0f} s" in said
+        assert f"the best takes {best.cost_s:.0f} s" in swarm(line + more)[1]
         features = json.loads((tmp_path / "c.geojson").read_text())["features"]
         bands = {each["properties"]["from_s"] for each in features}
         assert min(bands) == 0
@@ -208,11 +198,12 @@ def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
         write_route(site, tmp_path / "way.kml")
 
 
-def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(hill: Path, tmp_path: Path) -> None:
-    words = ["route", "--terrain", str(hill), "--from", "cell:55,5", "--to", "cell:55,5", "--out"]
+def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(
+    hill: Path, tmp_path: Path, swarm: Swarm
+) -> None:
     for ending in ("geojson", "kml"):
-        told = CliRunner().invoke(app, [*words, str(tmp_path / f"way.{ending}")]).stdout
-        assert "at most 0.00% above the optimum" in told
+        line = f"route --terrain {hill} --from cell:55,5 --to cell:55,5 --out {tmp_path}/way.{ending}"
+        assert "at most 0.00% above the optimum" in swarm(line)[1]
     (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
     first, last = feature["geometry"]["coordinates"]
     assert first == last
