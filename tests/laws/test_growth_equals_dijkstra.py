@@ -18,10 +18,6 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
 
-def test_a_thousand_random_grids_equal_dijkstra() -> None:
-    random_grids(1000, 1, 30)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("grids", [2_000, pytest.param(10_000, marks=pytest.mark.thorough)])
 def test_random_grids_equal_dijkstra(grids: int) -> None:

@@ -17,17 +17,23 @@ from support.live_swarm import LiveSwarm, client, swarm
 from support.processes import eventually
 
 from launch_scripts.launcher.takeover import processes
+from shared_map.learning.learned_factors import name_of
+from shared_map.learning.measurements import ONE, Measurement
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import beyond_region, beyond_tile
 from swarm.bus.bus import Heard
 from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.run_secret import state_folder
 from swarm.wire.fields import column
-from swarm.wire.topics import FLEET
+from swarm.wire.topics import FLEET, MARKS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 
 OPTIONS = ("--no-live",)
+ALSO = "\n[map]\nlearning = true\n"
 
 
 def order(live: LiveSwarm, *words: object, code: int = 0) -> Any:
@@ -209,3 +215,20 @@ def test_settings_and_stops_are_obeyed(live: LiveSwarm) -> None:
     order(live, "vehicle", "start", "a0-00")
     order(live, "unset", "time_scale")
     assert "no orders" in swarm("order", "ls", "--connect", live.endpoint).stdout
+
+
+def test_a_running_swarm_says_what_was_learned(live: LiveSwarm) -> None:
+    grid = GridSpec(96, 128, 30.0)
+    kind = {65: Measurement(400, ONE, ONE // 10)}
+    (word,) = MapReplica(grid, author="all.x1.1").write_learned(kind, time.time_ns())
+
+    def told() -> list[dict[str, Any]]:
+        bus.publish(MARKS, word, region=beyond_region(grid), tile=beyond_tile(grid), author="all.x1.1")
+        done = swarm("marks", "factors", "--connect", live.endpoint, "--json")
+        kinds = json.loads(done.stdout)["kinds"] if done.returncode == 0 else []
+        return [each for each in kinds if each["kind"] == name_of(65)]
+
+    with client(live.network) as bus:
+        eventually(told, 30, "the keeper")
+        (row,) = told()
+    assert (row["cells"], row["authors"]) == (400, 1)

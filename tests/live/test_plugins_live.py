@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import folders_of_runs, swarm, write_scenario
-from support.plugin_pages import write_all_examples
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -41,28 +40,11 @@ def scenario(folder: Path, **changes: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"vehicles": "sensor = 'failing:Hang'"}, "vehicles.sensor: 'failing:Hang': no 'Hang' in "),
-        pytest.param(
-            {"targets": "walk = 'failing:Hangs'"},
-            "targets[0].walk: walk plug-in 'failing:Hangs' has no method choose",
-            marks=pytest.mark.thorough,
-        ),
-        pytest.param(
-            {"also": "[[cost.layers]]\nlayer = 'failing:Silent'"},
-            "has no method cost, found Silent",
-            marks=pytest.mark.thorough,
-        ),
-    ],
-)
-def test_what_cannot_be_made_is_refused_in_one_sentence(
-    tmp_path: Path, changes: dict[str, str], sentence: str
-) -> None:
-    told = swarm("up", scenario(tmp_path, **changes), "--runs", tmp_path / "runs", "--plain", timeout_s=100)
+def test_what_cannot_be_made_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = scenario(tmp_path, vehicles="sensor = 'failing:Hang'")
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--plain", timeout_s=100)
     assert told.returncode == 2, told.stdout + told.stderr
-    assert sentence in told.stderr
+    assert "vehicles.sensor: 'failing:Hang': no 'Hang' in " in told.stderr
     assert told.stderr.count("\n") == 1
     assert "Traceback" not in told.stdout + told.stderr
 
@@ -89,31 +71,3 @@ def test_a_swarm_all_whose_plugins_fail_names_each_and_goes_on(tmp_path: Path) -
     numbers = json.loads((run_dir / "report.json").read_text())
     assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
     assert numbers["restarts"] == 0
-
-
-ALL = """
-time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 96
-cols = 128
-[terrain.hidden]
-rubble_fields = 5
-[[groups]]
-vehicles = 12
-"""
-
-
-@pytest.mark.thorough
-def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
-    path = write_all_examples(tmp_path, write_scenario(tmp_path, text=ALL).read_text())
-    assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6
-    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 8, "--plain", timeout_s=110)
-    said = told.stdout + told.stderr
-    assert told.returncode == 0, said
-    assert "plug-in" not in said
-    (run_dir,) = folders_of_runs(tmp_path / "runs")
-    numbers = json.loads((run_dir / "report.json").read_text())
-    assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
-    assert numbers["marks"] > 0
-    assert all("plugin_failed" not in log.read_text() for log in run_dir.glob("*.log"))

@@ -38,17 +38,6 @@ def test_a_crowd_with_certificates_and_every_fault_flows(seed):
     assert simulation.report(SECONDS)["captures"] > 5
 
 
-@pytest.mark.seeds(3)
-def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
-    """The settings of the dense runs in which two vehicles met."""
-    scenario, terrain = crowd("open", seed, vehicles=24, per_agent=3, side=16)
-    crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{(5 * n + seed) % 8}") for n in range(10))
-    simulation = Simulation(scenario, faults=FaultPlan(jitter_ms=20, crashes=crashes), terrain=terrain)
-    laws = LawBook(simulation)
-    simulation.run_until(14.0)
-    assert laws.collisions == laws.lethal == []
-
-
 @pytest.mark.seeds(4)
 def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
     """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""

@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from support.simulated import agents, vehicles
+from support.simulated import agents
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
@@ -47,16 +47,6 @@ def test_nobody_meets_where_shards_are_larger_than_regions(seed):
     cores = [service._right_of_way.core for service in agents(simulation).values()]
     assert {core.shards.count for core in cores} == {2}  # 280 x 800 cells
     assert {shard for core in cores for shard in core.holdings.shards} <= set(cores[0].shards.all)
-
-
-def test_agents_that_drove_alone_and_died_are_not_driven_into():
-    crashes = tuple(Crash(3 + 1.1 * n, f"agent-a{(3 * n) % 8}") for n in range(12))
-    plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=17, crashes=crashes)
-    simulation = Simulation(seeded(7, WIDE), faults=plan)
-    laws = LawBook(simulation)
-    simulation.run_until(SECONDS)
-    assert laws.collisions == laws.lethal == []
-    assert len(vehicles(simulation)) == 24
 
 
 def test_agents_that_begin_while_they_are_cut_off_find_all_their_vehicles_afterwards():

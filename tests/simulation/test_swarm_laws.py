@@ -92,20 +92,6 @@ def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_v
     assert laws.collisions == []
 
 
-def test_a_planner_killed_under_way_serves_routes_again_within_three_seconds():
-    simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(8, "planner-t0"),)))
-    laws = LawBook(simulation)
-    simulation.run_until(8 - 0.001)
-    simulation.run_until(11)
-    service = simulation.nodes["planner-t0"].service
-    assert service.counters.counts["routes_served"] > 0
-    simulation.run_until(14)
-    simulation.finish()
-    assert simulation.report(14)["lost"] == 0
-    assert simulation.report(14)["restarts"] == 1
-    assert laws.collisions == []
-
-
 def test_targets_that_evade_jump_or_stand_still_are_caught():
     """Every walk at once, in one small world."""
     walks = ("still", "random", "waypoints", "evade")

@@ -146,9 +146,6 @@ class Routed:
         """True if all vehicles were reported on a route after that time, by the monotonic clock."""
         return sum(last_s > began_s for last_s in dict(self._last_s).values()) == VEHICLES
 
-    def any_since(self, began_s: float) -> bool:
-        return any(last_s > began_s for last_s in dict(self._last_s).values())
-
     def again(self, within_s: float) -> float:
         """Waits until all are on a route from now on. Returns how long that took, s."""
         began_s = time.monotonic()

@@ -155,7 +155,7 @@ class Hands:
         self.network = load_scenario(self.path).network
         self.started: list[subprocess.Popen[str]] = []
 
-    def start(self, *arguments: str, runs: Path | None = None, own_session: bool = False) -> subprocess.Popen[str]:
+    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
         name = "-".join(arguments[:3]).replace("/", "_")
         with (self.folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
@@ -163,7 +163,6 @@ class Hands:
                 stdout=log,
                 stderr=log,
                 text=True,
-                start_new_session=own_session,
             )
         self.started.append(process)
         return process

@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.command import Swarm
 from support.map_strategies import GRID, set_of
-from typer.testing import CliRunner
 
-from launch_scripts.commands.map_commands import app
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.measurements import Measurement
 from shared_map.replication.replica import MapReplica
-from swarm.errors import SwarmError
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
@@ -34,40 +32,38 @@ def listed(path: Path) -> list[dict[str, Any]]:
     return json.loads(path.read_text())["sets"]
 
 
-def test_every_set_is_exported_and_inspected_on_the_command_line(tmp_path: Path) -> None:
+def test_every_set_is_exported_and_inspected_on_the_command_line(tmp_path: Path, swarm: Swarm) -> None:
     store, out = stored(tmp_path / "map.sqlite", SETS), tmp_path / "map.json"
-    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert swarm("marks export", store, out)[0] == 0
     assert [(each["author"], each["tile"], each["seq"], each["marks"]) for each in listed(out)] == [
         ("a1.1", 0, 3 * SEQ_STEP, [[0, 5, "lethal", None, 10], [0, 6, "pace", 2.5, 11]]),
         ("a2.1", 0, SEQ_STEP, [[0, 6, "clear", None, 12]]),
         ("a2.1", 4, 9 * SEQ_STEP, []),
     ]
-    found = json.loads(CliRunner().invoke(app, ["show", str(store), "--json"]).output)
+    found = json.loads(swarm("marks show --json", store)[1])
     assert (found["marks"], found["sets"], found["cells_with_marks"], found["cells_lethal"]) == (3, 3, 2, 1)
     assert found["authors"]["a2.1"] == {"sets": 2, "marks": 1, "tombstones": 1}
-    assert "3 marks in 3 sets" in CliRunner().invoke(app, ["show", str(store)]).output
+    assert "3 marks in 3 sets" in swarm("marks show", store)[1]
 
 
-def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path) -> None:
+def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path, swarm: Swarm) -> None:
     store, out = tmp_path / "map.sqlite", tmp_path / "map.json"
     with KeeperStore(store) as kept:
         kept.bind("fedcba9876543210", GRID, ["walker", "truck"])
         kept.save([set_of("a1.1", GRID.tile_for(0, 2), 3, {5: (LETHAL, 0, 10)}), SETS[0]])
-    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert swarm("marks export", store, out)[0] == 0
     assert json.loads(out.read_text())["classes"] == ["walker", "truck"]
     assert [each["tile"] for each in listed(out)] == [0, GRID.tile_for(0, 2)]
-    pixels = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "map.tif")]).output
-    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in pixels.replace(
-        "\n", " "
-    )
+    _, pixels, _ = swarm("marks export", store, tmp_path / "map.tif")
+    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in " ".join(pixels.split())
 
 
-def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:
+def test_a_geotiff_says_where_and_what(tmp_path: Path, swarm: Swarm) -> None:
     import rasterio
 
     store = stored(tmp_path / "map.sqlite", SETS)
     out = tmp_path / "map.tif"
-    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert swarm("marks export", store, out)[0] == 0
     with rasterio.open(out) as tiff:
         assert (tiff.height, tiff.width, tiff.transform.a) == (GRID.rows, GRID.cols, GRID.resolution_m)
         assert np.isinf(tiff.read(1)[0, 5])
@@ -75,16 +71,10 @@ def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:
         assert tiff.tags()["terrain"] == "fedcba9876543210"
 
 
-def complaint(arguments: list[str]) -> str:
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, SwarmError), result.output
-    return str(result.exception)
-
-
-def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
+def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path, swarm: Swarm) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
-    assert ": write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.gpx")])
-    assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
+    assert ": write .json or .tif" in swarm("marks export", store, tmp_path / "map.gpx")[2]
+    assert "cannot write" in swarm("marks export", store, tmp_path / "no" / "map.json")[2]
 
 
 def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
@@ -92,27 +82,27 @@ def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
     return replica.write_learned(dict(enumerate(said)), 1)
 
 
-def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
+def test_what_is_learned_counts_as_no_mark(tmp_path: Path, swarm: Swarm) -> None:
     store = stored(tmp_path / "map.sqlite", [*SETS, *learned_sets("all.a1.1", Measurement(400, 72_000, 6_500))])
-    found = json.loads(CliRunner().invoke(app, ["show", str(store), "--json"]).stdout)
+    found = json.loads(swarm("marks show --json", store)[1])
     assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
     assert found["authors_that_learned"] == ["all.a1.1"]
-    told = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "marks.json")]).stdout
+    told = swarm("marks export", store, tmp_path / "marks.json")[1]
     assert told.endswith("3 marks in 3 sets, and what 1 authors have learned\n")
 
 
-def test_what_is_learned_is_exported_and_shown(tmp_path: Path) -> None:
+def test_what_is_learned_is_exported_and_shown(tmp_path: Path, swarm: Swarm) -> None:
     words = [
         *learned_sets("all.a1.1", Measurement(400, 72_000, 6_500)),
         *learned_sets("all.a2.1", Measurement(9, 70_000, 0), Measurement(1, 0, 7)),
     ]
     store, out = stored(tmp_path / "map.sqlite", [*SETS, *words]), tmp_path / "marks.json"
-    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert swarm("marks export", store, out)[0] == 0
     assert [each["learned"] for each in listed(out) if each["tile"] == GRID.tiles] == [
         [[0, "unknown 0-5", 400, 72_000, 6_500]],
         [[0, "unknown 0-5", 9, 70_000, 0], [1, "unknown 5-10", 1, 0, 7]],
     ]
-    (row, *_) = json.loads(CliRunner().invoke(app, ["factors", str(store), "--json"]).stdout)["kinds"]
+    (row, *_) = json.loads(swarm("marks factors --json", store)[1])["kinds"]
     assert (row["kind"], row["cells"], row["authors"]) == ("unknown 0-5", 409, 2)
     assert 2.5 < row["factor"] <= row["measured"] < 3.1
-    assert "unknown 5-10" in CliRunner().invoke(app, ["factors", str(store)]).stdout
+    assert "unknown 5-10" in swarm("marks factors", store)[1]

@@ -74,14 +74,12 @@ def free_port(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
 
 
 def photo(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
-    import rasterio
     from rasterio.transform import from_origin
+    from support.height_models import written
 
     pixels = np.random.default_rng(1).integers(0, 255, (3, 24, 24), np.uint8)
-    shape = {"height": 24, "width": 24, "count": 3, "dtype": "uint8", "photometric": "RGB"}
-    place = {"crs": "EPSG:32632", "transform": from_origin(400000, 5000000, 10, 10)}
-    with rasterio.open(folder / "photo.tif", "w", driver="GTiff", **shape, **place) as file:
-        file.write(pixels)
+    place = from_origin(400000, 5000000, 10, 10)
+    written(folder / "photo.tif", pixels, "uint8", photometric="RGB", transform=place)
     return {}
 
 

@@ -5,7 +5,6 @@ import json
 import re
 import sqlite3
 from datetime import datetime
-from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,14 +12,11 @@ import numpy as np
 import pyogrio
 import pytest
 import rasterio
-from numpy.typing import NDArray
 from rasterio.transform import from_origin
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
-from typer.testing import CliRunner
+from support import slow_twins as naive
+from support.command import Swarm
+from support.height_models import written
 
-from launch_scripts.commands.ask_commands import app
-from launch_scripts.commands.terrain_commands import app as terrain_app
 from launch_scripts.commands.terrain_routes import (
     DescribedRoute,
     corridor,
@@ -47,15 +43,10 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heights = np.repeat(np.maximum(400.0 - 40.0 * across, 100.0)[None], 60, axis=0)
     heights[50:] = 100.0
     heights += np.random.default_rng(1).uniform(0, 0.5, heights.shape)
-    place = from_origin(ALPS.west_m, ALPS.north_m, 20, 20)
-    with rasterio.open(
-        path, "w", driver="GTiff", height=60, width=80, count=1, dtype="float32", crs=SYSTEM, transform=place
-    ) as file:
-        file.write(heights.astype(np.float32), 1)
-    return path
+    return written(path, heights, crs=SYSTEM, transform=from_origin(ALPS.west_m, ALPS.north_m, 20, 20))
 
 
-def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path) -> None:
+def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
     route = find_route(str(hill), "cell:10,5", "cell:10,75")
     assert (route.cells // route.grid.cols).max() >= 50
     assert route.gap == pytest.approx(1, abs=1e-3)
@@ -63,9 +54,10 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
     assert route.at_m[-1] == pytest.approx(route.length_m, rel=1e-6)
     assert (np.diff(route.at_s) > 0).all()
     for ending in ("geojson", "gpkg", "gpx", "kml", "csv", "png"):
-        line = f"route --terrain {hill} --from cell:10,5 --to cell:10,75 --out {tmp_path}/way.{ending} --json"
-        result = CliRunner().invoke(app, line.split(), catch_exceptions=False)
-        assert result.exit_code == 0, result.output
+        told = swarm(
+            f"route --terrain {hill} --from cell:10,5 --to cell:10,75 --out {tmp_path}/way.{ending} --json"
+        )
+        assert told[0] == 0, told
     many = len(route.at_m)
     (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
     lon, lat, height_m = feature["geometry"]["coordinates"][0]
@@ -112,15 +104,7 @@ def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Pa
     assert ("unknown",) not in names
 
 
-def test_the_bands_of_a_corridor_fit_its_slack(hill: Path, tmp_path: Path) -> None:
-    words = f"reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
-    CliRunner().invoke(terrain_app, words.split(), catch_exceptions=False)
-    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
-    assert {each["properties"]["from_s"] for each in features} >= {0}
-    assert 3 <= len({each["properties"]["from_s"] for each in features}) <= 6
-
-
-def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
+def test_what_cannot_be_is_said_in_a_sentence(hill: Path, swarm: Swarm) -> None:
     with pytest.raises(
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
@@ -130,20 +114,15 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path) -> None:
             find_route(str(hill), start, end)
         nearest = str(told.value).split("reached is ")[1].split()[0]
         assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
-    for words, complaint in (
-        (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
-        (["--from", "cell:1,1"], "give --from, and --target or --to"),
-    ):
-        result = CliRunner().invoke(app, ["route", *words])
-        assert isinstance(result.exception, SwarmError)
-        assert complaint in str(result.exception)
+    assert "give --from and --to" in swarm("route --from cell:1,1 --terrain", hill)[2]
+    assert "give --from, and --target or --to" in swarm("route --from cell:1,1")[2]
 
 
-def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(hill: Path, tmp_path: Path) -> None:
-    words = [str(hill), "--to", "cell:10,75", "--out"]
-    said = (
-        CliRunner().invoke(terrain_app, ["reach", *words, str(tmp_path / "s.tif")], catch_exceptions=False).output
-    )
+def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(
+    hill: Path, tmp_path: Path, swarm: Swarm
+) -> None:
+    line = f"terrain reach {hill} --to cell:10,75 --out {tmp_path}"
+    _, said, _ = swarm(f"{line}/s.tif")
     assert "from 8" in said or "from 9" in said
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
@@ -151,40 +130,40 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
     assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0
-    areas = [*words, str(tmp_path / "a.geojson"), "--every-s", "60", "--json"]
-    CliRunner().invoke(terrain_app, ["reach", *areas], catch_exceptions=False)
+    swarm(f"{line}/a.geojson --every-s 60 --json")
     features = json.loads((tmp_path / "a.geojson").read_text())["features"]
     assert max(each["properties"]["to_s"] for each in features) >= seconds.max()
     lon, lat = features[0]["geometry"]["coordinates"][0][0]
     assert (lat, lon) == pytest.approx((46.95, 9.0), abs=0.05)
-    with pytest.raises(SwarmError, match="areas, at most 200"):
-        CliRunner().invoke(terrain_app, ["reach", *areas[:-2], "0.001"], catch_exceptions=False)
-    with pytest.raises(SwarmError, match="--to is on lethal ground"):
-        CliRunner().invoke(terrain_app, ["reach", str(hill), "--to", "cell:10,35"], catch_exceptions=False)
+    assert "areas, at most 200" in swarm(f"{line}/a.geojson --every-s 0.001")[2]
+    assert "--to is on lethal ground" in swarm(f"terrain reach {hill} --to cell:10,35")[2]
 
 
-def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path) -> None:
-    """Against all cheapest ways there and on, by SciPy's Dijkstra."""
+def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
+    """Against all cheapest ways there and on, by their slow twin. Ways from a cell are ways to it turned round, on
+    which a step has the pace of the cell that it leaves."""
     best = find_route(str(hill), "cell:20,5", "cell:30,75")
     found = corridor(str(hill), "cell:20,5", "cell:30,75", 0.1)
     pace = build_terrain(find_scenario(str(hill))).pace_s_per_m
-    there_s, on_s = (cheapest_s(pace, 20.0, (20, 5), to=False), cheapest_s(pace, 20.0, (30, 75), to=True))
-    truth = there_s + on_s
+    there, on = naive.cost_to_go(pace, ALPS.cell(20, 5), left_share=1.0), naive.cost_to_go(pace, ALPS.cell(30, 75))
+    truth = 20.0 * (there + on)
     inside = np.isfinite(found.seconds)
     assert found.fastest_s == pytest.approx(truth[20, 5], rel=1e-5)
     assert (found.seconds[inside] >= truth[inside] * (1 - 1e-5)).all()
     assert (truth[inside] <= best.cost_s * 1.1 + 1e-3).all()
     assert inside.reshape(-1)[best.cells].all()
     assert inside.sum() >= 0.95 * (truth <= best.cost_s * 1.1).sum() > 300
-    line = f"reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --every-s 5 --out {tmp_path}/c.geojson"
-    said = CliRunner().invoke(terrain_app, line.split(), catch_exceptions=False).output
-    assert f"the best takes {best.cost_s:.0f} s" in said
-    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
-    assert min(each["properties"]["from_s"] for each in features) == 0
-    for feature in features:
-        border, *holes = feature["geometry"]["coordinates"]
-        assert turned(border) > 0
-        assert all(turned(hole) < 0 for hole in holes)
+    line = f"terrain reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
+    for more, fewest, most in ("", 3, 6), (" --every-s 5", 3, 99):
+        assert f"the best takes {best.cost_s:.0f} s" in swarm(line + more)[1]
+        features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+        bands = {each["properties"]["from_s"] for each in features}
+        assert min(bands) == 0
+        assert fewest <= len(bands) <= most
+        for feature in features:
+            border, *holes = feature["geometry"]["coordinates"]
+            assert turned(border) > 0
+            assert all(turned(hole) < 0 for hole in holes)
     with pytest.raises(SwarmError, match="--from is on lethal ground, cell:10,35"):
         corridor(str(hill), "cell:10,35", "cell:30,75", 0.1)
 
@@ -195,24 +174,6 @@ def turned(ring: list[list[float]]) -> float:
     (x0, y0), points = ring[0], np.array(ring)
     x, y = points[:, 0] - x0, points[:, 1] - y0
     return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
-
-
-def cheapest_s(pace: NDArray[np.float32], side_m: float, root: tuple[int, int], *, to: bool) -> NDArray[np.float64]:
-    """Seconds from everywhere to a cell, or from it to everywhere."""
-    rows, cols = pace.shape
-    cells, open_ = np.arange(rows * cols).reshape(rows, cols), np.isfinite(np.pad(pace, 1, constant_values=np.inf))
-    froms, tos, seconds = [], [], []
-    for down, right in product((-1, 0, 1), repeat=2):
-        there, down_only, right_only = (
-            open_[1 + r : 1 + r + rows, 1 + c : 1 + c + cols] for r, c in ((down, right), (down, 0), (0, right))
-        )
-        steps = cells[np.isfinite(pace) & there & down_only & right_only & ((down, right) != (0, 0))]
-        froms.append(steps)
-        tos.append(steps + down * cols + right)
-        seconds.append(side_m * np.hypot(down, right) * pace.reshape(-1)[tos[-1]].astype(np.float64))
-    ends = (np.concatenate(each) for each in ((tos, froms) if to else (froms, tos)))
-    graph = csr_array((np.concatenate(seconds), tuple(ends)), shape=(rows * cols, rows * cols))
-    return np.asarray(dijkstra(graph, indices=cells[root]).reshape(rows, cols), np.float64)
 
 
 def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
@@ -240,11 +201,12 @@ def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
         write_route(site, tmp_path / "way.kml")
 
 
-def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(hill: Path, tmp_path: Path) -> None:
-    words = ["route", "--terrain", str(hill), "--from", "cell:55,5", "--to", "cell:55,5", "--out"]
+def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(
+    hill: Path, tmp_path: Path, swarm: Swarm
+) -> None:
     for ending in ("geojson", "kml"):
-        told = CliRunner().invoke(app, [*words, str(tmp_path / f"way.{ending}")]).stdout
-        assert "at most 0.00% above the optimum" in told
+        line = f"route --terrain {hill} --from cell:55,5 --to cell:55,5 --out {tmp_path}/way.{ending}"
+        assert "at most 0.00% above the optimum" in swarm(line)[1]
     (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
     first, last = feature["geometry"]["coordinates"]
     assert first == last

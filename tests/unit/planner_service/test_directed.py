@@ -1,33 +1,21 @@
-"""Uphill is not downhill: the table of rises, trees on directed ground, and what vehicles drive on it."""
+"""Uphill is not downhill: the table of rises, and terrains of directed ground."""
 
 import math
 from typing import get_args
 
 import numpy as np
 import pytest
-from support.makers import route_reply
-from support.shard_tables import grants_of
 
-from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.store import load_prepared, save_prepared
 from shared_map.terrain.synthetic.noise import mountain_noise
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.agents import plan_agents
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import PlannerConfig, Scenario
+from swarm.config.scenario import Scenario
 from swarm.config.setting_types import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Shards
-from swarm.wire.messages.planning import TargetPose
-from swarm.wire.messages.traffic import Granted
-from vehicle_agent.agent import Agent, AskRoutes
-from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.target_choice import AskCosts
 
 RES = 10.0
 
@@ -119,63 +107,3 @@ def test_every_strategy_goes_with_direction_and_a_price_of_length_does_not():
         parse_scenario(f'[cost]\ndirectional = true\n[planner]\nstrategy = "{strategy}"')
     with pytest.raises(ConfigError, match="leave it out"):
         parse_scenario("[cost]\ndirectional = true\n[planner]\nlength_weight = 0.1")
-
-
-def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
-    """(seconds from setting out to standing on the target, what the planner said), of one vehicle on its own."""
-    climb = climb_on(elevation_m)
-    grid, level = climb.grid, np.full(elevation_m.shape, 0.1, np.float32)
-    tree = TargetTree(grid, PlannerConfig(), climb)
-    tree.update(level, target, [], 0)
-    row, col = grid.row_col(start)
-    text = f"[[groups]]\nvehicles = 1\ncells = [[{row}, {col}]]\n[vehicles]\ncapture_range_m = 1\n"
-    scenario = parse_scenario(text)
-    local_map = LocalMap(grid, level, level, level, level, climb)
-    shards, plan = Shards(grid, ["a0"]), plan_agents(scenario)[0]
-    holdings = Holdings(shards, plan.id, plan.vehicle_ids)
-    holdings.begin(1, [])
-    agent = Agent(plan, scenario, local_map, TruthSensor(grid, level, 20.0), holdings)
-
-    def grant(seq: int, cells: list[int]) -> None:
-        """Acts as the leader of the only shard, which has no other host to consider."""
-        leader, grants = shards.leader(0, 1), grants_of(holdings, seq, {"a0-00": cells})
-        granted = Granted(
-            shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants
-        )
-        agent.place(holdings.hear_granted(granted, seq))
-
-    grant(1, [start])
-    agent.set_planners({"t": 1}, 0)
-    x_m, y_m = grid.centre_m(target)
-    agent.take_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
-    motion = agent.vehicles["a0-00"].motion
-    set_out_s = None
-    for tick in range(2000):
-        now_ns = tick * 50_000_000
-        agent.begin_drive(now_ns)
-        while agent.drive() is not None:
-            pass
-        if set_out_s is None and not (motion.at_rest and motion.cell == start):
-            set_out_s = (tick - 1) * 0.05
-        if set_out_s is not None and motion.at_rest and motion.cell == target:
-            return tick * 0.05 - set_out_s, tree.routes([start])[0].cost_s
-        asks = agent.decide(now_ns)
-        wish = agent.wishes["a0-00"]
-        grant(tick + 2, [*holdings.path("a0-00"), *(wish.ahead or wish.wants[: wish.better][:1])])
-        for asked in asks:
-            if isinstance(asked, AskCosts):
-                agent.assignment.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
-                agent.costs_ended(asked.request, now_ns)
-            elif isinstance(asked, AskRoutes):
-                reply = route_reply(tree.routes(asked.cells), grid, target="t", target_cell=target)
-                agent.routes_given(asked.request, reply, now_ns)
-    raise AssertionError("the vehicle never arrived")
-
-
-def test_vehicles_drive_up_and_down_as_long_as_the_planner_says():
-    west, east = 3 * 12 + 1, 3 * 12 + 10
-    up_s, promised_up_s = driven_s(west, east, ramp(7, 12))
-    down_s, promised_down_s = driven_s(east, west, ramp(7, 12))
-    assert (promised_up_s, promised_down_s) == (pytest.approx(20.2, abs=0.1), pytest.approx(9.0))
-    assert up_s == pytest.approx(promised_up_s, abs=0.15)
-    assert down_s == pytest.approx(promised_down_s, abs=0.15)

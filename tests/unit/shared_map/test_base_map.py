@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.height_models import written
 from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher import fetched_terrain
@@ -127,14 +128,11 @@ def test_other_cost_rules_make_another_terrain_and_are_told_of() -> None:
 
 
 def test_where_a_mask_lies_makes_no_other_terrain(tmp_path: Path) -> None:
-    import rasterio
-
     digests = []
     for name in ("here", "there"):
         mask = tmp_path / name / "mask.tif"
         mask.parent.mkdir()
-        with rasterio.open(mask, "w", driver="GTiff", width=520, height=300, count=1, dtype="uint8") as out:
-            out.write(np.eye(300, 520, dtype=np.uint8)[None])
+        written(mask, np.eye(300, 520), "uint8", crs=None, transform=None)
         cost = CostConfig(zones=(ZoneConfig(kind="rough", mask=str(mask)),))
         digests.append(build_terrain(msgspec.structs.replace(SCENARIO, cost=cost)).digest)
     assert digests[0] == digests[1]

@@ -73,9 +73,6 @@ def photo_of(ground: Floats) -> Any:
 
 @pytest.mark.parametrize("kind", ["infrared", "legend"])
 def test_nothing_is_read_from_an_image_that_is_no_true_colour_photo(tmp_path: Path, kind: str) -> None:
-    import rasterio
-    from rasterio.transform import from_origin
-
     ground = np.maximum(hills(13, 900) - 300, 0).astype(np.float32)
     true = photo_of(ground)
     red, green = true[..., 0].astype(float), true[..., 1].astype(float)
@@ -83,12 +80,8 @@ def test_nothing_is_read_from_an_image_that_is_no_true_colour_photo(tmp_path: Pa
     legend = np.array([(255, 255, 100), (0, 100, 0), (0, 100, 200)])[np.digitize(ground, [1, 200])]
     shown = {"infrared": infrared, "legend": legend}[kind].astype(np.uint8)
     terrain = written(tmp_path / "dem.tif", ground)
-    place = {"crs": "EPSG:32632", "transform": from_origin(500_000, 5_000_000, 20, 20)}
     for name, image in (("true", true), ("other", shown)):
-        with rasterio.open(
-            tmp_path / f"{name}.tif", "w", driver="GTiff", height=SIDE, width=SIDE, count=3, dtype="uint8", **place
-        ) as file:
-            file.write(np.moveaxis(image, -1, 0))
+        written(tmp_path / f"{name}.tif", np.moveaxis(image, -1, 0), "uint8")
     good = load(terrain, photo=str(tmp_path / "true.tif"))
     assert not any("the photo is" in note for note in good.notes)
     other = load(terrain, photo=str(tmp_path / "other.tif"))

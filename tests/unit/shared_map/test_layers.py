@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from support.height_models import written
 
 from shared_map.importers.sources import load_source
 from shared_map.terrain.layers import (
@@ -159,12 +160,9 @@ def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
 
 
 def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:
-    import rasterio
-
     painted = np.zeros((20, 30), np.uint8)
     painted[5:8, 5:8] = 255
-    with rasterio.open(tmp_path / "m.png", "w", driver="PNG", count=1, height=20, width=30, dtype="uint8") as file:
-        file.write(painted, 1)
+    written(tmp_path / "m.png", painted, "uint8", driver="PNG", crs=None, transform=None)
     zone = ZoneConfig(kind="forbidden", mask=str(tmp_path / "m.png"))
     np.testing.assert_array_equal(zone_mask(zone, GridSpec(20, 30, 10.0)), painted > 0)
     with pytest.raises(TerrainError, match="20 x 30 pixels, the terrain 10 x 10"):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.height_models import written
 
 from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
@@ -96,11 +97,8 @@ def test_an_hgt_is_known_by_its_length(tmp_path: Path) -> None:
 
 
 def test_a_png_needs_a_scale(tmp_path: Path) -> None:
-    import rasterio
-
     grey = (np.arange(48).reshape(6, 8) * 100).astype(np.uint16)
-    with rasterio.open(tmp_path / "a.png", "w", driver="PNG", count=1, height=6, width=8, dtype="uint16") as file:
-        file.write(grey, 1)
+    written(tmp_path / "a.png", grey, "uint16", driver="PNG", crs=None, transform=None)
     with pytest.raises(TerrainError, match=r"set terrain\.resolution_m .* terrain\.height_scale"):
         load(tmp_path / "a.png")
     source = load(tmp_path / "a.png", resolution_m=5.0, height_scale=0.1)

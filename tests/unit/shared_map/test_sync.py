@@ -205,22 +205,6 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
     assert late.replica.counts["sets_refused"] == 1
 
 
-def test_digests_without_end_are_held_within_bounds() -> None:
-    swarm = SwarmModel()
-    listener = swarm.listener("p")
-    hostile = swarm.network.bus("hostile")
-    rows = np.array([(tile, 1, 1) for tile in range(6)], DIGEST_ROW).tobytes()
-    for n in range(6000):
-        digest = Digest(author=f"x{n}", role="agent", held={f"x{n}": rows})
-        hostile.publish(DIGEST, digest, author=f"x{n}")
-    swarm.run(0.01)
-    digests = listener.sync._digests
-    assert len(digests._pending) <= 4096
-    assert digests._bytes == sum(pending.size for pending in digests._pending.values())
-    swarm.run(10)
-    assert digests._bytes == 0
-
-
 def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
     swarm = SwarmModel()
     keeper_says = swarm.network.bus("k")

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import ndimage
+from support.height_models import written
 
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.store import (
@@ -150,7 +151,6 @@ def test_a_small_synthetic_terrain_is_built_too() -> None:
 def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     import re
 
-    import rasterio
     import rasterio.warp
     import shapely
     from pyogrio.raw import write
@@ -162,17 +162,12 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text("".join(blocks[:4]))
     # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
     (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
-    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(x_m - 900, y_m + 100, 20, 20)}
-    with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
-        file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
-    with rasterio.open(tmp_path / "photo.tif", "w", height=60, width=70, count=3, dtype="uint8", **base) as file:
-        file.write(np.full((3, 60, 70), 120, np.uint8))
+    place = from_origin(x_m - 900, y_m + 100, 20, 20)
+    written(tmp_path / "dem.tif", np.random.default_rng(1).uniform(0, 2, (60, 70)), transform=place)
+    written(tmp_path / "photo.tif", np.full((3, 60, 70), 120), "uint8", transform=place)
     roads = np.zeros((60, 70), np.uint8)
     roads[30] = 1
-    with rasterio.open(
-        tmp_path / "roads.png", "w", driver="PNG", height=60, width=70, count=1, dtype="uint8"
-    ) as file:
-        file.write(roads, 1)
+    written(tmp_path / "roads.png", roads, "uint8", driver="PNG", crs=None, transform=None)
     # A river along the sixth column, from the sixth row to the 45th.
     west_m, north_m = x_m - 900, y_m + 100
     course = [(west_m + 110, north_m - 100), (west_m + 110, north_m - 900)]

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
+from support import height_models
 from support.effort import few
 
 from shared_map.terrain.map_frame import MapFrame, middles_of
@@ -173,11 +173,7 @@ def test_places_of_a_rotated_file_are_those_of_its_own_transform(tmp_path: Path)
     heights = np.zeros((60, 60), np.float32)
     heights[20:24, 40:44] = 100.0
     heights += np.random.default_rng(1).uniform(0, 0.5, heights.shape).astype(np.float32)
-    with rasterio.open(
-        tmp_path / "turned.tif", "w", driver="GTiff", height=60, width=60, count=1, dtype="float32",
-        crs="EPSG:32632", transform=turned,
-    ) as file:  # fmt: skip
-        file.write(heights, 1)
+    height_models.written(tmp_path / "turned.tif", heights, transform=turned)
     terrain = build_terrain(Scenario(terrain=TerrainConfig(source=str(tmp_path / "turned.tif"))))
     frame = MapFrame(terrain.grid)
     x_m, y_m = turned @ (42, 22)

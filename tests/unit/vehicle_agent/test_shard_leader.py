@@ -27,6 +27,15 @@ def test_entries_of_a_table_are_ordered_by_epoch_and_then_by_number() -> None:
     assert list(Orders(table).order(9).values()) == ["a2-00", "a1-00", "a3-00"]
 
 
+def test_a_table_adds_one_entry_to_a_cell_at_most_so_that_its_number_is_used_once() -> None:
+    orders = Orders(table_of(1, 1, a1=[9], a2=[11]))
+    assert orders.append("a1-00", 10, (1, 2))
+    assert not orders.append("a2-00", 10, (1, 2))
+    assert orders.order(10) == {(10, 1, 2): "a1-00"}
+    assert orders.append("a2-00", 10, (1, 3))
+    assert list(orders.order(10).values()) == ["a1-00", "a2-00"]
+
+
 def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_dead() -> None:
     nine = entries(1, 1, 9)
     for end in (standing("a1", nine, seq=9, ended=True), standing("a1", nine, seq=9, generation=1 << 33, dead=[1])):

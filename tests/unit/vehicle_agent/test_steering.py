@@ -1,10 +1,11 @@
-"""Vehicles keep to the steps that are not too steep, and none is stuck on one that is."""
+"""Vehicles keep to steps that are not too steep, none is stuck on one that is, and all take what planners say."""
 
 import math
 import random
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
@@ -105,6 +106,25 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
         drive(1.0)
     assert vehicle.motion.at_rest
     assert vehicle.cell == above
+
+
+@pytest.mark.parametrize(("start", "target", "promised_s"), [(33, 38, 11.2), (38, 33, 5.0)], ids=["up", "down"])
+def test_vehicles_drive_up_and_down_as_long_as_the_planner_says(start: int, target: int, promised_s: float) -> None:
+    climb = climb_on(np.tile(np.arange(8.0), (8, 1)))  # rises to the east, 10 % steep
+    tree = TargetTree(GRID, PlannerConfig(), climb)
+    tree.update(LEVEL, target, [], 0)
+    (route,) = tree.routes([start])
+    assert route.cost_s == pytest.approx(promised_s, abs=0.1)
+    vehicle, held = Vehicle("v", GRID, start), Held(walk(GRID, start, route.directions))
+    passable = steering_on(climb).passable
+    driver = Driver(LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL, climb), held, passable, None)  # type: ignore[arg-type]
+    ticks = 0
+    while vehicle.cell != target or not vehicle.motion.at_rest:
+        ticks += 1
+        driver.begin({"v": vehicle}, 0.05)
+        for _ in range(2):  # up to the border, and beyond it
+            driver.drive(lambda _: False)
+    assert ticks * 0.05 == pytest.approx(route.cost_s, abs=0.15)
 
 
 @given(st.integers(0, 1 << 32), st.sampled_from([0.0, 0.5, 1.5, 3.0]))
