@@ -196,9 +196,19 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tu
     """(west, south, east, north) of a raster of rows x cols, in units of the system `target`; degrees count on
     beyond 180."""
     west, south, east, north = array_bounds(rows, cols, transform)
+    south, north = sorted((south, north))  # of a file which begins in the south
     if target != crs:
         west, south, east, north = transform_bounds(crs, target, west, south, east, north)
     return west, south, east + 360.0 * (target.is_geographic and east < west), north
+
+
+def going_on(crs: Any, transform: Any, rows: int, cols: int) -> Any:
+    """The system of a raster, whose degrees go on beyond 180 if the raster's do: PROJ's do not."""
+    west, _, east, _ = bounds_in(transform, rows, cols, crs, crs)
+    if not crs.is_geographic or -180 <= west <= east <= 180:
+        return crs
+    same = crs.to_proj4().replace("=True", "")
+    return rasterio.CRS.from_proj4(f"{same} +lon_wrap={(west + east) / 2:.9f}")
 
 
 def check_metres(step: float, west: float, what: str) -> None:

@@ -14,7 +14,7 @@ from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import Resampling
 
-from shared_map.importers.georeference import METRES, bounds_in, pixel_m, reprojecting, systems_of
+from shared_map.importers.georeference import METRES, bounds_in, going_on, pixel_m, reprojecting, systems_of
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -62,7 +62,8 @@ class Placed:
         place = transform_of(grid)
         own = place if self.is_cells else self.transform
         size = {"width": grid.cols, "height": grid.rows, "dtype": "float32", "nodata": math.nan}
-        source = {"src_crs": self.crs, "src_transform": own, "src_nodata": void}
+        crs = going_on(self.crs, own, dataset.height, dataset.width)
+        source = {"src_crs": crs, "src_transform": own, "src_nodata": void}
         # A photo shows nothing only where no band does.
         target = {"crs": self.target, "transform": place, "NUM_THREADS": "ALL_CPUS", "UNIFIED_SRC_NODATA": "YES"}
         with WarpedVRT(dataset, resampling=resampling, **source, **target, **size) as cells:

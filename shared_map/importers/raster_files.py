@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import glob
 import itertools
 import lzma
 import math
@@ -119,7 +120,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
                 contextlib.ExitStack() as files,
             ):
                 yield _georeferenced(path, what, files)
-    except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
+    except (RasterioError, CPLE_BaseError, UnicodeError) as error:  # the last of names, also inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
@@ -277,6 +278,10 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
 
     Raises TerrainError on a file that is not a raster; `what` names it. Raises OSError as `open` does.
     """
+    # GDAL opens what lies beside a file, too, such as its .prj: it would wait at a pipe for ever.
+    for beside in path.parent.glob(f"{glob.escape(path.stem)}.*"):
+        if beside.exists() and not (beside.is_file() or beside.is_dir()):
+            raise TerrainError(f"{what}: {beside} beside it is a device or pipe, not a file")
     head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
     if member is not None:
         driver = _driver(head, Path(member).suffix.lower(), f"{what}: {member}")
@@ -311,7 +316,8 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
         return head, None, 0
     try:
         with zipfile.ZipFile(path) as archive:
-            files = [each for each in archive.infolist() if not each.is_dir()]
+            # Finder adds a folder of its own.
+            files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
             named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
             if len(named) != 1:
                 raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")

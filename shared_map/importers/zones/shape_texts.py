@@ -41,12 +41,6 @@ _MAGIC = {
 """First bytes -> format. GDAL knows 80 formats, some of which name other files."""
 _ROOTS = {b"kml": "LIBKML", b"gpx": "GPX", b"osm": "OSM"}
 _ROOT = re.compile(rb"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*|<!DOCTYPE[^>\[]*>\s*)*<(?:\w+:)?(\w+)[\s/>]", re.DOTALL)
-_CONVERTED = {
-    b"PAR1": "GeoParquet",
-    b"\0\0\0\x0d\x0a\x09OSMHeader": "OSM PBF",
-    b"\0\0\0\x0e\x0a\x09OSMHeader": "OSM PBF",
-}
-"""First bytes of formats that are not read here."""
 _SQLITE, _APPLICATION = b"SQLite format 3\0", slice(68, 70)
 """Beginning of a database, and where it says to which application it belongs: GP10, GP11 or GPKG."""
 _CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
@@ -54,9 +48,6 @@ _CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
 
 def kind_of(head: bytes, what: str) -> Kind | None:
     """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
-    for magic, name in _CONVERTED.items():
-        if head.startswith(magic):
-            raise TerrainError(f"{what} is {name}, which {_CONVERT}")
     if head.startswith(_SQLITE):
         if head[_APPLICATION] != b"GP":
             raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; it {_CONVERT}")

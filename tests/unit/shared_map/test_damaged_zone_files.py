@@ -195,6 +195,8 @@ SAME = {
     "lines of geojson": FEATURE.replace("[[[", "[\n[[") + "\n",
     "geojson lines": f"{FEATURE}\n{FEATURE}\n",
     "geojson sequence": f"\x1e{FEATURE}\n\x1e{FEATURE}\n",
+    "a line of one place": f"{FEATURE}\n"
+    + json.dumps({"type": "LineString", "coordinates": [MIDDLE.tolist()] * 2}),
     "kml": kml(f"<Folder><name>a</name>{placemark(RING)}</Folder>"),
     "kml with spaces": kml(placemark(RING.replace(",", ", "))),
     "open kml": kml(placemark(RING.rpartition(" ")[0])),
@@ -260,6 +262,7 @@ def test_other_formats_close_the_same_ground_or_say_why_not(tmp_path: Path, name
     zone = ZoneConfig(kind="forbidden", file=str(path))
     archive = tmp_path / "zone.kmz"
     with zipfile.ZipFile(archive, "w") as packed:
+        packed.writestr("__MACOSX/._doc.kml", "of Finder")
         packed.write(path, f"doc.{name.partition(' ')[0]}")
     if name in SAME:
         touched = shapely.intersects(AREA, squares())

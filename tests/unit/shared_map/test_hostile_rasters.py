@@ -51,6 +51,18 @@ def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.mark.parametrize("west", [179.99, 350.0, -180.02])
+def test_degrees_which_go_on_beyond_180_are_the_same_ground_as_elsewhere(tmp_path: Path, west: float) -> None:
+    places = {lon: from_origin(lon, 50, 0.001, 0.001) for lon in (10.0, west)}
+    files = [written(tmp_path / f"{lon}.tif", HEIGHTS, crs="EPSG:4326", transform=places[lon]) for lon in places]
+    np.testing.assert_allclose(*(load(file).elevation_m for file in files), atol=0.01)
+
+
+def test_a_file_which_begins_in_the_south_is_turned(tmp_path: Path) -> None:
+    path = written(tmp_path / "south.tif", HEIGHTS, transform=rasterio.Affine(30, 0, 500_000, 0, 30, 5_000_000))
+    np.testing.assert_array_equal(load(path).elevation_m, HEIGHTS[::-1])
+
+
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
     from shared_map.importers import level_ground as module
 
