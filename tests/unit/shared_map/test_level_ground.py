@@ -286,7 +286,6 @@ def test_values_that_the_scenario_names_are_voids(tmp_path: Path) -> None:
     ground[20:40, 20:40] = 412
     source = load(written(tmp_path / "a.tif", ground, "int16"), nodata_values=(412.0,))
     assert np.isnan(source.elevation_m[20:40, 20:40]).all()
-    assert np.isnan(source.elevation_m[20:40, 20:40]).all()
 
 
 def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
