@@ -6,14 +6,12 @@ slope has none. Models are looked at in a sample of at most `level_ground.MOST_S
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
-from shared_map.terrain.row_bands import bands
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """Number of the eight neighbours that are as high as a cell of a patch: those of a creek one cell wide are two.
@@ -98,12 +96,9 @@ def level_patches(
     first = np.full(many, np.nan, np.float32)
     at = np.flatnonzero(labels)[::-1]  # backwards: the value of a patch's first cell is written last
     first[labels.reshape(-1)[at]] = elevation_m.reshape(-1)[at]
-    total_m, total_m2 = np.zeros((2, many))
-    for row0, row1 in bands(elevation_m.shape[0]):
-        of_cell = labels[row0:row1][(inside := labels[row0:row1] > 0)]
-        above_m = elevation_m[row0:row1][inside].astype(np.float64) - first[of_cell]
-        total_m += np.bincount(of_cell, above_m, many)
-        total_m2 += np.bincount(of_cell, above_m**2, many)
+    of_cell = labels[labels > 0]
+    above_m = elevation_m[labels > 0] - first[of_cell]
+    total_m, total_m2 = np.bincount(of_cell, above_m, many), np.bincount(of_cell, above_m**2, many)
     variance = total_m2 / np.maximum(cells, 1) - (total_m / np.maximum(cells, 1)) ** 2
     spread_m = np.sqrt(12 * np.maximum(variance, 0)).astype(np.float32)
     if shore_m is None:
@@ -129,16 +124,13 @@ def _sides(
     """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
     height, width = elevation_m.shape
     total = {name: np.zeros(len(cells), np.int64) for name in _COUNTS}
-    for (row0, row1), (down, right) in itertools.product(bands(height), ((-1, 0), (1, 0), (0, -1), (0, 1))):
-        top, end = max(row0, -down), min(row1, height - down)
-        left, stop = max(-right, 0), width - max(right, 0)
-        of_cell = labels[top:end, left:stop]
-        of_next = labels[top + down : end + down, left + right : stop + right]
-        row, col = np.nonzero((of_cell > 0) & (of_next != of_cell))
-        patch, beyond = of_cell[row, col], of_next[row, col]
-        row, col = row + top, col + left
-        height_m = elevation_m[row, col]
-        above_m = elevation_m[row + down, col + right] - height_m
+    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        here = np.s_[max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)]
+        there = np.s_[max(down, 0) : height + min(down, 0), max(right, 0) : width + min(right, 0)]
+        at = (labels[here] > 0) & (labels[there] != labels[here])
+        patch, beyond = labels[here][at], labels[there][at]
+        height_m = elevation_m[here][at]
+        above_m = elevation_m[there][at] - height_m
         with np.errstate(invalid="ignore"):
             differs = np.abs(above_m) > 2 * same_m
             near = np.abs(above_m) <= 1.5 * step_m

@@ -181,6 +181,9 @@ def _flattest(lines: _Doubles, found: _Resampling) -> _Resampling:
 
 def _factors(heights_m: Floats) -> list[float]:
     """The factors by which a file may have been made finer, the largest first."""
+    from scipy.ndimage import uniform_filter1d
+    from scipy.signal import find_peaks
+
     peaks: Any = 0
     size = 1 << math.ceil(math.log2(4 * len(heights_m)))
     some = heights_m[:, :: max(heights_m.shape[1] // _LONGEST, 1)].astype(np.float64)
@@ -189,21 +192,15 @@ def _factors(heights_m: Floats) -> list[float]:
         if not bends.any():
             return []
         bends = np.log(np.maximum(bends, bends.mean() / 100))
-        bends -= np.convolve(np.pad(bends, _SMOOTHED // 2, "edge"), np.ones(_SMOOTHED) / _SMOOTHED, "valid")
+        bends -= uniform_filter1d(bends, _SMOOTHED, mode="nearest")
         peaks = peaks + np.abs(np.fft.rfft(bends * np.hanning(len(bends)), size))
     per_cell = np.arange(len(peaks)) / size
     peaks[per_cell < _SLOWEST] = 0
     if not peaks.any():
         return []
-    usual = np.median(peaks[peaks > 0])
-    found = {2.0}
-    apart = _PEAK_APART * 4
-    for _ in range(_PEAKS):
-        n = int(peaks.argmax())
-        if peaks[n] <= 0 or peaks[n] < _PEAK * usual:
-            break
-        found |= {times / often for often in (per_cell[n], 1 - per_cell[n]) for times in (1, 2, 3)}
-        peaks[max(n - apart, 0) : n + apart + 1] = 0
+    at, shown = find_peaks(peaks, height=_PEAK * np.median(peaks[peaks > 0]), distance=4 * _PEAK_APART)
+    highest = per_cell[at[np.argsort(shown["peak_heights"])[-_PEAKS:]]]
+    found = {2.0, *(times / often for each in highest for often in (each, 1 - each) for times in (1, 2, 3))}
     return sorted((each for each in found if _LEAST_FACTOR <= each <= _MOST_FACTOR), reverse=True)
 
 

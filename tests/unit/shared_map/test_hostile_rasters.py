@@ -58,9 +58,11 @@ def test_degrees_which_go_on_beyond_180_are_the_same_ground_as_elsewhere(tmp_pat
     np.testing.assert_allclose(*(load(file).elevation_m for file in files), atol=0.01)
 
 
-def test_a_file_which_begins_in_the_south_is_turned(tmp_path: Path) -> None:
-    path = written(tmp_path / "south.tif", HEIGHTS, transform=rasterio.Affine(30, 0, 500_000, 0, 30, 5_000_000))
-    np.testing.assert_array_equal(load(path).elevation_m, HEIGHTS[::-1])
+@pytest.mark.parametrize(("right", "down"), [(1, 1), (-1, -1), (-1, 1)])
+def test_a_file_which_begins_in_the_south_or_east_is_turned(tmp_path: Path, right: int, down: int) -> None:
+    place = rasterio.Affine(30 * right, 0, 500_000, 0, 30 * down, 5_000_000)
+    turned = HEIGHTS[:: -1 if down > 0 else 1, ::right]
+    np.testing.assert_array_equal(load(written(tmp_path / "a.tif", HEIGHTS, transform=place)).elevation_m, turned)
 
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
