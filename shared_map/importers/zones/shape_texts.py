@@ -44,14 +44,14 @@ _ROOTS = {b"kml": "LIBKML", b"gpx": "GPX", b"osm": "OSM"}
 _ROOT = re.compile(rb"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*|<!DOCTYPE[^>\[]*>\s*)*<(?:\w+:)?(\w+)[\s/>]", re.DOTALL)
 _SQLITE, _APPLICATION = b"SQLite format 3\0", slice(68, 70)
 """Beginning of a database, and where it says to which application it belongs: GP10, GP11 or GPKG."""
-_CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
 
 
 def kind_of(head: bytes, what: str) -> Kind | None:
     """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
     if head.startswith(_SQLITE):
         if head[_APPLICATION] != b"GP":
-            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; it {_CONVERT}")
+            how = "it is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
+            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; {how}")
         return Kind("GPKG")
     head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)

@@ -315,17 +315,17 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path: Path, kind: str) -
         part.write_bytes(whole)
 
 
-@pytest.mark.parametrize("part", [".shp", ".shx"])
-def test_a_part_of_another_shapefile_is_refused(tmp_path: Path, part: str) -> None:
+def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
     boxes = [shapely.box(col, row, col + 3, row + 2) for row in (3, 20) for col in (4, 14, 24)]
     sets = (boxes, [box.buffer(1) for box in boxes], boxes[:4])
     files = [Path(written(tmp_path / f"{n}.shp", shapes, "EPSG:4326")) for n, shapes in enumerate(sets)]
     for one, other in itertools.permutations(files, 2):
-        kept = one.with_suffix(part).read_bytes()
-        one.with_suffix(part).write_bytes(other.with_suffix(part).read_bytes())
+        for part in (".shp", ".shx", ".dbf", ".prj"):
+            (tmp_path / f"mixed{part}").write_bytes(
+                (other if part == ".shx" else one).with_suffix(part).read_bytes()
+            )
         with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
-            closed_by(str(one), "forbidden")
-        one.with_suffix(part).write_bytes(kept)
+            closed_by(str(tmp_path / "mixed.shp"), "forbidden")
 
 
 # --- extents and fences -------------------------------------------------------------------------------------

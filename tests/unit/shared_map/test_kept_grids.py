@@ -15,6 +15,7 @@ from rasterio.control import GroundControlPoint
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from support.effort import few
+from support.height_models import written
 from support.zone_shapes import painted
 
 from shared_map.importers.sources import Source, load_source
@@ -38,12 +39,8 @@ def rows_of(heights: np.ndarray) -> str:
 
 
 def write_raster(path: Path, side_m: float, **profile: object) -> None:
-    numbers = profile.pop("numbers", HEIGHTS)
-    assert isinstance(numbers, np.ndarray)
-    size = {"height": ROWS, "width": COLS, "count": 1, "dtype": numbers.dtype}
-    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m)}
-    with rasterio.open(path, "w", **{**size, **place, **profile}) as file:
-        file.write(numbers, 1)
+    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m), **profile}
+    written(path, HEIGHTS, **place)
 
 
 def write_netcdf(path: Path, side_m: float, kind: str) -> None:

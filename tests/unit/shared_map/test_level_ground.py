@@ -137,24 +137,21 @@ def test_water_is_the_same_after_a_resampling(name: str, how: str, factor: float
     assert after == pytest.approx(before, rel=SMALL.get(name, 0.02))
 
 
-@pytest.mark.parametrize("how", ["nearest", "bilinear", "cubic", "lanczos", "average"])
-@pytest.mark.parametrize("name", ["coast, 75 % sea, float32", "lakes, decimetres"])
-def test_water_is_the_same_on_coarser_cells(name: str, how: str) -> None:
-    """Within 2 % of the water, or a quarter of the cells at its shore: where half of a cell is water, its height
-    does not say which half. Lakes of which a filter leaves fewer than 16 level cells are lost, and do not count."""
-    lakes, _ = ndimage.label(found_in(name), np.ones((3, 3)))
-    for factor in (0.5, 0.7, 0.9):
-        heights_m = resampled(model_of(name).heights_m, factor, how)
-        whole = resampled((lakes > 0).astype(np.float32), factor, "average") > 0.999
-        lake = np.nan_to_num(resampled(lakes.astype(np.float32), factor, "nearest")).astype(int)
-        middle_m = ndimage.median(heights_m, lake * whole, np.arange(lakes.max() + 1))
-        level = whole & (np.abs(heights_m - middle_m[lake]) <= 0.005)
-        known = np.flatnonzero(np.bincount(lake[level], minlength=lakes.max() + 1) >= 16)
-        before = factor**2 * np.count_nonzero(np.isin(lakes, known))
-        mask = level_ground(heights_m).mask & ndimage.binary_dilation(np.isin(lake, known))
-        shore = np.count_nonzero(mask & ndimage.binary_dilation(~mask))
-        assert abs(np.count_nonzero(mask) - before) <= max(0.02 * before, 0.25 * shore), factor
-        assert before > 0.9 * factor**2 * np.count_nonzero(lakes)
+LOST = {("lakes, decimetres", "lanczos", 0.5): 0.033, ("lakes, decimetres", "bilinear", 0.5): 0.006}
+"""Share of lakes of 83 and 384 cells of which a filter leaves no 16 level ones, so that nothing tells them."""
+COARSER = [(how, factor) for how in ("nearest", "bilinear", "cubic", "lanczos") for factor in (0.5, 0.7, 0.9)]
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "factor"), paired(["coast, 75 % sea, float32", "lakes, decimetres"], COARSER)
+)
+def test_water_is_the_same_on_coarser_cells(name: str, how: str, factor: float) -> None:
+    """Within 2 % of the water, or a quarter of the cells at its shore: of a cell of which half is water, the height
+    does not say which half."""
+    mask = level_ground(resampled(model_of(name).heights_m, factor, how)).mask
+    before = found_in(name).mean() * (1 - LOST.get((name, how, factor), 0))
+    shore = (mask & ndimage.binary_dilation(~mask)).mean()
+    assert abs(mask.mean() - before) <= max(0.02 * before, 0.25 * shore)
 
 
 @pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
