@@ -49,7 +49,7 @@ def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source
     with opened(path, "terrain") as dataset, ExitStack() as files:
         is_cover = holds_cover(dataset, what, config)
         crs, transform, notes = _place_of(dataset, path, config, is_cover)
-        grid, target, planned = plan_grid(transform, *dataset.shape, crs, config.resolution_m, what)
+        grid, target, planned = plan_grid(transform, dataset.height, dataset.width, crs, config.resolution_m, what)
         placed = Placed(dataset, grid, transform, crs, target or crs, is_cells=target is None)
         notes = (str(path), *notes, *planned)
         if not is_cover:
