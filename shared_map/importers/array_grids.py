@@ -24,12 +24,11 @@ from rasterio import CRS
 from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
-from shared_map.importers.georeference import METRES
+from shared_map.importers.georeference import METRES, check_size
 from shared_map.importers.raster_files import LONGEST_REASON, Numbers
 from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS
 
 _NPZ_ARRAYS = ("elevation", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
 _READ_ARRAYS = "elevation and resolution_m, or elevation, dx, dy, xmin and ymin (degrees)"
@@ -59,12 +58,6 @@ class LevelMap(NamedTuple):
     note: str
 
 
-def check_cells(rows: int, cols: int, what: str) -> None:
-    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
-    if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
-        raise TerrainError(f"{what}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
-
-
 # --- numpy's archives ---------------------------------------------------------------------------------------
 
 
@@ -89,7 +82,7 @@ def read_npz(path: Path, what: str) -> Numbers:
         raise TerrainError(
             f"{what}: elevation is {heights.shape} {heights.dtype}; expected numbers in 2 dimensions"
         )
-    check_cells(heights.shape[0], heights.shape[1], what)
+    check_size(heights.shape[0], heights.shape[1], what)
     ignored = [f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})"] * bool(unread)
     heights, notes = heights.astype(np.float32), ("arrays of NumPy", *ignored)
     try:
@@ -161,7 +154,7 @@ def read_map(path: Path) -> LevelMap:
             raise ValueError(marker)
     except (ValueError, KeyError) as error:
         raise TerrainError(f"terrain {path} is no MovingAI map, which has type, height, width, map") from error
-    check_cells(rows, cols, f"terrain {path}")
+    check_size(rows, cols, f"terrain {path}")
     letters = np.full(256, np.nan, np.float32)
     letters[list(b".GS")], letters[list(b"@OTW")] = 1.0, np.inf
     factor = np.empty((rows, cols), np.float32)
@@ -201,11 +194,13 @@ def read_ros(path: Path) -> LevelMap:
     TerrainError
         If a file cannot be read, a key is missing or out of range, or the origin is turned.
     """
-    raw = _yaml(path)
     try:
+        raw = yaml.safe_load(read_text(path, FileKind.ROS_MAP))
         found = msgspec.convert(raw, _RosMap, strict=False)
     except msgspec.ValidationError as error:
         raise TerrainError(f"terrain {path} is no ROS map: {explain(str(error), raw, _RosMap, 'map')}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise TerrainError(f"terrain {path}: no YAML: {' '.join(str(error).split())[:LONGEST_REASON]}") from error
     west, south, *turned = found.origin
     image, occupied, free = path.parent / found.image, found.occupied_thresh, found.free_thresh
     if turned and abs(turned[0]) > 1e-9:
@@ -230,13 +225,6 @@ def read_ros(path: Path) -> LevelMap:
     return LevelMap(factor, found.resolution, west, north, note)
 
 
-def _yaml(path: Path) -> Any:
-    try:
-        return yaml.safe_load(read_text(path, FileKind.ROS_MAP))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise TerrainError(f"terrain {path}: no YAML: {' '.join(str(error).split())[:LONGEST_REASON]}") from error
-
-
 def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     """The image of a ROS map: PGM, PNG or BMP. Colours count by their mean, as in map_server.
 
@@ -255,7 +243,7 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     check_bytes(path, FileKind.IMAGE)
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
-            check_cells(image.height, image.width, f"image {path}")
+            check_size(image.height, image.width, f"image {path}")
             if image.mode in ("L", "I", "I;16"):
                 return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
             colours = np.asarray(image.convert("RGBA"), np.float32)

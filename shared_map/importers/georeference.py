@@ -151,13 +151,9 @@ def _scale(crs: Any, local: Any) -> float:
 
 def is_local(crs: Any) -> bool:
     """Returns True if a system has metres without a place on Earth, as surveys of sites and arenas use."""
-    if crs.is_geographic or crs.is_projected:
-        return False
     known = crs.to_dict(projjson=True)
     axes = known.get("coordinate_system", {}).get("axis", [])
-    return (
-        known.get("type") == "EngineeringCRS" and bool(axes) and all(axis.get("unit") == "metre" for axis in axes)
-    )
+    return known.get("type") == "EngineeringCRS" and {axis.get("unit") for axis in axes} == {"metre"}
 
 
 def degrees_of(crs: Any) -> Any:
@@ -196,14 +192,24 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tu
     """(west, south, east, north) of a raster of rows x cols, in units of the system `target`; degrees count on
     beyond 180."""
     west, south, east, north = array_bounds(rows, cols, transform)
+    (west, east), (south, north) = sorted((west, east)), sorted((south, north))  # of a file that is mirrored
     if target != crs:
         west, south, east, north = transform_bounds(crs, target, west, south, east, north)
     return west, south, east + 360.0 * (target.is_geographic and east < west), north
 
 
+def going_on(crs: Any, transform: Any, rows: int, cols: int) -> Any:
+    """The system of a raster, whose degrees go on beyond 180 if the raster's do: PROJ's do not."""
+    west, _, east, _ = bounds_in(transform, rows, cols, crs, crs)
+    if not crs.is_geographic or -180 <= west <= east <= 180:
+        return crs
+    same = crs.to_proj4().replace("=True", "")
+    return rasterio.CRS.from_proj4(f"{same} +lon_wrap={(west + east) / 2:.9f}")
+
+
 def check_metres(step: float, west: float, what: str) -> None:
     """Raises TerrainError where numbers without a coordinate system look like degrees."""
-    if step < 0.1 and abs(west) <= 180:
+    if abs(step) < 0.1 and abs(west) <= 180:
         raise TerrainError(f"{what}: a cell of {step:g} looks like degrees; set terrain.crs = 'EPSG:4326'")
 
 
@@ -322,10 +328,8 @@ def _system(crs: Any) -> str:
 
 
 def check_size(rows: int, cols: int, what: str) -> None:
-    """Raises TerrainError if there are more than `MAX_CELLS` cells."""
-    if rows * cols > MAX_CELLS:
-        at_least = math.sqrt(rows * cols / MAX_CELLS)
-        raise TerrainError(
-            f"{what} would be {rows} x {cols} cells, more than {MAX_CELLS}: crop it, or set a terrain.resolution_m"
-            f" that is at least {at_least:.1f} times coarser"
-        )
+    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
+    if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
+        times = math.sqrt(max(rows * cols, 0) / MAX_CELLS)
+        coarser = f", or set a terrain.resolution_m that is at least {times:.1f} times coarser" if times > 1 else ""
+        raise TerrainError(f"{what} has {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed: crop it{coarser}")

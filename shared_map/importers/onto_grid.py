@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,10 @@ from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import Resampling
 
-from shared_map.importers.georeference import METRES, bounds_in, pixel_m, reprojecting, systems_of
+from shared_map.array_files import Floats
+from shared_map.importers.georeference import METRES, bounds_in, going_on, pixel_m, reprojecting, systems_of
+from shared_map.importers.raster_files import READ_ROWS
+from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -49,11 +51,14 @@ class Placed:
         width, height = pixel_m(self.transform, *size, self.crs, self.target)
         return self.grid.resolution_m >= 1.5 * max(width, height)
 
-    @contextmanager
-    def on_grid(self, how: str) -> Iterator[Any]:
-        """The raster as a dataset of float32 whose pixels are the cells of the grid; NaN where it shows nothing.
+    def on_grid(
+        self, how: str, indexes: Any = 1, what: str = "", progress: Progress = no_progress
+    ) -> Iterator[tuple[slice, Floats]]:
+        """Some rows of the grid at a time, and their values, float32; NaN where the raster shows nothing.
 
-        how  the name of one of rasterio's resamplings
+        how       the name of one of rasterio's resamplings
+        indexes   a band, or several
+        what      the current step, as `progress` tells it
         """
         grid, dataset = self.grid, self.dataset
         is_real = np.dtype(dataset.dtypes[0]).kind == "f"
@@ -62,11 +67,14 @@ class Placed:
         place = transform_of(grid)
         own = place if self.is_cells else self.transform
         size = {"width": grid.cols, "height": grid.rows, "dtype": "float32", "nodata": math.nan}
-        source = {"src_crs": self.crs, "src_transform": own, "src_nodata": void}
+        crs = going_on(self.crs, own, dataset.height, dataset.width)
+        source = {"src_crs": crs, "src_transform": own, "src_nodata": void}
         # A photo shows nothing only where no band does.
         target = {"crs": self.target, "transform": place, "NUM_THREADS": "ALL_CPUS", "UNIFIED_SRC_NODATA": "YES"}
         with WarpedVRT(dataset, resampling=resampling, **source, **target, **size) as cells:
-            yield cells
+            for row0, row1 in bands(grid.rows, READ_ROWS):
+                yield slice(row0, row1), cells.read(indexes, window=((row0, row1), (0, grid.cols)))
+                progress(what, row1 / grid.rows)
 
 
 def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: str = "terrain.crs") -> Placed:

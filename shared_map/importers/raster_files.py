@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import glob
 import itertools
 import lzma
 import math
@@ -41,7 +42,11 @@ _NAMELESS, _ZIPPED = (
 )
 _HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGNORECASE)
 """A line of a word and a value, in the header of a grid as text. Surfer's has lines of numbers."""
+_NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
 _SURFER_LINES = 5
+_VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows", "line 2"}
+"""Names of the word for no height, and of whole numbers; Surfer's header has lines without names."""
+_WORDS = {*_VOIDS, "type"}
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
 _HEAD_BYTES = 4096
@@ -61,6 +66,7 @@ READ_ROWS = 512
 """Rows that are read at once."""
 _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
 _MOST_TIMES, _DEEPEST = 32, 4
+_LOSSY, _RAW = ("JPEG", "WEBP"), ("EHdr", "ENVI")
 _MAX_PIXELS = 16 * MAX_CELLS
 """Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
@@ -87,18 +93,17 @@ class Numbers(NamedTuple):
 
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
-    if not path.is_file():  # a pipe would wait for ever
-        return False
-    if path.suffix.lower() in (*_NAMELESS, *PLAIN, ".zip"):
-        return True
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        return _magic_driver(file.read(_HEAD_BYTES)) is not None
+    if path.suffix.lower() in PLAIN:
+        return path.is_file()
+    with contextlib.suppress(OSError, TerrainError):
+        head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
+        return bool(_driver(head, Path(member or path).suffix.lower(), ""))
     return False
 
 
 @contextmanager
-def opened(path: Path, what: str) -> Iterator[Any]:
-    """A rasterio dataset; `what` names it in errors.
+def opened(path: Path, what: str, *, exact: bool = True) -> Iterator[Any]:
+    """A rasterio dataset; `what` names it in errors. Its numbers are `exact`, or may be compressed with loss.
 
     Raises
     ------
@@ -109,7 +114,6 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    check_file(path, FileKind.IMAGE)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -118,8 +122,14 @@ def opened(path: Path, what: str) -> Iterator[Any]:
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
                 contextlib.ExitStack() as files,
             ):
-                yield _georeferenced(path, what, files)
-    except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
+                dataset = _georeferenced(path, what, files)
+                packed = dataset.tags(ns="IMAGE_STRUCTURE")
+                if exact and (
+                    dataset.driver in _LOSSY or packed.get("COMPRESSION", "").rpartition(" ")[2] in _LOSSY
+                ):
+                    raise TerrainError(f"{what} {path} is compressed with loss, expected exact numbers")
+                yield dataset
+    except (RasterioError, CPLE_BaseError, UnicodeError) as error:  # the last of names, also inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
@@ -134,16 +144,19 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     if path.suffix.lower() in PLAIN:
         return in_memory(_plain(path, f"{what} {path}"), files)
     what = f"{what} {path}"
-    name, driver = _kind_of(path, what)
+    name, driver, length = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
     _check_size(dataset, what)
+    stated = dataset.height * dataset.width * sum(np.dtype(dtype).itemsize for dtype in dataset.dtypes)
+    if driver in _RAW and length != stated:  # GDAL reads what is missing as 0
+        raise TerrainError(f"{what} has {length} bytes, expected {stated}, as the header beside it says")
     if "text" in _FORMATS[driver]:
         if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
             cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
             raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-        crs = dataset.crs or (_system_beside(path, what) if str(name).startswith("/vsisubfile/") else None)
-        notes = (f"a grid as text, {driver}",)
-        return in_memory(Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, notes), files)
+        crs = dataset.crs or _system_beside(path, what)
+        text = Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, (f"a grid as text, {driver}",))
+        return in_memory(text, files)
     if dataset.transform.is_identity and dataset.gcps[0]:
         return files.enter_context(WarpedVRT(dataset))
     return dataset
@@ -160,7 +173,7 @@ def _plain(path: Path, what: str) -> Numbers:
 
 
 def _system_beside(path: Path, what: str) -> Any:
-    """The system of a .prj, which GDAL does not find beside a part of a file."""
+    """The system of a .prj, which GDAL reads beside some formats only."""
     from shared_map.importers.georeference import system_named
 
     found = path.with_suffix(".prj")
@@ -188,18 +201,18 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
     numbers = np.empty(dataset.height * dataset.width, np.float32)
     expected = f"its header says {dataset.height} rows of {dataset.width} numbers"
     with path.open("rb") as file:
-        lines, void = _skip_header(file, dataset.driver, what)
+        lines, void = _skip_header(file, dataset, what)
         count, rest = 0, b""
         for piece in itertools.chain(iter(partial(file.read, _TEXT_PIECE_BYTES), b""), (b"\n",)):
             text = rest + piece
             words = text.replace(b",", b".").split()
             rest = words.pop() if words and not text[-1:].isspace() else b""
-            fits = [b"nan" if each == void else each for each in words[: numbers.size - count]]
+            fits = [b"nan" if each == void else each.replace(b"_", b"?") for each in words[: numbers.size - count]]
             try:
                 numbers[count : count + len(fits)] = np.array(fits, np.float64)
                 wrong = len(fits)
             except ValueError:
-                wrong = next(n for n, each in enumerate(fits) if not _is_number(each))
+                wrong = next(n for n, each in enumerate(fits) if not _NUMBER.fullmatch(each))
             if wrong < len(words):
                 at = next(itertools.islice(re.finditer(rb"\S+", text), wrong, None)).start()
                 shown = words[wrong][:40].decode("ascii", "replace")
@@ -216,36 +229,47 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
     return grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
 
 
-def _skip_header(file: BinaryIO, driver: str, what: str) -> tuple[int, bytes | None]:
-    """Returns the number of the first line behind the header, and the word that stands for a void, if one does."""
-    header: dict[bytes, bytes] = {}
-    void, number = (b"*" if driver == "GRASSASCIIGrid" else None), 1
+def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | None]:
+    """Returns the number of the first line behind the header, and the word that stands for a void, if one does.
+
+    Raises TerrainError where GDAL reads another number than the header says: 3 columns of 3.7, 0 m of `x`.
+    """
+    header: dict[str, list[bytes]] = {}
+    driver, number = dataset.driver, 1
+    void = b"*" if driver == "GRASSASCIIGrid" else None
     while line := file.readline(_HEADER_LINE_BYTES):
-        words = line.replace(b":", b" ", 1).split()
+        key, *values = line.replace(b":", b" ", 1).split() or [b""]
         is_header = number <= _SURFER_LINES if driver == "GSAG" else _HEADER_LINE.match(line)
         if not is_header:
             file.seek(-len(line), 1)
             break
-        if words and words[0].lower() in (b"nodata_value", b"nodata", b"null"):
-            void = words[-1]
-        header |= {words[0].lower(): words[-1]} if words else {}
+        name = f"line {number}" if driver == "GSAG" else key.decode("ascii", "replace").lower()
+        if name in header:
+            raise TerrainError(f"{what}: its header says {name} twice")
+        if values:
+            header[name] = [key, *values] if driver == "GSAG" else values
+        if name in _VOIDS and values:
+            void = values[-1]
         number += 1
-    corner = [key for key in header if key.startswith((b"xll", b"yll"))]
-    if driver == "AAIGrid" and len({key[3:] for key in corner}) + (len(corner) != 2) != 1:
+    for name, word in [(name, word) for name, words in header.items() if name not in _WORDS for word in words]:
+        is_count = name in _COUNTS
+        if not _NUMBER.fullmatch(word) or (is_count and number_of(word) not in dataset.shape):
+            shown, kind = word[:40].decode("ascii", "replace"), "a whole number" if is_count else "a number"
+            raise TerrainError(f"{what}: its header says {name} {shown!r}, expected {kind}")
+    corner = [name for name in header if name.startswith(("xll", "yll"))]
+    if driver == "AAIGrid" and len({name[3:] for name in corner}) + (len(corner) != 2) != 1:
         raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")
-    if driver == "GRASSASCIIGrid":  # of which GDAL reads a part only
-        turned = [key for key in (b"north", b"south", b"east", b"west") if not _is_number(header.get(key, b""))]
-        if turned or header.get(b"multiplier", b"1").strip(b"0") not in (b"1", b"1."):
-            raise TerrainError(f"{what}: its header has degrees and minutes or a multiplier; write it as a .tif")
+    if number_of(header.get("multiplier", [b"1"])[0]) != 1:  # which GDAL does not read
+        raise TerrainError(f"{what}: its header has a multiplier; write it as a .tif")
     return number, void
 
 
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+def number_of(word: str | bytes) -> float:
+    """The value of a number as text. Raises ValueError if it is none; `1_0` is ten in Python only."""
+    text = word if isinstance(word, str) else word.decode("ascii")
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{text[:40]!r} is no number")
+    return float(text)
 
 
 def _check_size(dataset: Any, what: str) -> None:
@@ -272,46 +296,49 @@ def _check_size(dataset: Any, what: str) -> None:
             )
 
 
-def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
-    """Returns GDAL's name for a file, or for the one raster in it, and the driver that reads it.
+def _kind_of(path: Path, what: str) -> tuple[str | Path, str, int]:
+    """Returns GDAL's name for a file, or for the one raster in it, the driver that reads it, and its bytes.
 
     Raises TerrainError on a file that is not a raster; `what` names it. Raises OSError as `open` does.
     """
-    head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
-    if member is not None:
-        driver = _driver(head, Path(member).suffix.lower(), f"{what}: {member}")
-        if driver == "VRT":
-            raise TerrainError(f"{what}: {member} names other files; unpack it")
-        return f"/vsizip/{{{path}}}/{member}", driver
-    driver = _driver(head, path.suffix.lower(), what)
-    length = check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
+    head, member, length = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
+    named = path if member is None else Path(member)
+    driver = _driver(head, named.suffix.lower(), what if member is None else f"{what}: {member}")
+    if driver == "VRT" and member is not None:
+        raise TerrainError(f"{what}: {member} names other files; unpack it")
+    check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
     if driver == "SRTMHGT" and length not in _HGT_BYTES:  # it has no header: its length is its only description
         raise TerrainError(f"{what} is truncated or no .hgt: it has {length} bytes, expected one of {_HGT_BYTES}")
-    if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", path.stem, re.IGNORECASE):
+    if driver == "SRTMHGT" and not re.match(r"[ns]\d\d[ew]\d\d\d", named.stem, re.IGNORECASE):
         raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
         _check_virtual(path, what, {})
-    if head.startswith(codecs.BOM_UTF8):  # which GDAL takes for a letter
-        return f"/vsisubfile/3,{path}", driver
     beside = path.with_suffix(".hdr")
     if driver == "EHdr" and beside.is_file() and beside.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
-    return path, driver
+    # A mark of the order of bytes is a letter to GDAL.
+    plain = f"/vsisubfile/3,{path}" if head.startswith(codecs.BOM_UTF8) else path
+    return plain if member is None else f"/vsizip/{{{path}}}/{member}", driver, length
 
 
 def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> tuple[bytes, str | None, int]:
-    """The first bytes of a file; of a .zip those of the one file in it with such an ending, its name, and the size
-    of all parts of that file.
+    """The first bytes of a file, no name, and its size; of a .zip those of the one file in it with such an ending.
 
     Raises TerrainError if there are several such files, or they are larger than the kind allows.
     """
+    length = check_file(path, kind)
+    # GDAL opens what lies beside a file, too, such as its .prj: it would wait at a pipe for ever.
+    for beside in path.parent.glob(f"{glob.escape(path.stem)}.*"):
+        if beside.exists() and not (beside.is_file() or beside.is_dir()):
+            raise TerrainError(f"{what}: {beside} beside it is a device or pipe, not a file")
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     if not head.startswith(b"PK"):
-        return head, None, 0
+        return head, None, length
     try:
         with zipfile.ZipFile(path) as archive:
-            files = [each for each in archive.infolist() if not each.is_dir()]
+            # Finder adds a folder of its own.
+            files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
             named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
             if len(named) != 1:
                 raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")
@@ -321,20 +348,15 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
                 most = f"at most {size(kind.most_bytes)} are read"
                 raise TerrainError(f"{what}: {named[0]} has {size(unpacked)}, {most}: unpack it, and crop it")
             with archive.open(named[0]) as member:
-                return member.read(_HEAD_BYTES), named[0], unpacked
+                return member.read(_HEAD_BYTES), named[0], archive.getinfo(named[0]).file_size
     except BAD_ARCHIVE as error:
         raise TerrainError(f"{what} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
 
 
-def _magic_driver(head: bytes) -> str | None:
-    text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
-    return next(
-        (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic)), None
-    )
-
-
 def _driver(head: bytes, ending: str, what: str) -> str:
-    found = _magic_driver(head) or _NAMELESS.get(ending)
+    text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
+    found = next(begun, _NAMELESS.get(ending))
     if found is None:
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
         raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
@@ -356,9 +378,7 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
             continue
         source = path.parent / (node.text or "").strip()
-        check_file(source, FileKind.VIRTUAL_RASTER)
-        with source.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+        head, _, _ = beginning(source, (), FileKind.VIRTUAL_RASTER, what)
         _driver(head, source.suffix.lower(), f"{what}: {source}")  # GDAL knows other kinds, also of the network
         if b"<VRTDataset" in head:  # anywhere, for GDAL
             if depth >= _DEEPEST:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from shared_map.importers.cover.cover_codes import TABLES, some
 from shared_map.importers.georeference import METRES, check_metres, crs_of, overruled, plan_grid
 from shared_map.importers.level_ground import MOST_SAMPLED, looked_at, without
 from shared_map.importers.onto_grid import Placed
-from shared_map.importers.raster_files import NOTES, READ_ROWS, Numbers, in_memory, middle_of, opened, sampled
+from shared_map.importers.raster_files import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.sources import Source
-from shared_map.terrain.row_bands import Progress, bands
+from shared_map.terrain.row_bands import Progress
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
@@ -48,21 +48,16 @@ def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source
     what = f"terrain {path}"
     with opened(path, "terrain") as dataset, ExitStack() as files:
         is_cover = holds_cover(dataset, what, config)
-        place = _place_of(dataset, path, config, is_cover)
-        if is_cover:
-            return _level_cover(dataset, place, path, config, progress)
-        return _heights(dataset, place, [str(path), *place.notes], config, progress, files)
-
-
-def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    grid, _, notes = plan_grid(
-        place.transform, dataset.height, dataset.width, place.crs, config.resolution_m, f"terrain {path}"
-    )
-    cover = land_cover.read_cover(path, grid, config, progress)
-    level = np.zeros((grid.rows, grid.cols), np.float32)
-    alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
-    notes = [str(path), *place.notes, *notes, *cover.notes, alone]
-    return Source(grid, level, cover.classes, factor=cover.factor, notes=tuple(notes))
+        crs, transform, notes = _place_of(dataset, path, config, is_cover)
+        grid, target, planned = plan_grid(transform, dataset.height, dataset.width, crs, config.resolution_m, what)
+        placed = Placed(dataset, grid, transform, crs, target or crs, is_cells=target is None)
+        notes = (str(path), *notes, *planned)
+        if not is_cover:
+            return _heights(placed, path, notes, config, progress, files)
+        cover = land_cover.read_cover(path, grid, config, progress)
+        alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
+        level = np.zeros(grid.shape, np.float32)
+        return Source(grid, level, cover.classes, factor=cover.factor, notes=(*notes, *cover.notes, alone))
 
 
 # --- what it holds ------------------------------------------------------------------------------------------
@@ -122,17 +117,8 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
 # --- where it lies ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Coordinate system and affine transform of a raster, and what people should know of both."""
-
-    crs: Any
-    transform: Any
-    notes: tuple[str, ...] = ()
-
-
-def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -> _Place:
-    """Returns the georeference of a raster.
+def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -> tuple[Any, Any, tuple[str, ...]]:
+    """Returns the coordinate system of a raster, its affine transform, and what people should know of both.
 
     An image without a place lies anywhere, in metres, as numbers of our own reading do that have no system.
     """
@@ -143,54 +129,51 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
     if has_place and own is not None and not dataset.crs and config.crs is None:
         check_metres(dataset.transform.a, dataset.transform.c, what)
         notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
-        return _Place(rasterio.CRS.from_wkt(METRES), dataset.transform, notes)
+        return rasterio.CRS.from_wkt(METRES), dataset.transform, notes
     if has_place or not (is_cover or own is not None or path.suffix.lower() == ".png"):
         crs = crs_of(dataset.crs, config.crs, what)
-        return _Place(crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform)))
+        if crs.is_projected:
+            check_metres(dataset.transform.a, dataset.transform.c, what)
+        return crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform))
     is_grey = not is_cover and own is None
     if config.resolution_m is None or (is_grey and not config.height_scale):
         scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""
         raise TerrainError(f"{what} does not say how large a cell is; set terrain.resolution_m (metres){scale}")
     anywhere = from_origin(0.0, 0.0, config.resolution_m, config.resolution_m)
-    return _Place(rasterio.CRS.from_wkt(METRES), anywhere, notes)
+    return rasterio.CRS.from_wkt(METRES), anywhere, notes
 
 
 # --- heights ------------------------------------------------------------------------------------------------
 
 
 def _heights(
-    dataset: Any, place: _Place, notes: list[str], config: TerrainConfig, progress: Progress, files: ExitStack
+    placed: Placed, path: Path, notes: tuple[str, ...], config: TerrainConfig, progress: Progress, files: ExitStack
 ) -> Source:
     """Heights of the first band on a square metric grid, some rows at a time. Bilinear; averaged where cells grow
     by half or more."""
-    what = f"terrain {config.source}"
-    if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-        raise TerrainError(f"{what} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
-    shape = dataset.height, dataset.width
-    grid, target, planned = plan_grid(place.transform, *shape, place.crs, config.resolution_m, what)
-    factor, offset, scale_notes = _scale_of(dataset, place.crs, config)
+    dataset, grid = placed.dataset, placed.grid
+    factor, offset, scale_notes = _scale_of(dataset, placed.crs, config)
     if dataset.count == 2:
         scale_notes.append("the file has two bands; heights are taken from the first")
     some = sampled(dataset, 1, MOST_SAMPLED).astype(np.float32).filled(np.nan)
     voids, found, looks = looked_at(np.where(np.isfinite(some), some, np.float32(np.nan)), config, factor, offset)
-    if voids and target is not None:  # GDAL warps one value of no height only; of a second one it would make slopes
-        dataset = in_memory(Numbers(_whole(dataset, voids, what), place.transform, place.crs), files)
-    placed = Placed(dataset, grid, place.transform, place.crs, target or place.crs, is_cells=target is None)
-    stretch = Affine.scale(dataset.width / found.shape[1], dataset.height / found.shape[0])
-    flat = in_memory(Numbers(found.astype(np.float32), place.transform @ stretch, place.crs), files)
-    with Placed(flat, grid, flat.transform, place.crs, placed.target).on_grid("nearest") as cells:
-        level = cells.read(1) > 0
+    if (
+        voids and not placed.is_cells
+    ):  # GDAL warps one value of no height only; of a second one it would make slopes
+        whole = Numbers(_whole(dataset, voids, f"terrain {path}"), placed.transform, placed.crs)
+        placed = replace(placed, dataset=in_memory(whole, files))
+    stretch = placed.transform @ Affine.scale(dataset.width / found.shape[1], dataset.height / found.shape[0])
+    flat = in_memory(Numbers(found.astype(np.float32), stretch, placed.crs), files)
+    seen = Placed(flat, grid, stretch, placed.crs, placed.target).on_grid("nearest")
+    level = np.concatenate([values > 0 for _, values in seen])
     elevation_m = np.empty(grid.shape, np.float32)
-    with placed.on_grid("average" if placed.grows else "bilinear") as cells:
-        for row0, row1 in bands(grid.rows, READ_ROWS):
-            band = elevation_m[row0:row1]
-            band[:] = without(cells.read(1, window=((row0, row1), (0, grid.cols))), voids)
-            if (factor, offset) != (1.0, 0.0):
-                band *= np.float32(factor)
-                band += np.float32(offset)
-            progress("reading heights", row1 / grid.rows)
+    for rows, stored in placed.on_grid("average" if placed.grows else "bilinear", 1, "reading heights", progress):
+        elevation_m[rows] = without(stored, voids)
+        if (factor, offset) != (1.0, 0.0):
+            elevation_m[rows] *= np.float32(factor)
+            elevation_m[rows] += np.float32(offset)
     classes = np.zeros(elevation_m.shape, np.uint8)
-    return Source(grid, elevation_m, classes, level=level, notes=(*notes, *planned, *scale_notes, *looks))
+    return Source(grid, elevation_m, classes, level=level, notes=(*notes, *scale_notes, *looks))
 
 
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:

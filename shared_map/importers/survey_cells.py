@@ -40,9 +40,9 @@ _TRIED_CELLS, _LONGEST = 40, 1000
 """Surveyed cells of the first try. The longer a line, the more exact is the factor; a thousand cells suffice."""
 _PHASES = 8
 """A filter that is off by a sixteenth of a surveyed cell still fits better than others."""
-_MAYBE, _SURE = 0.7, 0.1
+_MAYBE, _SURE = 0.7, 0.03
 """The error of a filter that fits, as a share of the error of the same one moved by half a surveyed cell. Exact
-sums leave none; a file in whole metres leaves its rounding."""
+sums leave a thousandth, and a file that lacks one row in ten, which has a period as well, leaves 0.05."""
 _ALIKE = 3.0
 """Errors of rounding differ by less than this factor."""
 _LEVEL_M = 0.002
@@ -108,8 +108,10 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
         heights_m = elevation_m[tuple(nearest)]
     of_line = []
     for _ in range(2):
-        found, at = _resampling_of(heights_m), np.arange(len(heights_m))
-        if found is not None:
+        at = _repeated(heights_m)
+        if at[-1] + 1 < len(at):
+            heights_m = heights_m[np.unique(at, return_index=True)[1]]
+        elif (found := _resampling_of(heights_m)) is not None:
             at = np.rint(found.at(len(heights_m))).astype(np.intp)
             heights_m = _recovered(heights_m, found)
             at = np.clip(at - at[0] - _REACH, 0, len(heights_m) - 1)
@@ -122,6 +124,21 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
     if void.any():
         heights_m[rows[:, None].repeat(len(cols), 1)[void], cols[None].repeat(len(rows), 0)[void]] = np.nan
     return heights_m, rows, cols
+
+
+def _repeated(heights_m: Floats) -> NDArray[np.intp]:
+    """The number of the surveyed row that each row repeats, as the nearest cell's height does in a finer file."""
+    rows = np.arange(len(heights_m))
+    change = np.flatnonzero((np.diff(heights_m, axis=0) != 0).any(axis=1)) + 1
+    times = np.diff(change)
+    # Rows which are level as a whole, as those of a sea, repeat one another, too.
+    if len(change) < _TRIED_CELLS or (factor := times[times <= np.median(times) + 1].mean()) < _LEAST_FACTOR:
+        return rows
+    starts = np.concatenate(([change[0] - math.ceil(change[0] / factor) * factor], change))
+    number = np.concatenate(([0], np.cumsum(np.rint(np.diff(starts) / factor)))).astype(np.intp)
+    last = np.searchsorted(starts, rows, "right") - 1
+    at = number[last] + ((rows - starts[last]) / factor).astype(np.intp)
+    return np.unique(at, return_inverse=True)[1]
 
 
 def _resampling_of(heights_m: Floats) -> _Resampling | None:
@@ -164,6 +181,9 @@ def _flattest(lines: _Doubles, found: _Resampling) -> _Resampling:
 
 def _factors(heights_m: Floats) -> list[float]:
     """The factors by which a file may have been made finer, the largest first."""
+    from scipy.ndimage import uniform_filter1d
+    from scipy.signal import find_peaks
+
     peaks: Any = 0
     size = 1 << math.ceil(math.log2(4 * len(heights_m)))
     some = heights_m[:, :: max(heights_m.shape[1] // _LONGEST, 1)].astype(np.float64)
@@ -172,21 +192,15 @@ def _factors(heights_m: Floats) -> list[float]:
         if not bends.any():
             return []
         bends = np.log(np.maximum(bends, bends.mean() / 100))
-        bends -= np.convolve(np.pad(bends, _SMOOTHED // 2, "edge"), np.ones(_SMOOTHED) / _SMOOTHED, "valid")
+        bends -= uniform_filter1d(bends, _SMOOTHED, mode="nearest")
         peaks = peaks + np.abs(np.fft.rfft(bends * np.hanning(len(bends)), size))
     per_cell = np.arange(len(peaks)) / size
     peaks[per_cell < _SLOWEST] = 0
     if not peaks.any():
         return []
-    usual = np.median(peaks[peaks > 0])
-    found = {2.0}
-    apart = _PEAK_APART * 4
-    for _ in range(_PEAKS):
-        n = int(peaks.argmax())
-        if peaks[n] <= 0 or peaks[n] < _PEAK * usual:
-            break
-        found |= {times / often for often in (per_cell[n], 1 - per_cell[n]) for times in (1, 2, 3)}
-        peaks[max(n - apart, 0) : n + apart + 1] = 0
+    at, shown = find_peaks(peaks, height=_PEAK * np.median(peaks[peaks > 0]), distance=4 * _PEAK_APART)
+    highest = per_cell[at[np.argsort(shown["peak_heights"])[-_PEAKS:]]]
+    found = {2.0, *(times / often for each in highest for often in (each, 1 - each) for times in (1, 2, 3))}
     return sorted((each for each in found if _LEAST_FACTOR <= each <= _MOST_FACTOR), reverse=True)
 
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from rasterio import CRS
 from rasterio.transform import from_origin
 
-from shared_map.array_files import Floats
-from shared_map.importers.array_grids import check_cells
+from shared_map.importers.georeference import check_size
 from shared_map.importers.raster_files import Numbers
 from swarm.config.input_files import MAX_LINE_BYTES, FileKind, check_bytes, size
 from swarm.errors import TerrainError
@@ -155,12 +154,6 @@ def _numbers(layout: _Layout) -> Iterator[Points]:
             raise
 
 
-def _heights(numbers: Points) -> Floats:
-    """A value that is too large for float32 becomes infinite, which is no-data."""
-    with np.errstate(over="ignore"):
-        return numbers.astype(np.float32)
-
-
 # --- points -------------------------------------------------------------------------------------------------
 
 
@@ -187,12 +180,14 @@ def _points(layout: _Layout) -> Numbers:
     cells, steps = down.cells * across.cells, f"{across.step:g} x {down.step:g}"
     if total < _LEAST_FILLED * cells:
         raise _irregular(what, f"{total} points are {total / cells:.1%} of a grid of {steps}")
-    check_cells(down.cells, across.cells, what)
+    check_size(down.cells, across.cells, what)
     heights = np.full(cells, np.nan, np.float32)
     for part in _numbers(layout):  # a second time: to hold the points would take ten times their grid
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
         row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
-        at, z = row * across.cells + col, _heights(part[:, 2])
+        at = row * across.cells + col
+        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite, which is no-data
+            z = part[:, 2].astype(np.float32)
         before = heights[at]
         heights[at] = z
         other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))

@@ -25,10 +25,10 @@ from shared_map.importers.cover.cover_codes import (
     table_named,
 )
 from shared_map.importers.onto_grid import place_on
-from shared_map.importers.raster_files import READ_ROWS, opened, sampled
+from shared_map.importers.raster_files import opened, sampled
 from shared_map.importers.sources import Source
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.row_bands import Progress, bands, no_progress
+from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -105,10 +105,10 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
     with opened(path, "land cover") as dataset:
         found = meaning_of(dataset, what, config)
         if found is None:
-            codes = some(np.unique(sampled_codes(dataset, what)).tolist())
+            listed = some(np.unique(sampled_codes(dataset, what)).tolist())
             titles = ", ".join(each.title for each in TABLES.values())
             raise TerrainError(
-                f"{what}: its codes ({codes}) are those of no built-in table ({titles}); name a CSV file of code"
+                f"{what}: its codes ({listed}) are those of no built-in table ({titles}); name a CSV file of code"
                 " and class in terrain.cover_codes"
             )
         table, known_by = found
@@ -123,12 +123,10 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
         classes, factor = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
         known = np.empty(grid.shape, np.bool_)
         counts = np.zeros(HIGHEST_CODE + 3, np.int64)
-        with placed.on_grid(how) as cells:
-            for row0, row1 in bands(grid.rows, READ_ROWS):
-                at = _entries(cells.read(1, window=((row0, row1), (0, grid.cols))))
-                classes[row0:row1], factor[row0:row1], known[row0:row1] = kinds[at], factors[at], states[at] == 0
-                counts += np.bincount(at.reshape(-1), minlength=len(counts))
-                progress("reading land cover", row1 / grid.rows)
+        for rows, codes in placed.on_grid(how, 1, "reading land cover", progress):
+            at = _entries(codes)
+            classes[rows], factor[rows], known[rows] = kinds[at], factors[at], states[at] == 0
+            counts += np.bincount(at.reshape(-1), minlength=len(counts))
         return Cover(classes, factor, known, (*notes, *_notes_on(what, table, known_by, counts, states)))
 
 
@@ -218,12 +216,10 @@ def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
             f"{what} has {dataset.count} bands, expected one of codes; an image of a map holds no codes, the raster"
             " of the product is needed; a photo goes into terrain.photo"
         )
-    kind = np.dtype(dataset.dtypes[0]).kind
     values = sampled(dataset, 1, _MOST_SAMPLED).compressed()
-    if kind == "f":
-        values = values[np.isfinite(values)]
-    if kind not in "iuf" or (kind == "f" and (values % 1 != 0).any()):
-        raise TerrainError(f"{what} holds {'real' if kind == 'f' else dataset.dtypes[0]} numbers; codes are whole")
+    values = values[np.isfinite(values)]
+    if (values % 1 != 0).any():
+        raise TerrainError(f"{what} holds real numbers; codes are whole")
     return np.asarray(values[values >= 0])
 
 

@@ -13,8 +13,8 @@ from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.onto_grid import Placed, place_on
-from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, sampled
-from shared_map.terrain.row_bands import Progress, bands, no_progress
+from shared_map.importers.raster_files import middle_of, opened, sampled
+from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -71,7 +71,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
         nothing of it, or if one of the two has no place on earth and they differ in size.
     """
     what = f"photo {path}"
-    with opened(path, "photo") as dataset:
+    with opened(path, "photo", exact=False) as dataset:
         placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
         size = f"{dataset.height} x {dataset.width} pixels"
         notes = [str(path), f"photo: {size}, covers {placed.share:.1%} of the terrain"]
@@ -95,13 +95,9 @@ def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
     how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
-    with placed.on_grid(how) as cells:
-        for row0, row1 in bands(grid.rows, READ_ROWS):
-            raw = cells.read(indexes, window=((row0, row1), (0, grid.cols)))
-            inside = ~np.isnan(raw).any(axis=0)
-            seen[row0:row1] = inside
-            rgb[row0:row1] = colours(np.where(inside, raw, 0)) * inside[..., None]
-            progress("reading photo", row1 / grid.rows)
+    for rows, raw in placed.on_grid(how, indexes, "reading photo", progress):
+        seen[rows] = ~np.isnan(raw).any(axis=0)
+        rgb[rows] = colours(np.nan_to_num(raw)) * seen[rows, :, None]
     if not seen.any():
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():

@@ -117,6 +117,7 @@ class _Worth:
 
     def __init__(self, zone: ZoneConfig, layer: Layer, facts: FileFacts) -> None:
         self._zone, self._layer, self._facts = zone, layer, facts
+        self.closes = zone.kind in ("forbidden", "keep_in")
         self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
         name, assumed = zone.attribute, () if self._kind is None else COLUMNS[self._kind]
         has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
@@ -157,17 +158,13 @@ class _Worth:
                 way = self._way(tags, id)
                 bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
                 self._facts.bridges += bridge
-                inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no")
-                ways[key] = way, bridge, self.closes and inclusion.lower() in ("yes", "true", "1")
+                inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no").lower()
+                ways[key] = way, bridge, self.closes and inclusion in ("yes", "true", "1")
             way, bridge, inside = ways[key]
             if way is not None:
                 if inside and not way.width_m and shape.geom_type != "Polygon":
                     raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")
                 yield shape, id, way, bridge, inside
-
-    @property
-    def closes(self) -> bool:
-        return self._zone.kind in ("forbidden", "keep_in")
 
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""

@@ -19,7 +19,8 @@ from xml.etree import ElementTree
 import msgspec
 from msgspec import Meta, Struct
 
-from shared_map.importers.raster_files import beginning
+from shared_map.importers.georeference import system_named
+from shared_map.importers.raster_files import beginning, number_of
 from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 
@@ -41,25 +42,16 @@ _MAGIC = {
 """First bytes -> format. GDAL knows 80 formats, some of which name other files."""
 _ROOTS = {b"kml": "LIBKML", b"gpx": "GPX", b"osm": "OSM"}
 _ROOT = re.compile(rb"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*|<!DOCTYPE[^>\[]*>\s*)*<(?:\w+:)?(\w+)[\s/>]", re.DOTALL)
-_CONVERTED = {
-    b"PAR1": "GeoParquet",
-    b"\0\0\0\x0d\x0a\x09OSMHeader": "OSM PBF",
-    b"\0\0\0\x0e\x0a\x09OSMHeader": "OSM PBF",
-}
-"""First bytes of formats that are not read here."""
 _SQLITE, _APPLICATION = b"SQLite format 3\0", slice(68, 70)
 """Beginning of a database, and where it says to which application it belongs: GP10, GP11 or GPKG."""
-_CONVERT = "is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
 
 
 def kind_of(head: bytes, what: str) -> Kind | None:
     """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
-    for magic, name in _CONVERTED.items():
-        if head.startswith(magic):
-            raise TerrainError(f"{what} is {name}, which {_CONVERT}")
     if head.startswith(_SQLITE):
         if head[_APPLICATION] != b"GP":
-            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; it {_CONVERT}")
+            how = "it is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
+            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; {how}")
         return Kind("GPKG")
     head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
@@ -85,39 +77,56 @@ _Line = Annotated[list[Position], Meta(min_length=2)]
 _Area = Annotated[list[_Ring], Meta(min_length=1)]
 
 
-class Point(Struct, tag_field="type", frozen=True):
+class _System(Struct, frozen=True):
+    """Name of a system as GDAL reads it; it takes others for degrees."""
+
+    type: Literal["name", "EPSG", "OGC"]
+    properties: dict[str, str | int]
+
+    def check(self, what: str) -> None:
+        key, before = {"name": ("name", ""), "EPSG": ("code", "EPSG:"), "OGC": ("urn", "")}[self.type]
+        system_named(f"{before}{self.properties.get(key, '')}", what)
+
+
+class _Shape(Struct, tag_field="type", frozen=True, kw_only=True, omit_defaults=True):
+    crs: _System | None = None
+
+
+class Point(_Shape, frozen=True):
     coordinates: Position
 
 
-class MultiPoint(Struct, tag_field="type", frozen=True):
+class MultiPoint(_Shape, frozen=True):
     coordinates: Annotated[list[Position], Meta(min_length=1)]
 
 
-class LineString(Struct, tag_field="type", frozen=True):
+class LineString(_Shape, frozen=True):
     coordinates: _Line
 
 
-class MultiLineString(Struct, tag_field="type", frozen=True):
+class MultiLineString(_Shape, frozen=True):
     coordinates: Annotated[list[_Line], Meta(min_length=1)]
 
 
-class Polygon(Struct, tag_field="type", frozen=True):
+class Polygon(_Shape, frozen=True):
     coordinates: _Area
 
 
-class MultiPolygon(Struct, tag_field="type", frozen=True):
+class MultiPolygon(_Shape, frozen=True):
     coordinates: Annotated[list[_Area], Meta(min_length=1)]
 
 
-class GeometryCollection(Struct, tag_field="type", frozen=True):
+class GeometryCollection(_Shape, frozen=True):
     geometries: Annotated[list[Geometry], Meta(min_length=1)]
 
 
 Geometry = Point | MultiPoint | LineString | MultiLineString | Polygon | MultiPolygon | GeometryCollection
 
 
-class Feature(Struct, tag_field="type", frozen=True):
+class Feature(_Shape, frozen=True):
     geometry: Geometry
+    properties: msgspec.Raw = msgspec.Raw(b"null")
+    id: msgspec.Raw = msgspec.Raw(b"null")
 
 
 class _Document(Struct, frozen=True):
@@ -125,8 +134,9 @@ class _Document(Struct, frozen=True):
 
     type: str = ""
     features: list[msgspec.Raw] | None = None
+    crs: _System | None = None
+    name: str = ""
     fileType: str = ""  # noqa: N815
-    geometryType: str = ""  # noqa: N815
 
 
 _document = msgspec.json.Decoder(_Document)
@@ -140,17 +150,18 @@ INCLUSION = "inclusion"
 """Column of a fence: yes if all but the area is closed."""
 
 
-def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
-    """Checks every coordinate of a GeoJSON, also of one with a feature a line.
+def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
+    """The features of a GeoJSON, a sequence of them, or a fence, as a GeoJSON for GDAL: every coordinate has been
+    checked, and what has not been looked at, as a key that comes twice, is not in it.
 
-    Returns its content as a GeoJSON where GDAL cannot read the file itself, as that of a fence; else None.
+    name  of the layer, if the file does not name it
 
     Raises TerrainError with one sentence, which names the first feature that cannot be read.
     """
     number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(_RECORD, b"")
     try:
         if kind.text == "fence":
-            return fence_of_waypoints(text.decode("ascii"))
+            return _collection(fence_of_waypoints(text.decode("ascii")), name)
         try:
             document = _document.decode(text)
         except msgspec.DecodeError as error:
@@ -158,22 +169,34 @@ def checked_json(data: bytes, kind: Kind, what: str) -> bytes | None:
                 raise
             document = _Document(features=_lines.decode_lines(text))
         if document.fileType:
-            return fence_of_plan(text)
-        foreign = "TopoJSON" if document.type == "Topology" else "ArcGIS JSON" if document.geometryType else ""
-        if foreign:
-            raise TerrainError(f"{what} is {foreign}, which {_CONVERT}")
-        if document.type == "FeatureCollection" and document.features is None:
-            raise TerrainError(f"{what} is damaged: a FeatureCollection without features")
-        features = document.features if document.features is not None else [msgspec.Raw(text)]
-        for number, each in enumerate(features, 1):  # noqa: B007
-            _feature.decode(each)
-        return None if document.type and _RECORD not in data else _collection(features)
+            return _collection(fence_of_plan(text), name)
+        if document.type == "FeatureCollection" and not document.features:
+            raise TerrainError(f"{what} holds no feature")
+        if document.crs is not None:
+            document.crs.check(f"{what}: its crs")
+        features = []
+        for number, each in enumerate(document.features or [msgspec.Raw(text)], 1):  # noqa: B007
+            found = _feature.decode(each)
+            feature = found if isinstance(found, Feature) else Feature(geometry=found)
+            if not all(crs in (None, document.crs) for crs in (feature.crs, feature.geometry.crs)):
+                raise ValueError("its crs is not that of the file")
+            features.append(msgspec.Raw(msgspec.json.encode(feature)))
+        return _collection(features, document.name or name, document.crs)
     except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
         at = f"feature number {number} cannot be used: " if number else ""
         raise TerrainError(f"{what} is damaged: {at}{error}; repair or remove it") from error
 
 
 # --- XML ----------------------------------------------------------------------------------------------------
+
+
+_ONE_OF = {
+    "Placemark": ("Point", "LineString", "LinearRing", "Polygon", "MultiGeometry", "Track", "MultiTrack", "Model"),
+    "Polygon": ("outerBoundaryIs",),
+    **dict.fromkeys(("outerBoundaryIs", "innerBoundaryIs"), ("LinearRing",)),
+    **dict.fromkeys(("Point", "LineString", "LinearRing"), ("coordinates",)),
+}
+"""Elements of KML, and what each holds once."""
 
 
 def checked_xml(data: bytes, what: str) -> None:
@@ -192,7 +215,7 @@ def checked_xml(data: bytes, what: str) -> None:
             name = element.tag.rpartition("}")[2]
             places: list[list[str]] = []
             if name == "coordinates":
-                text = re.sub(r"\s*,\s*", ",", (element.text or "").strip())
+                text = re.sub(r"\s*,\s*", ",", "".join(element.itertext()).strip())
                 places = [place.split(",") for place in text.split()] or [[]]
             elif name == "coord":
                 places = [(element.text or "").split()]
@@ -200,9 +223,13 @@ def checked_xml(data: bytes, what: str) -> None:
                 places = [[element.get("lon", ""), element.get("lat", "")]]
             for place in places:
                 with contextlib.suppress(ValueError):
-                    if len(place) in (2, 3) and math.isfinite(sum(map(float, place))):
+                    if len(place) in (2, 3) and math.isfinite(sum(map(number_of, place))):
                         continue
                 raise TerrainError(f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers")
+            held = [inner.tag.rpartition("}")[2] for inner in element]
+            parts = _ONE_OF.get(name, ())
+            if parts and (count := sum(map(held.count, parts))) != 1:  # of several, GDAL reads the last
+                raise TerrainError(f"{what} is damaged: a {name} holds {count} of {', '.join(parts)}, expected one")
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
             if name == "way":
@@ -264,23 +291,21 @@ class _Plan(Struct, frozen=True):
     geoFence: _Fence  # noqa: N815
 
 
-def fence_of_plan(data: bytes) -> bytes:
-    """The fence of a QGroundControl .plan as GeoJSON."""
+def fence_of_plan(data: bytes) -> list[dict[str, Any]]:
+    """The fence of a QGroundControl .plan as features of a GeoJSON."""
     fence = msgspec.json.decode(data, type=_Plan).geoFence
-    return _collection(
-        [_area(each.polygon, each.inclusion) for each in fence.polygons]
-        + [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
-    )
+    areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
+    return areas + [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
 
 
-def fence_of_waypoints(text: str) -> bytes:
-    """The fence of a Mission Planner .waypoints as GeoJSON; of a mission, the line of its places.
+def fence_of_waypoints(text: str) -> list[dict[str, Any]]:
+    """The fence of a Mission Planner .waypoints as features of a GeoJSON; of a mission, the line of its places.
 
     Raises ValueError if a row is damaged.
     """
-    rows = [[float(word) for word in line.split()] for line in text.splitlines()[1:] if line.strip()]
-    if not all(len(row) == 12 and math.isfinite(sum(row)) for row in rows):
-        raise ValueError("a row does not have 12 numbers")
+    rows = [[number_of(word) for word in line.split()] for line in text.splitlines()[1:] if line.strip()]
+    if not all(len(row) == 12 and math.isfinite(sum(row)) and row[3] % 1 == 0 for row in rows):
+        raise ValueError("a row does not have 12 numbers, the fourth a whole one")
     found: list[dict[str, Any]] = []
     path: list[list[float]] = []
     while rows:
@@ -288,8 +313,8 @@ def fence_of_waypoints(text: str) -> bytes:
         if command in (_POLYGON_IN, _POLYGON_OUT):
             count = int(extent)
             ring = rows[: max(count, 0)]
-            if not 3 <= count <= len(rows) or [row[3:5] for row in ring] != [rows[0][3:5]] * count:
-                raise ValueError(f"a fence polygon of {count} corners has not as many")
+            if not 3 <= count == extent <= len(rows) or [row[3:5] for row in ring] != [rows[0][3:5]] * count:
+                raise ValueError(f"a fence polygon of {extent:g} corners has not as many")
             found.append(_area([row[8:10] for row in ring], command == _POLYGON_IN))
             del rows[: count - 1]
         elif command in (_CIRCLE_IN, _CIRCLE_OUT):
@@ -300,8 +325,8 @@ def fence_of_waypoints(text: str) -> bytes:
             path.append(place[::-1])
         del rows[0]
     if len(path) > 1:
-        found.append({"type": "Feature", "properties": {}, "geometry": LineString(path)})
-    return _collection(found)
+        found.append({"type": "Feature", "properties": {}, "geometry": LineString(coordinates=path)})
+    return found
 
 
 _LAST_NAV = 95
@@ -311,16 +336,16 @@ _POLYGON_IN, _POLYGON_OUT, _CIRCLE_IN, _CIRCLE_OUT = 5001, 5002, 5003, 5004
 
 def _area(ring: list[list[float]], inside: bool) -> dict[str, Any]:
     corners = [[lon, lat] for lat, lon, *_ in ring]
-    return _fence(Polygon([[*corners, corners[0]]]), inside)
+    return _fence(Polygon(coordinates=[[*corners, corners[0]]]), inside)
 
 
 def _disc(centre: list[float], radius_m: float, inside: bool) -> dict[str, Any]:
-    return _fence(Point([centre[1], centre[0]]), inside, radius=max(round(radius_m, 3), 0.001))
+    return _fence(Point(coordinates=[centre[1], centre[0]]), inside, radius=max(round(radius_m, 3), 0.001))
 
 
 def _fence(shape: Geometry, inside: bool, **extent: float) -> dict[str, Any]:
     return {"type": "Feature", "properties": {INCLUSION: "yes" if inside else "no", **extent}, "geometry": shape}
 
 
-def _collection(features: Sequence[object]) -> bytes:
-    return msgspec.json.encode({"type": "FeatureCollection", "features": features})
+def _collection(features: Sequence[object], name: str, crs: _System | None = None) -> bytes:
+    return msgspec.json.encode({"type": "FeatureCollection", "name": name, "crs": crs, "features": features})

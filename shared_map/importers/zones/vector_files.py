@@ -113,12 +113,10 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             index = listed[:, 0].tolist().index(name)
             info = pyogrio.read_info(source, layer=index, force_feature_count=True)
             count = int(info["features"])
-            index_file = path.with_suffix(".SHX" if path.suffix.isupper() else ".shx")
-            if kind.driver == "ESRI Shapefile" and index_file.is_file():
-                count = max(count, (index_file.stat().st_size - 100) // 8)  # GDAL believes its header
+            if kind.driver == "ESRI Shapefile":
+                count = max(count, _check_index(path, source, what))  # GDAL believes the header of the index
             columns = tuple(str(field) for field in info["fields"])
-            shown = name if isinstance(source, str) else path.stem
-            found.append(Layer(source, what, index, shown, str(info["crs"] or ""), columns, count))
+            found.append(Layer(source, what, index, name, str(info["crs"] or ""), columns, count))
         return found
 
 
@@ -200,7 +198,7 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
-        head, member, unpacked = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
+        head, member, length = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
     kind = kind_of(head, what)
@@ -215,18 +213,39 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if kind.text is None:
         return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
-    if unpacked > FileKind.VECTOR_TEXT.most_bytes:
-        raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(unpacked)}")
+    if member is not None and length > FileKind.VECTOR_TEXT.most_bytes:
+        raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(length)}")
     data = _read(path, member)
     if kind.text == "xml":
         checked_xml(data, what)
         return source, kind
-    return checked_json(data, kind, what) or f"GeoJSON:{source}", kind
+    return checked_json(data, kind, what, path.stem.encode("utf-8", "replace").decode()), kind
 
 
-def _read(path: Path, member: str | None) -> bytes:
+def _check_index(path: Path, source: str | bytes, what: str) -> int:
+    """The number of shapes of a Shapefile, whose index must be its own: GDAL reads whatever lies where it says."""
+    _, _, member = str(source).partition("}/")
+    parts = []
+    for ending in (".shp", ".shx"):
+        part = b""
+        for name in (ending, ending.upper()):
+            with contextlib.suppress(KeyError, TerrainError):  # there is no such part
+                inner = str(Path(member).with_suffix(name)) if member else None
+                part = _read(path if member else path.with_suffix(name), inner, FileKind.VECTORS)
+        parts.append(np.frombuffer(part, np.uint8))
+    shapes, index = parts
+    at, length = 2 * index[100:][: len(index[100:]) // 8 * 8].view(">i4").reshape(-1, 2).T.astype(np.int64)
+    end, ends = 2 * int(shapes[24:28].view(">i4")[0]), at + 8 + length
+    inside = (at >= 100).all() and (length >= 4).all() and end <= ends.max(initial=100) <= len(shapes)
+    heads = shapes[at[:, None] + np.arange(4, 8)] if inside else np.zeros((0, 4), np.uint8)
+    if not np.array_equal(2 * heads.view(">i4")[:, 0], length):
+        raise TerrainError(f"{what} is damaged: its .shx is that of another file; make both anew")
+    return len(at)
+
+
+def _read(path: Path, member: str | None, kind: FileKind = FileKind.VECTOR_TEXT) -> bytes:
     if member is None:
-        return read_bytes(path, FileKind.VECTOR_TEXT)
+        return read_bytes(path, kind)
     with zipfile.ZipFile(path) as archive:
         return archive.read(member)
 

@@ -34,8 +34,8 @@ _MOST_CROSSINGS = 50_000
 _STEP_M = 1000.0
 """Longer edges are cut: a straight edge in one system is bent in another, by some centimetres over this length."""
 _DEG_M = 111_000.0
-POLYGON = 3
-"""Number of a polygon among the types of shapely."""
+_LINE, POLYGON = 1, 3
+"""Numbers of a line and of a polygon among the types of shapely."""
 _MOST_BURNT_CELLS = 1 << 34
 _HEAVY = 50_000_000
 """Corners times rows of a polygon: GDAL looks at every corner in every row."""
@@ -242,6 +242,9 @@ def _mended(
     Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
     """
     shapes = features.shapes.copy()
+    # A line of one place is a point: GEOS does not cut it.
+    still = (shapely.get_type_id(shapes) == _LINE) & (shapely.length(shapes) == 0)
+    shapes[still] = shapely.get_point(shapes[still], 0)
     polygons = near & (shapely.get_type_id(shapes) == POLYGON)
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
     for n in wrong:

@@ -14,7 +14,6 @@ from shared_map.importers.onto_grid import place_on
 from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones.shape_texts import is_vector
 from swarm.config.ground import ZoneConfig
-from swarm.config.input_files import FileKind, check_file
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 
@@ -70,10 +69,6 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     assert zone.file is not None
     path = Path(zone.file)
     what = f"{where} {path}"
-    try:
-        check_file(path, FileKind.VECTORS)
-    except TerrainError as error:
-        raise TerrainError(f"{where}: {error}") from error
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
     from shared_map.importers.zones.drawings import closed_shapes, draw_zone
@@ -96,12 +91,12 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")
     with opened(path, where) as dataset:
         placed = place_on(dataset, grid, zone.crs, what, "crs")
-        if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
-            found = f"{dataset.count} bands of {dataset.dtypes[0]}"
-            raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
+        if dataset.count != 1:
+            raise TerrainError(f"{what} has {dataset.count} bands of {dataset.dtypes[0]}, expected one")
         # The nearest cell counts, or the mean where cells of the grid are half as large again.
-        with placed.on_grid("average" if placed.grows else "nearest") as cells:
-            values = cells.read(1) * np.float32(dataset.scales[0] or 1.0) + np.float32(dataset.offsets[0] or 0.0)
+        stored = placed.on_grid("average" if placed.grows else "nearest")
+        values = np.concatenate([rows for _, rows in stored])
+        values = values * np.float32(dataset.scales[0] or 1.0) + np.float32(dataset.offsets[0] or 0.0)
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]

@@ -1,5 +1,6 @@
 """Files of zones with any damage: all features close their ground, or the file is refused by name."""
 
+import itertools
 import json
 import os
 import random
@@ -195,6 +196,8 @@ SAME = {
     "lines of geojson": FEATURE.replace("[[[", "[\n[[") + "\n",
     "geojson lines": f"{FEATURE}\n{FEATURE}\n",
     "geojson sequence": f"\x1e{FEATURE}\n\x1e{FEATURE}\n",
+    "a line of one place": f"{FEATURE}\n"
+    + json.dumps({"type": "LineString", "coordinates": [MIDDLE.tolist()] * 2}),
     "kml": kml(f"<Folder><name>a</name>{placemark(RING)}</Folder>"),
     "kml with spaces": kml(placemark(RING.replace(",", ", "))),
     "open kml": kml(placemark(RING.rpartition(" ")[0])),
@@ -219,7 +222,12 @@ DAMAGED = {
     "zip": "PK\3\4" + "x" * 200,
     "lines cut off": f"{FEATURE}\n{FEATURE[:-9]}",
     "kml of words": kml(placemark(RING.replace(f"{CORNERS[1][0]:.10f}", "east"))),
+    "kml of underscores": kml(placemark(RING.replace(f"{CORNERS[1][0]:.10f}", "9_0"))),
     "kml of one number": kml(placemark(RING + " 9.0")),
+    "kml of two borders": kml(placemark(RING).replace("</Polygon>", f"{placemark(RING)[20:-22]}</Polygon>")),
+    "kml of two shapes": kml(
+        placemark(RING).replace("</Placemark>", "<Point><coordinates>9,46</coordinates></Point></Placemark>")
+    ),
     "kml without corners": kml(placemark("")),
     "kml without a shape": kml("<Placemark><name>a</name></Placemark>" + placemark(RING)),
     "linked kml": kml("<NetworkLink><Link><href>http://127.0.0.1:9/a.kml</href></Link></NetworkLink>"),
@@ -229,6 +237,14 @@ DAMAGED = {
     "gpx of words": '<?xml version="1.0"?><gpx version="1.1"><wpt lat="46" lon="x"/></gpx>',
     "gpx without places": '<?xml version="1.0"?><gpx version="1.1"></gpx>',
     "virtual": "<?xml version='1.0'?><kml><OGRVRTDataSource/></kml>",
+    "system as text": f'{FEATURE[:-1]}, "crs": "EPSG:4326"}}',
+    "system of no name": FEATURE[:-1] + ', "crs": {"type": "name", "properties": {"title": "EPSG:4326"}}}',
+    "system unknown": FEATURE[:-1] + ', "crs": {"type": "name", "properties": {"name": "EPSG:99999"}}}',
+    "system of one feature": FEATURE
+    + "\n"
+    + FEATURE[:-1]
+    + ', "crs": {"type": "EPSG", "properties": {"code": 4326}}}',
+    "features twice": f'{{"type": "FeatureCollection", "features": [{FEATURE}], "features": []}}',
     "topojson": '{"type": "Topology", "objects": {}, "arcs": []}',
     "arcgis": '{"geometryType": "esriGeometryPolygon", "features": []}',
     "plan without a fence": json.dumps({"fileType": "Plan", "mission": {"items": []}}),
@@ -236,6 +252,7 @@ DAMAGED = {
     "plan of nothing": plan([]),
     "plan without radius": plan([], [{**DISC, "circle": {"center": LATLON[0]}}]),
     "waypoints of less": waypoints(*((5002, 5, corner) for corner in CORNERS)),
+    "waypoints of parts": waypoints(*((5002, 4.5, corner) for corner in CORNERS)),
     "waypoints of words": waypoints(*((5002, 4, corner) for corner in CORNERS)).replace("\t0\t3\t", "\tx\t3\t"),
     "circle of nothing": waypoints((5004, 0, MIDDLE)),
     "parquet": "PAR1....",
@@ -249,6 +266,10 @@ REASONS = {
     "metres": "which are no degrees",
     "sqlite": "is SQLite, but no GeoPackage, perhaps SpatiaLite; it is not read; `ogr2ogr",
     "geopackage": "is damaged",
+    "system as text": r"Expected `object \| null`, got `str` - at `\$\.crs`",
+    "kml of two borders": "a Polygon holds 2 of outerBoundaryIs, expected one",
+    "kml of two shapes": "a Placemark holds 2 of Point, LineString",
+    "system unknown": "its crs 'EPSG:99999' is no coordinate system; write EPSG:32632",
     "zip": r"is damaged or no \.zip",
 }
 
@@ -260,6 +281,7 @@ def test_other_formats_close_the_same_ground_or_say_why_not(tmp_path: Path, name
     zone = ZoneConfig(kind="forbidden", file=str(path))
     archive = tmp_path / "zone.kmz"
     with zipfile.ZipFile(archive, "w") as packed:
+        packed.writestr("__MACOSX/._doc.kml", "of Finder")
         packed.write(path, f"doc.{name.partition(' ')[0]}")
     if name in SAME:
         touched = shapely.intersects(AREA, squares())
@@ -291,6 +313,19 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path: Path, kind: str) -
                 refused = str(error)
                 assert "\n" not in refused
         part.write_bytes(whole)
+
+
+def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
+    boxes = [shapely.box(col, row, col + 3, row + 2) for row in (3, 20) for col in (4, 14, 24)]
+    sets = (boxes, [box.buffer(1) for box in boxes], boxes[:4])
+    files = [Path(written(tmp_path / f"{n}.shp", shapes, "EPSG:4326")) for n, shapes in enumerate(sets)]
+    for one, other in itertools.permutations(files, 2):
+        for part in (".shp", ".shx", ".dbf", ".prj"):
+            (tmp_path / f"mixed{part}").write_bytes(
+                (other if part == ".shx" else one).with_suffix(part).read_bytes()
+            )
+        with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
+            closed_by(str(tmp_path / "mixed.shp"), "forbidden")
 
 
 # --- extents and fences -------------------------------------------------------------------------------------

@@ -51,6 +51,20 @@ def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.mark.parametrize("west", [179.99, 350.0, -180.02])
+def test_degrees_which_go_on_beyond_180_are_the_same_ground_as_elsewhere(tmp_path: Path, west: float) -> None:
+    places = {lon: from_origin(lon, 50, 0.001, 0.001) for lon in (10.0, west)}
+    files = [written(tmp_path / f"{lon}.tif", HEIGHTS, crs="EPSG:4326", transform=places[lon]) for lon in places]
+    np.testing.assert_allclose(*(load(file).elevation_m for file in files), atol=0.01)
+
+
+@pytest.mark.parametrize(("right", "down"), [(1, 1), (-1, -1), (-1, 1)])
+def test_a_file_which_begins_in_the_south_or_east_is_turned(tmp_path: Path, right: int, down: int) -> None:
+    place = rasterio.Affine(30 * right, 0, 500_000, 0, 30 * down, 5_000_000)
+    turned = HEIGHTS[:: -1 if down > 0 else 1, ::right]
+    np.testing.assert_array_equal(load(written(tmp_path / "a.tif", HEIGHTS, transform=place)).elevation_m, turned)
+
+
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
     from shared_map.importers import level_ground as module
 

@@ -15,6 +15,7 @@ from rasterio.control import GroundControlPoint
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from support.effort import few
+from support.height_models import written
 from support.zone_shapes import painted
 
 from shared_map.importers.sources import Source, load_source
@@ -38,12 +39,8 @@ def rows_of(heights: np.ndarray) -> str:
 
 
 def write_raster(path: Path, side_m: float, **profile: object) -> None:
-    numbers = profile.pop("numbers", HEIGHTS)
-    assert isinstance(numbers, np.ndarray)
-    size = {"height": ROWS, "width": COLS, "count": 1, "dtype": numbers.dtype}
-    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m)}
-    with rasterio.open(path, "w", **{**size, **place, **profile}) as file:
-        file.write(numbers, 1)
+    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, side_m, side_m), **profile}
+    written(path, HEIGHTS, **place)
 
 
 def write_netcdf(path: Path, side_m: float, kind: str) -> None:
@@ -182,11 +179,13 @@ def test_control_points_place_a_raster(tmp_path: Path) -> None:
     assert float(np.nanmean(source.elevation_m)) == pytest.approx(float(HEIGHTS.mean()), abs=0.5)
 
 
-@pytest.mark.parametrize("ending", ["tif", "asc", "npz", "xyz", "yaml", "geojson"])
+@pytest.mark.parametrize("ending", ["tif", "asc", "npz", "xyz", "yaml", "geojson", "tif.aux.xml"])
 def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
+    if ending == "tif.aux.xml":  # GDAL opens what lies beside a file, too
+        write_raster(tmp_path / "dem.tif", 10.0)
     os.mkfifo(tmp_path / f"dem.{ending}")
     with pytest.raises(TerrainError, match="it is a device or pipe, not a file"):
-        load(tmp_path / f"dem.{ending}")
+        load(tmp_path / f"dem.{ending.removesuffix('.aux.xml')}")
 
 
 def test_depths_are_turned_into_heights(tmp_path: Path) -> None:

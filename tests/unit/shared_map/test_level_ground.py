@@ -87,6 +87,7 @@ def resampled(heights_m: np.ndarray, factor: float, how: str) -> np.ndarray:
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
 FINER = [("bilinear", 1.5), ("bilinear", 2.0), ("cubic", 1.2), ("cubic", 4.0), ("lanczos", 2.0), ("lanczos", 3.0)]
+FINER += [("nearest", 4.0)]
 
 
 def real(name: str) -> np.ndarray:
@@ -136,13 +137,21 @@ def test_water_is_the_same_after_a_resampling(name: str, how: str, factor: float
     assert after == pytest.approx(before, rel=SMALL.get(name, 0.02))
 
 
-@pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
-def test_a_sea_is_the_same_on_coarser_cells(how: str) -> None:
-    """The shore is mixed in cells that are averaged: a part of such a cell is lost."""
-    name = "coast, 75 % sea, float32"
-    for factor in (0.5, 0.7):
-        after = level_ground(resampled(model_of(name).heights_m, factor, how)).mask.mean()
-        assert after == pytest.approx(found_in(name).mean(), rel=0.035)
+LOST = {("lakes, decimetres", "lanczos", 0.5): 0.033, ("lakes, decimetres", "bilinear", 0.5): 0.006}
+"""Share of lakes of 83 and 384 cells of which a filter leaves no 16 level ones, so that nothing tells them."""
+COARSER = [(how, factor) for how in ("nearest", "bilinear", "cubic", "lanczos") for factor in (0.5, 0.7, 0.9)]
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "factor"), paired(["coast, 75 % sea, float32", "lakes, decimetres"], COARSER)
+)
+def test_water_is_the_same_on_coarser_cells(name: str, how: str, factor: float) -> None:
+    """Within 2 % of the water, or a quarter of the cells at its shore: of a cell of which half is water, the height
+    does not say which half."""
+    mask = level_ground(resampled(model_of(name).heights_m, factor, how)).mask
+    before = found_in(name).mean() * (1 - LOST.get((name, how, factor), 0))
+    shore = (mask & ndimage.binary_dilation(~mask)).mean()
+    assert abs(mask.mean() - before) <= max(0.02 * before, 0.25 * shore)
 
 
 @pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
@@ -205,8 +214,6 @@ def test_a_code_that_is_far_from_all_heights_is_a_void(code: int) -> None:
 
 def test_a_sea_at_zero_stored_in_centimetres_is_no_void(tmp_path: Path) -> None:
     """The lowest beach is 40 cm high: 40 of the file's units are no gap of 40 m."""
-    import rasterio
-
     ground = np.maximum(hills(8, 900) - 300, 0)
     ground[ground > 0] += 0.4
     path = written(tmp_path / "cm.tif", np.round(ground * 100), "int32")

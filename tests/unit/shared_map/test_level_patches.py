@@ -44,3 +44,12 @@ def test_patches_are_those_of_a_search_height_by_height(seed: int, rows: int, co
     pairs = set(zip(expected.ravel().tolist(), labels.ravel().tolist(), strict=True)) | {(0, 0)}
     assert len(pairs) == expected.max() + 1 == len(cells)
     assert cells[1:].tolist() == np.bincount(labels.ravel())[1:].tolist()
+
+
+def test_runs_are_one_patch_if_they_are_equally_high_anywhere_along_them() -> None:
+    """A filter leaves ripples at a shore: there the first cells of two rows differ, and all others are equal."""
+    heights = np.zeros((6, 40), np.float32)
+    heights[2, :8] = np.linspace(0.02, 0, 8)
+    labels, cells = labelled(heights, np.float32(0.005), 5, 2)
+    assert cells.size == 2
+    assert labels[0, 20] == labels[5, 20] == 1

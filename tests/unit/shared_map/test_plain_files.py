@@ -28,7 +28,11 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (ASC.replace("ncols 3", "ncols 2.5"), "line 8: found '-9999'; its header says 2 rows of 2 numbers"),
+        (ASC.replace("ncols 3", "ncols 2.5"), "its header says ncols '2.5', expected a whole number"),
+        (ASC.replace("ncols 3", "ncols 3x"), "its header says ncols '3x', expected a whole number"),
+        (ASC.replace("cellsize 50", "cellsize 5_0"), "its header says cellsize '5_0', expected a number"),
+        (ASC.replace("cellsize 50", "cellsize 50\ncellsize 60"), "its header says cellsize twice"),
+        (ASC.replace("1 2 3", "1 2_0 3"), "line 7: found '2_0'; its header says 2 rows of 3 numbers"),
         (ASC.replace("ncols 3", "ncols nan"), "Invalid dataset dimensions : 0 x 2"),
         (ASC.replace("cellsize 50", "cellsize inf"), "has pixels without a size"),
         (ASC.replace("1 2 3", "1 2"), "has 5 numbers; its header says 2 rows of 3"),
@@ -43,15 +47,15 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
             "looks like degrees",
         ),
         (ASC.replace("xllcorner", "xllcenter"), "its header needs xllcorner and yllcorner"),
-        (
-            GRASS + "multiplier: 0.01\n1 2 3\n4 5 6",
-            "a multiplier",
-        ),
+        (GRASS + "multiplier: 0.01\n1 2 3\n4 5 6", "a multiplier"),
         (ASC.replace("cellsize 50", "cellsize -50"), "a cell -50 x -50, expected a size above 0"),
         (ASC.replace("cellsize 50", "dx 50\ndy 0"), "a cell 50 x 0, expected"),
         (GRASS.replace("north: 20", "north: -20") + "1 2 3\n4 5 6", "a cell 10 x -10, expected"),
         ("DSAA\n3 2\n60 0\n0 30\n1 6\n1 2 3\n4 5 6", "a cell -30 x 30, expected"),
-        ("north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6", "degrees and minutes"),
+        (
+            "north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6",
+            "north '46:30N', expected a number",
+        ),
         (b"\xff\xfe\x00", "is truncated or no raster"),
         ("", "is truncated or no raster"),
     ],
@@ -127,7 +131,7 @@ def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
         (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
         (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
         (MAP.replace("height 3", "height many"), "no MovingAI map"),
-        (MAP.replace("height 3", "height 99999999").replace("width 4", "width 9999"), "header says 99999999"),
+        (MAP.replace("height 3", "height 99999999").replace("width 4", "width 9999"), "has 99999999 x 9999 cells"),
         ("hello", "no MovingAI map"),
     ],
 )

@@ -222,6 +222,11 @@ def blank(folder: Path, name: str, content: bytes) -> dict[str, Any]:
     return {"source": folder / name}
 
 
+def raw(folder: Path, rows: int) -> dict[str, Any]:
+    (folder / "a.hdr").write_text(f"NROWS {rows}\nNCOLS 10\nNBITS 8\n")
+    return blank(folder, "a.bil", bytes(100))
+
+
 def two_variables(folder: Path) -> dict[str, Any]:
     with netcdf_file(folder / "a.nc", "w") as file:
         for axis in ("y", "x"):
@@ -282,6 +287,14 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: blank(f, "a.hgt", bytes(2 * 1201**2)), "says by its name where it lies, such as N46E008.hgt"),
     (lambda f: blank(f, "N46E010.hgt", bytes(1000)), r"truncated or no \.hgt: it has 1000 bytes"),
     (lambda f: dem(f, heights() * np.float32(100)), "m: of centimetres set terrain.height_scale = 0.01"),
+    (
+        lambda f: dem(f, heights().astype(np.uint8), compress="jpeg"),
+        "is compressed with loss, expected exact numbers",
+    ),
+    (lambda f: dem(f, None, from_origin(9, 46, 0.001, 0.001)), "a cell of 0.001 looks like degrees"),
+    (lambda f: {"source": dem(f)["source"].rename(f / os.fsdecode(b"a\xff.tif"))}, "codec can't encode character"),
+    (lambda f: raw(f, 3), "has 100 bytes, expected 30, as the header beside it says"),
+    (lambda f: raw(f, 11), "has 100 bytes, expected 110"),
     (two_variables, "several rasters .*height.*snow"),
 ]
 

@@ -158,18 +158,3 @@ def test_degrees_lie_where_they_say_in_text_and_in_rasters(tmp_path: Path) -> No
         south_m = grid.north_m - grid.rows * grid.resolution_m
         _, ys = rasterio.warp.transform(grid.crs, "EPSG:32632", [0.0, 0.0], [grid.north_m, south_m])
         assert (ys[0] - ys[1]) / 0.9996 == pytest.approx(grid.rows * 90.0, rel=3e-5)
-
-
-@pytest.mark.parametrize(
-    ("driver", "text"),
-    [
-        ("XYZ", "0 20 5\n10 20 6\n20 20 7\n0 10 5\n20 10 7\n0 0 1\n10 0 2\n20 0 3\n"),
-        ("AAIGrid", "ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize 10\n5 6 7\n5 what 7\n1 2 3\n"),
-    ],
-)
-def test_gdal_makes_a_height_of_0_of_what_is_missing_or_no_number(tmp_path: Path, driver: str, text: str) -> None:
-    """The reason for our own readers of points and ASCII grids. If this fails, GDAL's reader can be used."""
-    import rasterio
-
-    with rasterio.open(wrote(tmp_path / "a.txt", text), driver=driver) as dataset:
-        assert dataset.read(1)[1, 1] == 0
