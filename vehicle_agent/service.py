@@ -232,8 +232,10 @@ class AgentService:
         self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
         agent.obstacles.tick(now_ns)
+        targets = self._obedience.book.targets(self._setup.scenario)
         for pose in self._collected(POSE, TargetPose):
-            self._on_pose(pose, now_ns)
+            if pose.target in targets:  # a stranger may name any number of others
+                self._on_pose(pose, now_ns)
         for pose in self._collected(TRUE_POSE, TargetPose):
             self._detector.set_truth(pose, now_ns)
         self._member.tick(now_ns)

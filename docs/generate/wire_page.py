@@ -63,8 +63,8 @@ def _how(topic: Topic) -> str:
     if topic.request is not None:
         several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
         ways.append(f"get with {_link(topic.request)}{several}")
-    if topic.trusted or topic.trusted_in:
-        ways.append("with a code" + (f" where the key has `{topic.trusted_in}`" if topic.trusted_in else ""))
+    if topic.free:
+        ways.append(f"free: {', '.join(topic.free)}")
     return "; ".join(ways)
 
 
@@ -180,11 +180,12 @@ _BY_TYPE: dict[Any, Any] = {int: 1, float: 1.0, str: "word", bool: True, list: [
 
 
 def put_from_outside() -> list[Topic]:
-    """The topics that programs which no launcher starts may put on, by the table of topics."""
+    """The topics that programs which no launcher starts may put on, by the table of topics. Those of right of way
+    take a proof (`swarm.client`), not a message."""
     return [
         topic
         for topic in TOPICS
-        if not topic.trusted and any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)
+        if "agent" not in topic.fields and any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)
     ]
 
 

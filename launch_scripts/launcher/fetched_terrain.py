@@ -21,6 +21,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.files import writing
 from swarm.plugins.find import source_of
+from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ def fetch_if_missing(
             log.warning("the terrain in %s is not as it was written: fetching it again", run_dir)
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
         layers = (*NEEDED, "photo") if looks else NEEDED
-        with open_bus(scenario.network) as bus:
+        with open_bus(scenario.network, authenticator=authenticator_of(scenario.network, found[0].run_id)) as bus:
             within_s = 2 * scenario.network.connect_timeout_s  # so slow a link is one that a start may wait for
             wanted = Fetching(found[0].terrain, scenario.cost, layers, within_s)
             terrain = fetch_base_map(bus, wanted, why, progress)

@@ -186,7 +186,6 @@ class LatestState(Counts):
     plan    what the run should be
     book    what operators have ordered
     status  target -> the newest status of the planner that leads
-    poses   target -> its newest pose that counts
     leads   (role, id) -> whether the process leads, where there are standbys
     hears   topics that are heard as long as the run lasts, from all whom this is about: only they are evidence of
             an alarm
@@ -207,7 +206,6 @@ class LatestState(Counts):
         self.fleet_ns: int | None = None
         """Time when an agent last reported its vehicles; None before."""
         self.status: dict[str, PlannerStatus] = {}
-        self.poses: dict[str, TargetPose] = {}
         self.leads: dict[tuple[str, str], bool] = {}
         self._goals: dict[str, GoalState] = {}
         self._trackings = Trackings(grid)
@@ -251,10 +249,7 @@ class LatestState(Counts):
                     _remember(self._fleet_told_ns, agent_of(message.ids[0]), now_ns)
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
-                pose = self._trackings.counted(message, now_ns)
-                if pose is not None:
-                    _remember(self.poses, pose.target, pose)
-                return pose
+                return self._trackings.counted(message, now_ns)
             case MarkSet():
                 marks = self._marks.get((message.author, message.tile))
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
@@ -284,6 +279,8 @@ class LatestState(Counts):
             self._told_ns[key] = now_ns
         elif key in self._alive:
             self._alive[key].discard(peer.incarnation)
+            if not self._alive[key] and key not in self._newest and key not in self._started:
+                del self._alive[key]  # of a stranger, whose names must not fill the place of others
 
     def touch(self, now_ns: int) -> None:
         """Something of the run came at a time, or its end."""
@@ -357,6 +354,11 @@ class LatestState(Counts):
         return [f"{role} {id}" for role, id in crew if not self.fills(role, id)]
 
     # --- trackers -------------------------------------------------------------------------------------------------
+
+    @property
+    def poses(self) -> dict[str, TargetPose]:
+        """Target -> its newest pose that counts."""
+        return self._trackings.poses()
 
     def lost(self, now_ns: int) -> set[str]:
         """Returns the targets that no tracker publishes now; those without a tracker according to their

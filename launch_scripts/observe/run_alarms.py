@@ -217,8 +217,9 @@ def _of_process(kind: str, role: str, id: str, what: str, since_ns: int, over_ns
 
 
 def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[WireAlarm, int]]:
+    poses = latest.poses
     for id in sorted(latest.lost(now_ns).intersection(targets)):
-        status, pose = latest.told_by_planner(id), latest.poses.get(id)
+        status, pose = latest.told_by_planner(id), poses.get(id)
         since_ns, cell, heard_ns = _UNKNOWN_NS, None if pose is None else pose.cell, now_ns
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.

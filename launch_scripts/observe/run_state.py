@@ -164,11 +164,11 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
 def _lines(
     latest: LatestState, targets: Sequence[str], vehicles: VehicleColumns, now_ns: int
 ) -> tuple[TargetLine, ...]:
-    lost = latest.lost(now_ns)
+    lost, poses = latest.lost(now_ns), latest.poses
     captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
     lines = []
     for id in targets:
-        pose, status = latest.poses.get(id), latest.told_by_planner(id)
+        pose, status = poses.get(id), latest.told_by_planner(id)
         nearest_m = None
         if pose is not None and len(vehicles):
             east_m, south_m = latest.place_m(pose)

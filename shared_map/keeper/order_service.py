@@ -146,9 +146,7 @@ class KeptOrders:
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
         match asked.request:
-            case (GiveOrder() | ZoneOrder() | SendVehicle()) as order if (
-                order.changes and self._fresh is not None and asked.topic.trusted
-            ):
+            case (GiveOrder() | ZoneOrder() | SendVehicle()) as order if order.changes and self._fresh is not None:
                 return self._fresh.fault(order.stamp_ns, now_ns)
         return None
 

@@ -14,8 +14,8 @@ Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is
 Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
-            logged once per key and minute, and never posted. If the bus has an `Authenticator`, a
-            sample on a trusted topic without the run's code is dropped and counted, and such a query is refused.
+            logged once per key and minute, and never posted. If the bus has an `Authenticator`, so is a payload
+            without the run's code, unless `Topic.free` lets strangers say it; such a query is refused.
 Misrouting  A payload that names another key than the one under which it came is never posted, and is counted apart
             (`payloads_misrouted`). A query that names another key is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
@@ -235,8 +235,6 @@ class Answerer(Protocol):
 
 def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
     """Raises TypeError on a subscription that the topic does not allow."""
-    if together and topic.trusted:
-        raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
     if every_s and (together or not topic.newest):
         raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
 

@@ -125,7 +125,7 @@ class MemoryAnswerer:
         key = asking.topic.below(named)
         payload = meant_for(key, encode(message))
         bus.sent(payload)
-        code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
+        code = code_of(bus.authenticator, key, payload, asking.asked)
         parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
 
         def arrive() -> None:
@@ -133,7 +133,7 @@ class MemoryAnswerer:
                 return
             try:
                 check_size(payload, asking.topic.answer_bytes)
-                check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
+                check_code(asking.bus.authenticator, code, asking.topic, "answer", key, payload, asking.asked)
             except ProtocolError as error:
                 asking.bus.counts[counter_of(error)] += 1
                 return
@@ -421,7 +421,7 @@ class MemoryBus:
 
     def _put(self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes, in_json: bool = False) -> None:
         self.sent(payload)
-        code = code_of(self.authenticator, topic, key, payload)
+        code = code_of(self.authenticator, key, payload)
         sample = _Sample(topic, named, key, payload, code, in_json, checked_by=self.authenticator)
         network = self.network
         arrivals: dict[int, list[Declaration]] = {}
@@ -557,7 +557,7 @@ class MemoryBus:
             return
         asking.asked = payload
         parsed = decode(payload, topic.request)
-        code = code_of(self.authenticator, topic, topic.below(wanted), payload)
+        code = code_of(self.authenticator, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
             for delay_ns in self.network.delays_ns(self, queryable.bus, topic.name):
                 answerer = MemoryAnswerer(asking, queryable, index, asking.began_ns + delay_ns)
@@ -590,7 +590,7 @@ class MemoryBus:
         try:
             check_size(payload, event.topic.ask_bytes)
             check_meant(key, payload)
-            check_code(self.authenticator, code, event.topic, key, payload)
+            check_code(self.authenticator, code, event.topic, "ask", key, payload)
         except ProtocolError as error:
             self.counts[counter_of(error)] += 1
             event.refuse(f"{event.topic.name}: {error}")
@@ -703,7 +703,7 @@ class _Sample:
             self.parse()
         if self.checked_by is not bus.authenticator and not isinstance(self.parses, ProtocolError):
             try:
-                check_code(bus.authenticator, self.code, self.topic, self.key, self.payload)
+                check_code(bus.authenticator, self.code, self.topic, "put", self.key, self.payload)
             except ProtocolError as error:
                 return error
             self.checked_by = bus.authenticator

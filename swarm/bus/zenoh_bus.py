@@ -123,7 +123,7 @@ class ZenohAnswerer:
         if self._as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
-            query.reply(key, payload, attachment=code_of(bus.authenticator, topic, key, payload, self._asked))
+            query.reply(key, payload, attachment=code_of(bus.authenticator, key, payload, self._asked))
 
     def refuse(self, reason: str) -> None:
         if self._query is not None and not self._bus.closed:
@@ -161,7 +161,7 @@ def open_bus(
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
     patient        wait until a router listens: a process may be started before it, and a proxy be between
-    authenticator  signs messages on trusted topics
+    authenticator  makes and checks the codes of messages
     """
     endpoints = network.listen if mode == "router" else network.connect
     warned = False
@@ -226,7 +226,7 @@ class ZenohBus:
 
     @property
     def authenticator(self) -> Authenticator | None:
-        """Signs messages on trusted topics, and checks them."""
+        """Makes the codes of messages, and checks them."""
         return self.intake.authenticator
 
     def trust(self, authenticator: Authenticator | None) -> None:
@@ -257,7 +257,7 @@ class ZenohBus:
         self._session.put(
             key,
             payload,
-            attachment=code_of(self.authenticator, topic, key, payload),
+            attachment=code_of(self.authenticator, key, payload),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=_PRIORITIES[topic.priority],
             allowed_destination=zenoh.Locality.ANY if topic.echoed else zenoh.Locality.REMOTE,
@@ -393,7 +393,7 @@ class ZenohBus:
                 payload = reply.ok.payload.to_bytes()
                 check_size(payload, topic.answer_bytes)
                 check_meant(self.intake.below(key), payload)
-                self.intake.check(topic, key, reply.ok, payload, asked)
+                self.intake.check(topic, "answer", key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
                 named = self.intake.fields(topic, key)
             except ProtocolError as error:
@@ -417,7 +417,7 @@ class ZenohBus:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
             payload=asked,
-            attachment=code_of(self.authenticator, topic, expression, asked),
+            attachment=code_of(self.authenticator, expression, asked),
             priority=_PRIORITIES[topic.priority],
         )
 

@@ -25,7 +25,7 @@ from swarm.bus.bus import (
     newest_of,
 )
 from swarm.errors import ProtocolError
-from swarm.wire.access import Authenticator, check_code
+from swarm.wire.access import Act, Authenticator, check_code
 from swarm.wire.codec import (
     JSON_ENCODING,
     KEY_FIELD,
@@ -248,11 +248,11 @@ class Intake:
         check_size(asked, topic.ask_bytes)
         if query.payload is None:
             check_named(self.below(key), parameters.pop(KEY_FIELD, None))
-            self.check(topic, key, query, asked)
+            self.check(topic, "ask", key, query, asked)
             return decode_parameters(parameters, wanted)
         packed = packed_json(asked, wanted) if is_json(query, asked) else asked
         check_meant(self.below(key), packed)
-        self.check(topic, key, query, asked)
+        self.check(topic, "ask", key, query, asked)
         return decode(packed, wanted)
 
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
@@ -262,25 +262,19 @@ class Intake:
         in_json = is_json(sample, payload)
         packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
-        self.check(topic, key, sample, payload)
+        self.check(topic, "put", key, sample, payload)
         return packed
 
     def below(self, key: str) -> str:
         """A key below the namespace."""
         return key.removeprefix(self._start)
 
-    def check(self, topic: Topic, key: str, carrier: Any, payload: bytes, asked: bytes | None = None) -> None:
-        """Raises ProtocolError where a trusted key's sample, query or reply has no right code, or no payload, which
-        alone a code covers; also where a reply is too long.
+    def check(self, topic: Topic, act: Act, key: str, carrier: Any, payload: bytes, asked: bytes = b"") -> None:
+        """Raises ProtocolError where a sample, query or reply lacks the code that it needs.
 
         asked  the payload of the question, where this is an answer
         """
-        if asked is not None:
-            check_size(payload, topic.answer_bytes)
-        if topic.needs_code(key) and self.authenticator is not None:
-            if not payload:
-                raise ProtocolError("its fields are not in a payload, which alone a code can cover")
-            check_code(self.authenticator, attached(carrier), topic, key, payload, asked or b"")
+        check_code(self.authenticator, attached(carrier), topic, act, key, payload, asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""

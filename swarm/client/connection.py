@@ -174,14 +174,11 @@ class Swarm:
         session: Session,
         stop: Callable[[], None] = lambda: None,
         open_trusted: Callable[[], Bus] | None = None,
-        trust: Callable[[], None] = lambda: None,
     ) -> None:
         self._session = session
         self._stop = stop
         self._open_trusted = open_trusted or (lambda: session.bus)
         """Opens a bus whose words count in right of way."""
-        self._trust = trust
-        """Makes orders of the session count."""
         self._externals: list[ExternalSession] = []
 
     def __enter__(self) -> Swarm:
@@ -316,7 +313,7 @@ class Swarm:
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... For the user of the swarm, or with certificates
         for `operator.NAME` only."""
-        self._trust()
+        self._session.trust()
         return Orders(self._session)
 
     def observer(self, *, every_s: float = EVERY_S) -> Observer:
@@ -385,6 +382,7 @@ def connect(
         clock = MonotonicClock()
         run, ahead_ns = _run(bus, inbox, began_s + timeout_s, f"{namespace!r} at {endpoint}", clock)
         session = Session(bus, run, clock, inbox.post, ahead_ns)
+        session.trust = lambda: bus.trust(authenticator_of(network, run.run_id))
     except BaseException:
         bus.close()
         raise
@@ -397,10 +395,7 @@ def connect(
     def open_trusted() -> Bus:
         return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
 
-    def trust() -> None:
-        bus.trust(authenticator_of(network, session.run.run_id))
-
-    swarm = Swarm(session, stop, open_trusted, trust)
+    swarm = Swarm(session, stop, open_trusted)
     atexit.register(swarm.close)  # an open session of Zenoh aborts the interpreter at its exit
     return swarm
 

@@ -85,8 +85,6 @@ class Observer:
         """(author, region) -> its newest message, and when it came."""
         self._obstacles: dict[str, tuple[Obstacle, int]] = {}
         self._trackings = Trackings(session.frame.grid)
-        self._targets: dict[str, None] = {}
-        """Ids of targets that were heard of, in order."""
         self._routes: dict[str, Followed] = {}
         self._sets: dict[tuple[int, str], MarkSet] = {}
         """(tile, author) -> its newest set."""
@@ -132,11 +130,10 @@ class Observer:
         """All known targets, by id."""
         with self._session.lock:
             now_ns = self._session.now_ns()
-            tracked = ((id, self._trackings.of(id)) for id in self._targets)
+            lost = self._trackings.lost(now_ns)
             return {
-                id: SeenTarget(id, pose.x_m, pose.y_m, pose.captures, pose.tracker, tracking.lost(now_ns))
-                for id, tracking in tracked
-                if tracking is not None and (pose := tracking.pose) is not None
+                id: SeenTarget(id, pose.x_m, pose.y_m, pose.captures, pose.tracker, id in lost)
+                for id, pose in self._trackings.poses().items()
             }
 
     @property
@@ -177,8 +174,7 @@ class Observer:
             case Heard(message=Obstacle() as obstacle):
                 self._obstacles[obstacle.id] = obstacle, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
-                if self._trackings.counted(pose, now_ns) is not None:
-                    self._targets[pose.target] = None
+                self._trackings.counted(pose, now_ns)
             case Heard(message=Followed() as followed):
                 self._on_followed(followed)
             case Heard(message=Note() as note):

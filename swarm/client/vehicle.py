@@ -379,7 +379,8 @@ class Vehicle(Reported):
         for_s: float | None = None,
         only_for: str | None = None,
     ) -> int:
-        """State something about cells, for all vehicles and planners. Returns how many cells were stated.
+        """State something about cells, for all vehicles and planners. Returns how many cells were stated. Without
+        certificates it counts only from the user of the swarm.
 
         cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)`
         lethal        no vehicle may enter them
@@ -410,6 +411,7 @@ class Vehicle(Reported):
             now_ns = session.swarm_now_ns()
             until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             if not self._marks.any:
+                session.trust()
                 session.bus.serve(MARKS, session.post, author=self._marks.author)
                 session.bus.subscribe(MARKS, session.post, author=self._marks.author)
             sets = self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns, class_number)

@@ -91,7 +91,8 @@ class OrderClient:
             case Heard(message=Goals() as goals) | Replied(message=Goals() as goals):
                 self._missing.discard(_GOALS)
                 if self._goals is not None:
-                    self._goals.merge(goals.goals, now_ns)
+                    own = f"{self._obeyed.id}-"  # goals of other agents' vehicles are a false keeper's
+                    self._goals.merge([each for each in goals.goals if each.name.startswith(own)], now_ns)
                 self.shared = dict(goals.shared)
             case Asked(topic=topic) if topic is ORDERS:
                 if self.known:

@@ -154,7 +154,8 @@ class Tracking:
 
 
 class Trackings:
-    """The trackers of many targets. For targets beyond 4096 there is no state, and all poses are refused."""
+    """The trackers of many targets, 4096 at most. A further target takes the place of one whose trackers are lost;
+    as long as there is none, its poses are refused."""
 
     def __init__(self, grid: GridSpec) -> None:
         self._grid = grid
@@ -164,7 +165,7 @@ class Trackings:
         """Takes in a pose of any target; returns it, with its cell, if it counts."""
         tracking = self._of.get(pose.target)
         if tracking is None:
-            if len(self._of) >= _MOST_TARGETS:
+            if len(self._of) >= _MOST_TARGETS and not self._forget_one(now_ns):
                 return None
             tracking = Tracking(self._grid)
         verdict = tracking.judge(pose, now_ns)
@@ -178,6 +179,19 @@ class Trackings:
             self._of[pose.target] = Tracking(self._grid)
         if (tracking := self._of.get(pose.target)) is not None:
             tracking.place(pose, now_ns)
+
+    def _forget_one(self, now_ns: int) -> bool:
+        """Forgets the first target if its trackers are lost; else the next call looks at another one, so that each
+        takes the same time."""
+        id = next(iter(self._of))
+        first = self._of.pop(id)
+        if not first.lost(now_ns):
+            self._of[id] = first
+        return id not in self._of
+
+    def poses(self) -> dict[str, TargetPose]:
+        """Returns the newest pose that counts of each target."""
+        return {id: tracking.pose for id, tracking in self._of.items() if tracking.pose is not None}
 
     def of(self, target: str) -> Tracking | None:
         """Returns the state of a target's trackers; None before its first pose."""

@@ -8,8 +8,9 @@
   returns keeps every rule that the types state: a reader checks only what a message cannot know, such as the grid.
 - `route_columns` has routes one by one, as arrays and as columns.
 
-Work and memory that a stranger's messages make, and their bounds. "Names" are bounds of dicts by sender, which on
-loopback costs nothing to make up; with certificates each sender has one name.
+Work and memory that hostile messages make, and their bounds. Without certificates a stranger may do only what
+`Topic.free` names. "Names" are bounds of dicts by sender, which there costs nothing to make up; with certificates
+each sender has one name.
 
 ======================  ==========================================  ================================================
 message                 work or memory                              bound
@@ -35,7 +36,7 @@ believed, note          shown                                       the newest o
 zones, give-order       zones, orders, processes                    1,000 zones, 1,999 orders
 run, asked              answers; strangers named                    one answer; 256 names
 tokens                  planners looked up, questions               once a tick; a round of questions a second
-other topics            trusted: a code of the run's secret         see `access`
+other topics            from members of the run only                see `access`
 ======================  ==========================================  ================================================
 
 A value is bounded where it enters and trusted inside. A new message needs a struct and a row of the table;

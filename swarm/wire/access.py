@@ -3,17 +3,17 @@
 A router enforces these rules, so they are complete: it denies everything that no topic grants. A router itself
 passes on everybody's messages, may therefore do everything, and is named nowhere.
 
-On a topic where a false message would harm, a message counts only with a code that the processes of one run alone
-can make (docs/design/security.md). The code is a keyed BLAKE2b (RFC 7693) of the key, the query if it is a reply,
-and the payload. It travels beside the payload, as Zenoh's attachment, so a process without the secret may still
-read."""
+Without certificates a message counts only with a code that the processes of one run alone can make
+(docs/design/security.md). The code is a keyed BLAKE2b (RFC 7693) of the key, the query if it is a reply, and the
+payload. It travels beside the payload, as Zenoh's attachment, so a process without the secret may still read. A
+topic names the acts which count without (`Topic.free`)."""
 
 from __future__ import annotations
 
 import hmac
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from swarm.errors import ProtocolError
 
@@ -104,26 +104,29 @@ class Authenticator:
         return blake2b(lengths + key.encode() + asked + payload, key=self._key, digest_size=CODE_BYTES).digest()
 
 
-def code_of(
-    authenticator: Authenticator | None, topic: Topic, key: str, payload: bytes, asked: bytes = b""
-) -> bytes | None:
-    """Returns the attachment of a payload: its code, on a trusted key; None if no secret is shared."""
-    if authenticator is None or not topic.needs_code(key):
-        return None
-    return authenticator.code(key, payload, asked)
+Act = Literal["put", "ask", "answer"]
+"""Use of a message: it is published, is a query, or is a reply to one."""
+
+
+def code_of(authenticator: Authenticator | None, key: str, payload: bytes, asked: bytes = b"") -> bytes | None:
+    """Returns the attachment of a payload: its code; None if no secret is shared."""
+    return None if authenticator is None else authenticator.code(key, payload, asked)
 
 
 def check_code(
     authenticator: Authenticator | None,
     code: bytes | None,
     topic: Topic,
+    act: Act,
     key: str,
     payload: bytes,
     asked: bytes = b"",
 ) -> None:
-    """Raises ProtocolError on what no process of the run has said, on a trusted topic."""
-    right = code_of(authenticator, topic, key, payload, asked)
-    if right is None or (code is not None and hmac.compare_digest(code, right)):
+    """Raises ProtocolError on what no process of the run has said, unless the topic lets strangers say it."""
+    if authenticator is None or act in topic.free:
         return
-    what = "no code" if code is None else "a false code"
-    raise ProtocolError(f"it carries {what}, so no process of this run has said it")
+    if not payload:
+        raise ProtocolError("its fields are not in a payload, which alone a code can cover")
+    if code is None or not hmac.compare_digest(code, authenticator.code(key, payload, asked)):
+        what = "no code" if code is None else "a false code"
+        raise ProtocolError(f"it carries {what}, so no process of this run has said it")

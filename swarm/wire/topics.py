@@ -11,7 +11,7 @@ from enum import Enum
 
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Access, access
+from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, Act, access
 from swarm.wire.codec import prime
 from swarm.wire.messages import Message, Nothing, map_data, orders, planning, processes, traffic, vehicles
 
@@ -44,8 +44,9 @@ class Topic:
     costly                   for a queryable: askers take turns, by the field `asker` of the key; agents come before
                              all others
     published                whether values are put, not only answered
-    trusted                  only with a code of the run's secret does a message on it count (`swarm.wire.access`)
-    trusted_in               part of those keys on which the same holds, where it does not hold on all
+    free                     acts that count without a code of the run's secret (`swarm.wire.access`): all that a
+                             stranger on loopback may do. `tests/laws/test_what_strangers_may_do.py` says of each
+                             why its effect ends with it
     newest                   each value carries the whole state of its key, so a reader may skip to the newest
     echoed                   whether a process that puts and subscribes hears what it has put itself
     buffer                   samples that wait for a slow reader; the oldest are dropped first
@@ -65,8 +66,7 @@ class Topic:
     bulk: type[Message] | None = None
     costly: bool = False
     published: bool = True
-    trusted: bool = False
-    trusted_in: str | None = None
+    free: tuple[Act, ...] = ()
     newest: bool = True
     echoed: bool = True
     priority: Priority = Priority.DATA
@@ -90,10 +90,6 @@ class Topic:
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
         repeated = tuple(name for name in self.fields if name in self.message.__struct_fields__)
         object.__setattr__(self, "_repeated", repeated)
-
-    def needs_code(self, key: str) -> bool:
-        """Returns True if a message under a key counts only with a code."""
-        return self.trusted or (self.trusted_in is not None and self.trusted_in in key)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """Returns each field of the topic as one part of a Zenoh key; fields that are not given become `*`.
@@ -186,7 +182,7 @@ OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
 RUN = Topic(
     "run", "run/{role}/{id}", processes.RunInfo, "run and terrain of a process",
     "asked at every start", access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing, published=False,
-    ask_bytes=_SHORT, answer_bytes=_LONG,
+    free=("ask", "answer"), ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", map_data.MarkSet,
@@ -196,7 +192,7 @@ MARKS = Topic(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
         hear=f"{_REPLICAS} rover:author",
     ),
-    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192, trusted_in=f"/{OPERATOR}.",
+    request=map_data.MarksRequest, bulk=map_data.MarkSets, free=("ask",), buffer=8192,
     answer_bytes=2 * _LONG,
 )  # fmt: skip
 DIGEST = Topic(
@@ -208,14 +204,14 @@ BASE_MAP = Topic(
     "base-map", "base/{keeper}", map_data.BaseMap, "terrain of a keeper, for machines without its files",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
-    request=Nothing, published=False, priority=Priority.BACKGROUND,
+    request=Nothing, published=False, free=("ask",), priority=Priority.BACKGROUND,
     ask_bytes=_SHORT, answer_bytes=_FILE,
 )  # fmt: skip
 BASE_TILES = Topic(
     "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain, by layer and region",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
-    request=map_data.BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+    request=map_data.BaseMapRequest, published=False, free=("ask",), priority=Priority.BACKGROUND,
     ask_bytes=_LONG, answer_bytes=_FILE,
 )  # fmt: skip
 FLEET = Topic(
@@ -248,7 +244,7 @@ HOST_STATE = Topic(
     "positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; "
     "each counts, because two generations of a host must not replace each other's messages",
     "on change, else 5 Hz",
-    access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
+    access(put="agent:agent rover:agent", hear="agent:member"), newest=False,
     priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
@@ -257,33 +253,33 @@ TABLE = Topic(
     "granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies "
     "with its stored table", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
-    request=traffic.Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    request=traffic.Claim, echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 GRANTED = Topic(
     "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,
     "cells of a shard granted to one host, on file with its members", "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
 WORD = Topic(
     "word", "word/{shard}/{host}/{agent}", traffic.Word,
     "digest of a member's file for a host, which uses a grant that a majority confirms; only with certificates",
     "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 LEFT = Topic(
     "left", "left/{host}/{agent}", traffic.Left,
     "cells which vehicles of a host have left, for a host whose vehicles follow; each counts",
     "on change, and at 5 Hz until the leader has counted it",
-    access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False, trusted=True,
+    access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "number of a member's table on file",
     "per table by one member, 5 Hz by the other; 5 Hz by the leader instead of an unchanged table",
-    access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:member"), echoed=False, priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 KNOWN = Topic(
@@ -291,14 +287,14 @@ KNOWN = Topic(
     "an agent's file on another host, for its next generation",
     "asked at a start",
     access(serve="agent:agent", ask="agent rover"),
-    request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    request=traffic.KnownRequest, published=False, priority=Priority.INTERACTIVE,
     ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 LEAVE = Topic(
     "leave", "leave/{agent}", vehicles.Removed,
     "vehicles which an agent has removed for an operator", "asked",
     access(serve="agent:agent"),
-    request=vehicles.RemoveVehicles, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    request=vehicles.RemoveVehicles, published=False, priority=Priority.INTERACTIVE,
     ask_bytes=_LONG, answer_bytes=_LONG,
 )  # fmt: skip
 FOLLOWED = Topic(
@@ -319,6 +315,7 @@ POSE = Topic(
     "position of a target, from a tracker; each counts, because trackers must not replace each other's messages",
     "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
+    free=("put",),
     put_bytes=_SHORT,
 )  # fmt: skip
 TRUE_POSE = Topic(
@@ -339,26 +336,26 @@ OBSTACLE = Topic(
     "id must not replace each other's messages",
     "10 Hz in motion, else at least 1 Hz",
     access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
-    priority=Priority.INTERACTIVE,
+    free=("put",), priority=Priority.INTERACTIVE,
     put_bytes=_SHORT,
 )  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route/{asker}", planning.RouteReply, "routes from cells to the target", "asked",
     access(serve="planner:target", ask="agent:asker rover:asker"),
-    request=planning.RouteRequest, published=False, costly=True,
+    request=planning.RouteRequest, published=False, costly=True, free=("ask",),
     ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 PLACE_ROUTE = Topic(
     "place-route", "place/{places}/route/{asker}", planning.PlaceRouteReply, "routes from cells to a place",
     "asked",
     access(serve="places:places", ask="agent:asker rover:asker"),
-    request=planning.PlaceRouteRequest, published=False, costly=True,
+    request=planning.PlaceRouteRequest, published=False, costly=True, free=("ask",),
     ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
     access(serve="planner:target", ask="agent:asker targets:asker monitor:asker rover:asker"),
-    request=planning.CostRequest, published=False, costly=True,
+    request=planning.CostRequest, published=False, costly=True, free=("ask",),
     ask_bytes=_LONG, answer_bytes=2 * _LONG,
 )  # fmt: skip
 _NAMELESS = "the same for askers without a name, which share one turn"
@@ -393,20 +390,20 @@ LEAD = Topic(
 ZONES = Topic(
     "zones", "order/{keeper}/zone", orders.Zones, "adds, removes and lists zones",
     "asked by people", access(serve="keeper:keeper"),
-    request=orders.ZoneOrder, published=False, trusted=True, priority=Priority.INTERACTIVE,
+    request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
     answer_bytes=_FILE,
 )  # fmt: skip
 GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders,
     "gives an order: pause, stop, targets of a group, added targets, settings", "asked by people",
-    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False, trusted=True,
+    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False,
     priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
 ORDERS = Topic(
     "orders", "orders/{role}/{id}", orders.Orders,
     "orders in force, from keepers; without a keeper, from any process to a starting one", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
-    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+    request=Nothing, priority=Priority.INTERACTIVE,
     put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
 OBEYED = Topic(
@@ -418,7 +415,7 @@ OBEYED = Topic(
 SEND_VEHICLE = Topic(
     "send-vehicle", "order/{keeper}/send", orders.Goals,
     "sends a vehicle to places, recalls it, and lists sent vehicles", "asked by people",
-    access(serve="keeper:keeper"), request=orders.SendVehicle, published=False, trusted=True,
+    access(serve="keeper:keeper"), request=orders.SendVehicle, published=False,
     priority=Priority.INTERACTIVE, answer_bytes=_FILE,
 )  # fmt: skip
 GOALS = Topic(
@@ -426,19 +423,19 @@ GOALS = Topic(
     "places to which an agent's vehicles are sent, as on a keeper's disk",
     "1 Hz for agents with goals, and on change",
     access(put="keeper:id", serve="keeper:id", ask="agent:agent keeper", hear="agent:agent keeper"),
-    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+    request=Nothing, priority=Priority.INTERACTIVE,
     put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
 GOAL_STATES = Topic(
     "goal-states", "reached/{agent}", orders.GoalStates, "progress of an agent's vehicles towards their places",
-    "1 Hz for agents with goals, and on change", access(put="agent:agent", hear="keeper monitor"), trusted=True,
+    "1 Hz for agents with goals, and on change", access(put="agent:agent", hear="keeper monitor"),
     put_bytes=_LONG,
 )  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", processes.Stats,
     "counts of a process; keepers serve the last ones of ended processes", "1 Hz",
     access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
-    request=Nothing, priority=Priority.BACKGROUND,
+    request=Nothing, free=("ask",), priority=Priority.BACKGROUND,
     put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
 NOTE = Topic(

@@ -68,7 +68,7 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
 def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> int:
     """Tell one such lie for each true message about right of way. Returns the number of processes that were lied
     to."""
-    bus = simulation.network.bus("liar", simulation.scenario.network.namespace)
+    bus = simulation.network.bus("liar", simulation.scenario.network.namespace, simulation.authenticator)
     heard: list[Heard] = []
     lies: set[bytes] = set()
 

@@ -227,6 +227,20 @@ def test_a_pose_off_the_map_neither_counts_nor_keeps_its_tracker_alive(cell: int
     assert trackings.lost(now_ns) == {"t"}
 
 
+def test_made_up_targets_keep_out_no_other_once_their_leases_end() -> None:
+    trackings, tracker = Trackings(GRID), Tracker("a", START_NS)
+    living = msgspec.structs.replace(tracker.pose(START_NS), lease_s=60.0)
+    assert trackings.counted(living, START_NS) is not None
+    for n in range(5000):
+        trackings.counted(msgspec.structs.replace(tracker.pose(START_NS), target=f"q{n}", lease_s=30.0), START_NS)
+    pose = msgspec.structs.replace(tracker.pose(START_NS), target="new")
+    assert trackings.counted(pose, START_NS) is None
+    later_ns = START_NS + 31 * NS_PER_S
+    assert any(trackings.counted(pose, later_ns) is not None for _ in range(3))
+    assert len(trackings.poses()) <= 4096
+    assert {"t", "new"} <= trackings.poses().keys()
+
+
 def test_replaying_everything_that_was_heard_changes_nothing() -> None:
     chance, tracking = random.Random(3), Tracking(GRID)
     trackers = [Tracker("a", START_NS), Tracker("b", START_NS + 5 * NS_PER_S)]

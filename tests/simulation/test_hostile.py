@@ -31,7 +31,7 @@ def test_garbage_on_every_key_is_counted_and_dropped_and_the_swarm_does_its_work
     simulation = Simulation(seeded(1))
     laws = LawBook(simulation)
     chance = random.Random(1)
-    stranger = simulation.network.bus("stranger")
+    stranger = simulation.network.bus("stranger", authenticator=simulation.authenticator)
     for step in range(120):
         simulation.run_until(step * 0.1)
         for topic in FORGEABLE:

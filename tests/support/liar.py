@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from support.message_fuzzer import MessageFuzzer
 
@@ -69,7 +69,7 @@ class Liar:
         self.bus.ask(topic, request, post, tag="lie", timeout_s=0.5, **fields)
         self.told += 1
 
-    def serve(self, topics: tuple[Topic, ...]) -> None:
+    def serve(self, topics: Iterable[Topic], *, refuses: bool = True) -> None:
         """Answer everybody's questions with lies, several at a time."""
 
         def answer(event: Event) -> None:
@@ -80,7 +80,7 @@ class Liar:
                 message, fields = self._message(event.topic, kind)
                 event.answer(message, **fields)
                 self.told += 1
-            if self._chance.random() < 0.2:
+            if refuses and self._chance.random() < 0.2:
                 event.refuse("no")
             event.end()
 

@@ -42,7 +42,7 @@ def lock() -> Lock:
 def _key(topic: Topic) -> str:
     kinds = (topic.message, topic.request, topic.bulk)
     names = ["none" if kind is None else kind.__name__ for kind in kinds]
-    return " | ".join([topic.key, *names, "trusted" if topic.trusted else "open"])
+    return " | ".join([topic.key, *names, f"free: {', '.join(topic.free) or 'nothing'}"])
 
 
 def _locked(kind: type[Message]) -> dict[str, Any]:

@@ -81,7 +81,6 @@ class Rovers:
         rover = self.all.get(obstacle.id)
         if rover is not None and self._passable(obstacle.x_m, obstacle.y_m):
             rover.x_m, rover.y_m = obstacle.x_m, obstacle.y_m
-            rover.seq = max(rover.seq, obstacle.seq)
 
     def tick(self, time_scale: float, now_ns: int) -> list[Obstacle]:
         """Moves all rovers by a time (s) on the terrain. Returns what they say now."""

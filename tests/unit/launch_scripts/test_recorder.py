@@ -199,6 +199,17 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
     assert latest.poses["x3"].seq == 8
 
 
+def test_tokens_of_strangers_that_have_fallen_take_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.observe.latest_messages._MOST_NAMES", 10)
+    latest = LatestState(plan_of(scenario(), 0), GRID)
+    strangers = [Peer("agent", f"x{n}", 1) for n in range(10)]
+    for up in (True, False):
+        for peer in strangers:
+            latest.alive(peer, up, 0)
+    latest.alive(Peer("planner", "t7", 1), True, 0)
+    assert latest.up() == [("planner", "t7")]
+
+
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
     hear(
         recorder,

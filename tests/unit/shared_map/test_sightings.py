@@ -170,7 +170,7 @@ def test_a_sighting_that_ended_on_its_way_tells_nobody_anything() -> None:
     blind = msgspec.structs.replace(UNTRACKED.vehicles, sense_range_m=0.1)
     simulation = Simulation(msgspec.structs.replace(UNTRACKED, vehicles=blind))
     simulation.run_until(1)
-    stranger = simulation.network.bus("stranger")
+    stranger = simulation.network.bus("stranger", authenticator=simulation.authenticator)
     late = sighted(0, target="lost0", author="all.a9.1", until_ns=1)
     stranger.publish(SIGHTED, late, target="lost0", author="all.a9.1")
     simulation.run_until(2)

@@ -15,7 +15,9 @@ from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.topics import POSE, TABLE
 
 SHORT = st.text(max_size=4)
-SAID = st.tuples(st.binary(min_size=1, max_size=32), SHORT, SHORT, st.binary(max_size=8), st.binary(max_size=8))
+SAID = st.tuples(
+    st.binary(min_size=1, max_size=32), SHORT, SHORT, st.binary(min_size=1, max_size=8), st.binary(max_size=8)
+)
 """Secret, run, key, payload, question."""
 
 
@@ -23,21 +25,22 @@ SAID = st.tuples(st.binary(min_size=1, max_size=32), SHORT, SHORT, st.binary(max
 def test_a_code_is_good_for_what_it_was_made_for_and_nothing_else(one, other) -> None:
     secret, run, key, payload, asked = one
     code = Authenticator(secret, run).code(key, payload, asked)
-    check_code(Authenticator(secret, run), code, TABLE, key, payload, asked)
+    check_code(Authenticator(secret, run), code, TABLE, "put", key, payload, asked)
     secret, run, key, payload, asked = other
     if one != other:
         with pytest.raises(ProtocolError, match="a false code"):
-            check_code(Authenticator(secret, run), code, TABLE, key, payload, asked)
+            check_code(Authenticator(secret, run), code, TABLE, "put", key, payload, asked)
 
 
-def test_no_code_is_no_good_and_only_trusted_topics_have_one() -> None:
+def test_no_code_is_no_good_but_for_what_a_topic_leaves_free() -> None:
     ours = Authenticator(b"secret", "run")
     with pytest.raises(ProtocolError, match="no code"):
-        check_code(ours, None, TABLE, "key", b"payload")
-    check_code(ours, None, POSE, "key", b"payload")
-    check_code(None, None, TABLE, "key", b"payload")
-    assert code_of(ours, POSE, "key", b"payload") is None
-    assert code_of(None, TABLE, "key", b"payload") is None
+        check_code(ours, None, TABLE, "put", "key", b"payload")
+    with pytest.raises(ProtocolError, match="in a payload"):
+        check_code(ours, None, TABLE, "ask", "key", b"")
+    check_code(ours, None, POSE, "put", "key", b"payload")
+    check_code(None, None, TABLE, "put", "key", b"payload")
+    assert code_of(None, "key", b"payload") is None
 
 
 @pytest.fixture
