@@ -3,7 +3,7 @@
 import contextlib
 import random
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -36,13 +36,13 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.access import Authenticator
+from swarm.wire.access import Act, Authenticator
 from swarm.wire.codec import decode
 from swarm.wire.fields import OR_INFINITE, Column, taken_apart
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED
+from swarm.wire.topics import MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
 
@@ -234,23 +234,31 @@ def world(run: str) -> tuple[Scenario, Terrain, Floats]:
     return scenario, terrain, build_truth(scenario, terrain)
 
 
-def lied_to(run: str, state: str, seed: int, steps: int, altered: bool, *, secret: bool = True) -> Lied:
+May = Callable[[Topic, Act], bool]
+
+
+def lied_to(
+    run: str, state: str, seed: int, steps: int, altered: bool, *, secret: bool = True, may: May | None = None
+) -> Lied:
     """A swarm after many lies of every kind.
 
     altered  half of the lies are real messages with one field altered
+    may      which acts the liar uses; None: all, refusals and tokens too
     """
+    tells = may or (lambda topic, act: True)
     swarm = Lied(run, state, seed, secret=secret)
     liar = swarm.liar
     if altered:
         liar.listen()
     # Only a process that has no confirmation yet ends when it hears of another run.
-    liar.serve(tuple(topic for topic in asked() if topic is not RUN or state == "running"))
+    served = (topic for topic in asked() if topic is not RUN or state == "running")
+    liar.serve([topic for topic in served if tells(topic, "answer")], refuses=may is None)
     for step in range(steps):
-        for topic in (*published(), *OFTEN):
+        for topic in filter(lambda topic: tells(topic, "put"), (*published(), *OFTEN)):
             liar.put(topic)
-        for topic in asked():
+        for topic in filter(lambda topic: tells(topic, "ask"), asked()):
             liar.ask(topic, liar.hear)
-        if step % 5 == 0:
+        if step % 5 == 0 and may is None:
             liar.token(swarm.chance.choice(ROLES))
         swarm.disturb(step)
         swarm.run(0.1)

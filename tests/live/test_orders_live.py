@@ -18,6 +18,7 @@ from support.processes import eventually
 
 from launch_scripts.launcher.takeover import processes
 from swarm.bus.bus import Heard
+from swarm.clock import NS_PER_S
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.run_secret import state_folder
 from swarm.wire.fields import column
@@ -169,15 +170,16 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
     assert "no code" in str(stranger.order("zone", action="add", polygon=[[1, 1], [1, 9], [9, 9]], stamp_ns=now_ns))
     # A keeper's whole book, forged: launchers and all processes drop it.
     added = {"subject": "target", "name": "forged", "stamp_ns": now_ns, "cell": 40, "added": True}
-    session.put("swarm/orders/keeper/0", json.dumps({"orders": [added]}), encoding=zenoh.Encoding.APPLICATION_JSON)
-    # A zone, drawn without a keeper.
-    closed = {"group": "operator", "epoch": 1, "seq": 1 << 60, "cells": [5, 6], "kinds": [1, 1], "paces": [0, 0]}
-    session.put(
-        "swarm/marks/0/0/operator.z",
-        json.dumps({**closed, "stamps_ns": [now_ns] * 2}),
-        encoding=zenoh.Encoding.APPLICATION_JSON,
-    )
+    # A zone, drawn without a keeper, and marks that would overrule all others for 20 hours.
+    closed = {"epoch": 1, "seq": 1 << 60, "cells": [5, 6], "kinds": [1, 1], "paces": [0, 0]}
+    zone = {**closed, "group": "operator", "stamps_ns": [now_ns] * 2}
+    marks = {**closed, "group": "all", "stamps_ns": [now_ns + 20 * 3600 * NS_PER_S] * 2}
+    forged = {"orders/keeper/0": {"orders": [added]}, "marks/0/0/operator.z": zone, "marks/0/0/all.a88.1": marks}
+    for key, said in forged.items():
+        session.put(f"swarm/{key}", json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
     time.sleep(4.0)  # a launcher of a part waits for three seconds
+    held = [str(reply.ok.key_expr) for reply in session.get("swarm/marks/**") if reply.ok]
+    assert not {"swarm/marks/0/0/operator.z", "swarm/marks/0/0/all.a88.1"}.intersection(held)
     assert order(live, "zone", "ls")["zones"] == []
     assert order(live, "ls") == before
     assert [name for name in processes(live.run_dir) if name.startswith(("planner-z", "planner-f"))] == []

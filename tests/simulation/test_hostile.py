@@ -7,18 +7,12 @@ from support.wire_strategies import BY_TYPE
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
-from swarm.bus.bus import Event
 from swarm.wire.codec import encode
 from swarm.wire.messages import Message
-from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import TOPICS, Topic
 
 KNOWN = ("t0", "t1", "a0", "a1", "a2", "a0-00", "a1-01", "0", "3", "keeper", "planner", "agent", "targets")
 FORGEABLE = [topic for topic in TOPICS if topic.published]
-
-
-def ignore(event: Event) -> None:
-    pass
 
 
 def key_fields(topic: Topic, message: Message, chance: random.Random) -> dict[str, str]:
@@ -45,7 +39,3 @@ def test_garbage_on_every_key_is_counted_and_dropped_and_the_swarm_does_its_work
     assert report["vehicles_routed"] == 10
     assert report["captures"] > 0
     assert laws.collisions == laws.lethal == []
-
-
-def test_only_a_run_that_differs_ends_a_process():
-    assert RunInfo not in {topic.message for topic in FORGEABLE}
