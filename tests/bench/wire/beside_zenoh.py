@@ -21,7 +21,7 @@ from bench.harness import benchmark, names_of, track
 from bench.isolated import isolated
 from bench.wire import codec
 from bench.wire.queries import positions, route_queries
-from bench.wire.remote import RAW, beside, map_holder, map_key, map_peer, replica_cost
+from bench.wire.remote import CODES, RAW, beside, map_holder, map_key, map_peer, replica_cost
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
@@ -31,6 +31,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
 from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
+from swarm.wire.access import code_of
 from swarm.wire.codec import encode
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.topics import MARKS
@@ -112,7 +113,7 @@ def latency(far: Far, marks: int) -> dict[str, float]:
     """Microseconds from the put of a mark until another process's cost map has it, beside a raw put of the same
     bytes until a thread there has them. Both take turns in changing order."""
     peer = far.start(map_peer)
-    with open_bus(far.network) as bus:
+    with open_bus(far.network, authenticator=CODES) as bus:
         replica = MapReplica(GRID, author=_AUTHOR, publish_hz=1e6)
         put_ns: dict[tuple[int, int], int] = {}  # (tile, seq) -> when
         raw_ns: list[int] = []
@@ -154,7 +155,7 @@ def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
     per_s: dict[str, list[float]] = {"ours": [], "raw": []}
     cpu_us: dict[str, list[float]] = {"ours": [], "raw": []}
     lost = 0
-    with open_bus(far.network) as bus:
+    with open_bus(far.network, authenticator=CODES) as bus:
         _settle(bus, peer)
         for nth in range(rounds):
             numbers = range(nth * sets, (nth + 1) * sets)
@@ -162,10 +163,12 @@ def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
             keys = [map_key(n % tiles, "writer.1") for n in numbers]
             for name, root in (("raw", RAW), ("ours", NAMESPACE)):
                 whole = [f"{root}/{key}" for key in keys]
+                maker = CODES if name == "ours" else None
+                codes = [code_of(maker, *each) for each in zip(whole, payloads, strict=True)]
                 asked(peer, "applied")
                 began_ns = time.monotonic_ns()
-                for key, payload in zip(whole, payloads, strict=True):
-                    bus.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                for key, payload, code in zip(whole, payloads, codes, strict=True):
+                    bus.session.put(key, payload, attachment=code, congestion_control=zenoh.CongestionControl.BLOCK)
                 _until_still(peer, sets, 0 if name == "ours" else 1)
                 used_ns = asked(peer, "cpu")
                 applied, received_ns = asked(peer, "applied")
@@ -201,7 +204,7 @@ def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
                 cpu[name].append((time.process_time_ns() - used_ns) / 1e6)
                 if name == "sets" and count != sets:
                     raise SwarmError(f"a raw get had {count} of {sets} replies")
-        with open_bus(far.network) as bus:
+        with open_bus(far.network, authenticator=CODES) as bus:
             inbox = Inbox()
             replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
             sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench")

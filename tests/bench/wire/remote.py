@@ -29,11 +29,14 @@ from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
+from swarm.wire.access import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.messages.map_data import MarkSet
 
 RAW = "raw/bench"
 """Keys of the raw measurements: as long and as many as ours, without subscribers of ours."""
+CODES = Authenticator(b"bench", "bench")
+"""Makes and checks the codes of our messages, as between processes of one machine."""
 
 
 def map_key(tile: int, author: str) -> str:
@@ -132,7 +135,7 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
             case _:
                 return (len(applied), len(raw_ns))
 
-    with open_bus(network) as bus:
+    with open_bus(network, authenticator=CODES) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
         sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
@@ -145,7 +148,7 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
 def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) -> None:
     """Holds sets and answers as a keeper does; answers raw queries with the same bytes, by set and in bulk."""
     held = [some_set(tile, 0, marks) for tile in range(sets)]
-    with open_bus(network) as bus:
+    with open_bus(network, authenticator=CODES) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID)
         replica.merge(held)
