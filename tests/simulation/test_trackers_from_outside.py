@@ -78,7 +78,7 @@ class Ear:
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
-        self.bus = simulation.network.bus("ear-0", EXTERNAL.network.namespace)
+        self.bus = simulation.network.bus("ear-0", EXTERNAL.network.namespace, simulation.authenticator)
         self.status: PlannerStatus | None = None
         self.route: RouteReply | None = None
         self.cost: CostReply | None = None
