@@ -3,15 +3,10 @@ rule that is taken out is found. Every history has two shards with a seam, exter
 lives."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from support import broken_rules as rules
 from support.order_world import OrderWorld
-
-from swarm.right_of_way.entries import HostEntries
-from swarm.wire.messages.traffic import Table
-from vehicle_agent.traffic.cell_orders import Orders
 
 HISTORIES = 100
 Mutation = Callable[[pytest.MonkeyPatch], Callable[[OrderWorld], None] | None]
@@ -26,43 +21,6 @@ def test_histories_have_what_they_are_about() -> None:
     worlds = [OrderWorld(seed).run() for seed in range(20)]
     counts = {kind: sum(world.counts[kind] for world in worlds) for kind in worlds[0].counts}
     assert all(count > 20 for count in counts.values()), counts
-
-
-# --- rules of hosts ---------------------------------------------------------------------------------------------
-
-
-def says_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
-    enter = HostEntries.enter_next
-
-    def early(self: HostEntries, vehicle: str) -> bool:
-        if vehicle in self.placed and len(self.paths[vehicle]) > 1:
-            self._end(self.paths[vehicle][:1])
-        return enter(self, vehicle)
-
-    patch.setattr(HostEntries, "enter_next", early)
-
-
-def acts_on_what_was_granted_to_another_generation(patch: pytest.MonkeyPatch) -> None:
-    hear = HostEntries.hear_granted
-    patch.setattr(
-        HostEntries,
-        "hear_granted",
-        lambda self, shard, stamp, _, grants: hear(self, shard, stamp, self.generation, grants),
-    )
-
-
-# --- rules of leaders -------------------------------------------------------------------------------------------
-
-
-def frees_what_was_not_said(patch: pytest.MonkeyPatch) -> None:
-    table = Orders.table
-
-    def greedy(self: Orders, *what: Any) -> Table:
-        for host, vehicles in self.by_host.items():
-            self.remove(host, {vehicle: self.of[vehicle][-1:] for vehicle in vehicles}, (1 << 60, 0))
-        return table(self, *what)
-
-    patch.setattr(Orders, "table", greedy)
 
 
 # --- rules of members and of generations
@@ -80,15 +38,12 @@ def _setting(name: str, value: object) -> Mutation:
 RULES: list[Mutation] = [
     rules.follows_without_a_word,
     rules.follows_on_the_word_of_the_last_before_it,
-    says_left_when_it_sets_out,
     rules.takes_what_an_older_table_added,
-    acts_on_what_was_granted_to_another_generation,
     rules.believes_that_another_vehicle_of_the_cell_has_left,
     rules.forgets_who_is_before,
     rules.forgets_those_before_in_earlier_generations,
     rules.forgets_where_an_older_generation_may_stand,
     rules.frees_what_the_host_did_not_know_of,
-    frees_what_was_not_said,
     rules.forgets_where_bodies_are,
     _setting("majority", 1),
     _setting("forgetful", True),
