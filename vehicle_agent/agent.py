@@ -95,7 +95,6 @@ class Agent:
         self.blocked_ticks = 0
         self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
-        self._time_scale = scenario.time_scale
         self._map = local_map
         self.obstacles = obstacles or Obstacles(local_map.grid)
         self._sensor = sensor
@@ -136,6 +135,7 @@ class Agent:
         self._route_requests: dict[int, AskRoutes] = {}
         assigner, stagger = assigner or Spread(), chance.random()
         self.assignment = Assignment(self.vehicles, self.targets, assigner, config.reassign_s, stagger, group)
+        self.set_pace(scenario.time_scale, config.reassign_s)
         self._unassigned = False
         """True if vehicles have been placed that have no assignment yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -439,7 +439,7 @@ class Agent:
         if near != vehicle.in_reach:
             vehicle.set_in_reach(near)
             if near:
-                self._driver.stop_soon(vehicle)
+                self._driver.stop_soon(vehicle, 1 + self.holdings.is_followed(vehicle.id))
 
     # --- what is heard --------------------------------------------------------------------------------------
 
@@ -565,8 +565,8 @@ class Agent:
         if vehicle.route.cut(self._steering.passable_steps):
             vehicle.cut_route(now_ns)
         if path[-1] not in cells:  # it was granted cells along another route
-            on_route = set(cells)
-            self._driver.stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
+            kept = max(index + 1 for index, cell in enumerate(path) if cell in cells)
+            self._driver.stop_soon(vehicle, max(kept, 1 + self.holdings.is_followed(vehicle.id)))
         return [begun]
 
     # --- which target ---------------------------------------------------------------------------------------

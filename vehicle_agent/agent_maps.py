@@ -6,7 +6,6 @@ class. Hazards found in a zone are no news, and a vehicle in one drives out.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -53,10 +52,10 @@ class LocalMap:
     own_prior: NDArray[np.float32] | None = None
 
     def cell_s(self, share: float) -> float:
-        """Returns this quantile of the times of cells (s), from a sample of them."""
+        """Returns this quantile of the times of passable cells (s), from a sample of them; 0 if there are none."""
         paces = self.physics.reshape(-1)[:: max(self.physics.size // _SAMPLE, 1)]
         paces = paces[np.isfinite(paces)]
-        return self.grid.resolution_m * float(np.quantile(paces, share)) if len(paces) else math.inf
+        return self.grid.resolution_m * float(np.quantile(paces, share)) if len(paces) else 0.0
 
     def lethal(self, cells: NDArray[np.int64], paces: NDArray[np.float32]) -> NDArray[np.int64]:
         """Returns which of these cells are lethal to the vehicles' class, if these are their paces for "ground"."""

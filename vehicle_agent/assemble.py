@@ -40,8 +40,9 @@ from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.steering import FAR_CELLS
 
-_ACTS = 5
-"""Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them."""
+_ACTS = 10
+"""Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them. Each lets
+those behind wait for a moment: 5 cost a twentieth of the flow of a crowd (docs/design/right-of-way.md)."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least, so that they are there before a vehicle is."""
 

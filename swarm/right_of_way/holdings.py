@@ -205,6 +205,10 @@ class Holdings:
                 return entry
         return None
 
+    def is_followed(self, vehicle: str) -> bool:
+        """Returns True if another vehicle waits for the cell of this one."""
+        return any(entry.number in self._followed for entry in self._entries.paths[vehicle][:1])
+
     def open(self, vehicle: str) -> Sequence[int]:
         """The first cells of a path, up to the first that the vehicle may not enter yet."""
         path = self.path(vehicle)

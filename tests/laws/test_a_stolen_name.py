@@ -7,15 +7,17 @@ More histories: `pytest tests/laws/test_a_stolen_name.py -m seeds --seeds 0:2000
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import pytest
 from support.shard_tables import GRID, MEMBERS, holdings_of, standing
-from support.thief import ThiefWorld
-from support.traffic_world import Faults, TrafficWorld, random_faults
+from support.thief import Thief, ThiefWorld
+from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
 from vehicle_agent.traffic import member
@@ -35,13 +37,18 @@ def world_of(seed: int) -> ThiefWorld:
     return ThiefWorld(seed, *chance.choice(SHAPES), replace(faults, twins=0))
 
 
-def harm_done(seed: int) -> list[str]:
+def harm_done(seed: int, *, renewed: bool = False) -> list[str]:
     """Harm that remains of a history: vehicles of others met, members of a shard do not agree some time after the
     name is revoked, cells are closed for a vehicle that does not exist or a start that has ended, or a vehicle has
-    no entry."""
+    no entry.
+
+    renewed  whether the name's next certificate is stolen, too, after its owner has used it for a while
+    """
     world = world_of(seed)
-    world.run(LIES_S)
-    world.revoke()
+    history = [world.revoke, partial(world.begin_again, Process), partial(world.begin_again, Thief), world.revoke]
+    for event in history if renewed else history[:1]:
+        world.run(LIES_S)
+        event()
     world.run(25.0)
     at_odds = set(world.shards.all)
     for _ in range(60):  # a table is on its way to some in most moments
@@ -57,6 +64,26 @@ def harm_done(seed: int) -> list[str]:
 @pytest.mark.seeds(30)
 def test_others_do_not_meet_and_members_agree_once_the_name_is_revoked(seed: int) -> None:
     assert harm_done(seed) == []
+
+
+@pytest.mark.seeds(6)
+def test_a_name_that_is_stolen_again_with_its_next_certificate_does_no_harm(seed: int) -> None:
+    assert harm_done(seed, renewed=True) == []
+
+
+@pytest.mark.seeds(6)
+def test_members_agree_once_the_name_is_revoked_although_all_vehicles_have_left(seed: int) -> None:
+    world = world_of(seed)
+    world.run(LIES_S)
+    for process in world.processes:
+        process.disk.bodies.clear()
+        for vehicle in process.vehicles:
+            process.rights.holdings.leave(vehicle)
+    world.unmoved.clear()
+    world.run(4.0)
+    world.revoke()
+    world.run(12.0)
+    assert [table.shard for table in world.files() if table.without.get(world.stolen) != 1] == []
 
 
 @pytest.mark.seeds(6)
@@ -185,12 +212,17 @@ def test_a_member_stores_no_table_that_breaks_a_rule(lie: dict[str, object]) -> 
 def test_a_host_disclaims_nothing_while_a_vehicle_is_nowhere() -> None:
     """A liar may ask before the grant of the entry by which it begins: it would not take that."""
     holdings = holdings_of()
-    holdings.hear_word(
-        Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
-    )
+    word = Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
+    holdings.hear_word(word)
     assert not holdings._entries.never(0)
     holdings.enter("a0-00", 9)
-    holdings.hear_word(
-        Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
-    )
+    holdings.hear_word(word)
     assert holdings._entries.never(0) == {(7, 3, 2)}
+
+
+def test_a_member_remembers_the_newest_of_the_starts_that_have_ended() -> None:
+    """A host may name any number of them, in any order."""
+    host = _Host(0)
+    for seq, start in enumerate(random.Random(1).sample(range(1, 1000), 999)):
+        host.hear(standing("a1", [(20, 1, 1)], seq, generation=start, dead=[start], ended=True), 0)
+    assert host.ended == {*range(1000 - 2 * GENERATIONS_KEPT, 1000)}

@@ -227,36 +227,50 @@ class Thief(Process):
 
 class ThiefWorld(TrafficWorld):
     """Names are proven, and one of them is stolen until `faults.quiet_s`; then it is revoked. `collisions` are of
-    vehicles of the others."""
+    vehicles of the others.
+
+    revoked  number of the newest certificate of the name that is revoked; the next one may be stolen, too
+    """
 
     def __init__(self, seed: int, agents: int, per_agent: int, size: int, side: int, faults: Faults) -> None:
         self.lies = 0
-        self.revoked = False
+        self.revoked = 0
+        self.thief: type[Process] = Thief
+        """Kind of process that starts under the stolen name."""
         self.stolen = f"a{seed % agents}"
         super().__init__(seed, agents, per_agent, size, side, faults, proven=True)
 
     def process_of(self, agent: str, disk: Disk) -> Process:
-        process = (Thief if agent == self.stolen else Process)(self, agent, disk)
+        process = (self.thief if agent == self.stolen else Process)(self, agent, disk)
         if self.revoked:
             self.tell_revoked(process)
         return process
 
     def revoke(self) -> None:
         """The thief is silent from now on, and the others notice within two seconds."""
-        for process in [each for each in self.processes if each.agent == self.stolen]:
-            process.alive = False
-            self.processes.remove(process)
-        self.revoked = True
+        self.end_stolen()
+        self.revoked += 1
         for process in self.processes:
             self.at(self.chance.randrange(2 * NS_PER_S), lambda to=process: self.tell_revoked(to))
 
+    def end_stolen(self) -> None:
+        """Ends the processes under the stolen name."""
+        for process in [each for each in self.processes if each.agent == self.stolen]:
+            process.alive = False
+            self.processes.remove(process)
+
+    def begin_again(self, kind: type[Process]) -> None:
+        """The name has its next certificate, in the hands of its owner or a thief."""
+        self.end_stolen()
+        self.thief = kind
+        self.start(self.stolen, self.disks[self.stolen][0])
+
     def carry(self, source: Process, to: Process, deliver: Callable[[], None]) -> None:
-        """Carries nothing more that a revoked name has said."""
-        is_denied = source.agent == self.stolen
-        super().carry(source, to, lambda: None if is_denied and self.revoked else deliver())
+        """Carries nothing more that a process which has ended said under the name."""
+        super().carry(source, to, lambda: deliver() if source.alive or source.agent != self.stolen else None)
 
     def tell_revoked(self, process: Process) -> None:
-        process.rights.revoke({self.stolen: 1}, process.now_ns)
+        process.rights.revoke({self.stolen: self.revoked}, process.now_ns)
 
     def entries(self) -> list[Number]:
         """Some entries that members have on file."""

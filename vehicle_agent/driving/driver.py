@@ -165,7 +165,7 @@ class Driver:
 
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
         """Gives back all but the first `keep` cells and the one being entered."""
-        if self._holdings.awaits(vehicle.id) is not None:
+        if keep < 2 and self._holdings.awaits(vehicle.id) is not None:
             vehicle.motion.turn_back()  # else it would set out long after the order
         self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
 

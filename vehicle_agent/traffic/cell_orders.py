@@ -120,6 +120,10 @@ class Orders:
         """Returns True if the last entry of a vehicle waits for another."""
         return any(True for number in self.entries(vehicle)[-1:] for _ in self.before(number, vehicle))
 
+    def is_followed(self, cell: int, vehicle: str) -> bool:
+        """Returns True if others wait for a cell until this vehicle leaves it."""
+        return vehicle in [*self.order(cell).values()][:-1]
+
     def would_circle(self, vehicle: str, cell: int) -> bool:
         """Returns True if one of those in a cell's order waits, by way of others, for a vehicle."""
         left, seen = list(self.order(cell).values()), set[str]()
@@ -171,7 +175,7 @@ class Orders:
             if len(order) > 1:
                 hosts = [(number, agent_of(vehicle)) for number, vehicle in order.items()]
                 for index, (number, host) in enumerate(hosts):
-                    for other in {other for _, other in hosts[index + 1 :]}:
+                    for other in dict.fromkeys(other for _, other in hosts[index + 1 :]):
                         found.setdefault(host, {}).setdefault(other, []).append(number)
         return found
 

@@ -135,7 +135,7 @@ class Member:
         self._leader = ""
         self._led_until_ns = now_ns  # the leader that we know of is in charge at least this time
         self._due_ns = now_ns
-        self._wanted_ns: int | None = None
+        self._wanted_ns = now_ns - _WANTED_NS - 1
         self._acked_ns = dict.fromkeys(self._others, now_ns)
         """Other member -> when it acknowledged our claim or table last."""
         self._told: list[Table] = []
@@ -186,6 +186,11 @@ class Member:
         if asked_ns >= 0:
             self._trips.measure(member, now_ns - asked_ns)
 
+    def _is_wanted(self, now_ns: int) -> bool:
+        """Returns True if a leader is needed: a host has spoken lately, or members have to agree again, before
+        another name is revoked."""
+        return now_ns - self._wanted_ns <= _WANTED_NS or bool(self._distrusts(self.stored))
+
     def revoke(self, names: Mapping[str, int], now_ns: int) -> None:
         """Certificates of these agents up to a number are revoked: by what they said as a member or a host, others
         may have different tables on file."""
@@ -198,7 +203,7 @@ class Member:
     # --- what hosts say -------------------------------------------------------------------------------------
 
     def hear_host_state(self, standing: HostState, now_ns: int) -> None:
-        if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
+        if now_ns - self._wanted_ns > _WANTED_NS:
             # A new shard cannot have another leader; and hosts receive no more from the previous one.
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
             start_ns = max(_START_NS, self._trips.bound_ns(self._trusted) + self._tick_ns)
@@ -290,7 +295,7 @@ class Member:
         """Promise, or say nothing. The last action is the table to answer with."""
         claimant = self._shards.leader(self.shard, epoch)
         led = now_ns < self._led_until_ns and claimant != self._leader
-        if epoch <= self.promised or self.leader is not None or led:
+        if epoch <= self.promised or (self.leader is not None and self._is_wanted(now_ns)) or led:
             return []
         if epoch > self.promised + FURTHEST_EPOCH:
             return [Refused(f"a claim names an epoch that is implausibly far ahead: {epoch}")]
@@ -334,7 +339,7 @@ class Member:
     # --- being leader ---------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> list[MemberAction]:
-        wanted = self._wanted_ns is not None and now_ns - self._wanted_ns <= _WANTED_NS
+        wanted = self._is_wanted(now_ns)
         if wanted and self.leader is not None and self._claim_above <= self.leader.epoch:
             return self._lead(self.leader, now_ns)
         if not wanted or (self.leader is None and now_ns < self._due_ns):

@@ -61,9 +61,13 @@ class Round:
         self._onward = onward
         self._chain: set[int] = set()
 
-    def plan(self, mover: Mover) -> None:
+    def plan(self, mover: Mover, *, pushed: bool = False) -> None:
+        """Plans a mover and those in its way, if it is not planned yet.
+
+        pushed  whether others wait for its cell: it goes anywhere rather than stay
+        """
         if mover.id not in self.to:
-            self._plan(mover, mover.age, pushed=False)
+            self._plan(mover, mover.age, pushed)
 
     def _plan(self, mover: Mover, age: int, pushed: bool) -> bool:
         """Returns True if the mover leaves its cell, or may stay."""

@@ -231,6 +231,8 @@ class RightOfWay:
         """Returns the messages of our members and our vehicles to send now."""
         actions: list[Action] = [Refused(text) for text in self.holdings.refused]
         self.holdings.refused.clear()
+        for shard in self._saved if self._revoked else ():
+            self._member(shard, now_ns)  # they have to agree again, even if no host speaks to them
         for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
         if self.holdings.replaced:

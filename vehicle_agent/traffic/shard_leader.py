@@ -39,7 +39,6 @@ MOST_CELLS_OF_EXTERNAL = 1024
 MOST_CELLS_OF_EXTERNALS = 1 << 14
 """Cells of one shard that all external vehicles together hold: a quarter of one as large as a region
 (docs/design/external-vehicles.md)."""
-_NO_ENTRIES: Sequence[Number] = []
 _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
 TABLES_KEPT = 16
@@ -322,7 +321,7 @@ class Leader:
         for stand in asking:
             mover = movers.get(stand.vehicle)
             if mover is not None:
-                round.plan(mover)
+                round.plan(mover, pushed=self._orders.is_followed(mover.cell, mover.id))
             elif stand.ahead and not self._orders.waits(stand.vehicle):
                 self._grant(stand, self._next_ahead(stand), round.taken)
         # Who makes way first, so that others may follow it.

@@ -1,12 +1,21 @@
 """An agent whose file takes nothing is no member: it promises, stores and tells nothing until its file takes it."""
 
+from unittest.mock import MagicMock
+
 import msgspec
 from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
 
+from swarm.bus.bus import Replied
+from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.lock_regions import Shards
+from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
+from swarm.wire.topics import KNOWN
+from vehicle_agent.promise_store import PromiseStore
+from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
@@ -81,18 +90,16 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     older.hear_known(known)
     (told,) = older.tick({}, S)
     assert isinstance(told, Tell)
-    said = told.standing
-    assert (said.shard, said.ended) == (0, True)
+    assert (told.standing.shard, told.standing.ended) == (0, True)
 
 
 def test_whoever_waits_in_a_shard_without_a_leader_says_so() -> None:
     rights = rights_of("a0")
     rights.begin(0)
-    generation = rights.holdings.generation
 
     def hear(seq: int, now_ns: int) -> None:
         table = table_of(1, seq, a0=[0])
-        table.hosts["a0"] = (generation, 1)
+        table.hosts["a0"] = (rights.holdings.generation, 1)
         rights.host.hear_granted(granted_of(table), now_ns)
 
     assert rights.host.unled(S) == {}
@@ -102,3 +109,20 @@ def test_whoever_waits_in_a_shard_without_a_leader_says_so() -> None:
     assert all(member in sentence for member in MEMBERS)
     hear(1, 4 * S)  # told again
     assert rights.host.unled(5 * S) == {}
+
+
+def test_late_answers_count_for_the_generation_that_asked_only() -> None:
+    """Answers to an earlier question are older than the shards into which that one's successor drove."""
+    rights, bus = rights_of("a0"), MagicMock()
+    setup = RoleSetup(Scenario(), "run", "agent", "a0", 1, 1)
+    sync = RightOfWaySync(rights, setup, PromiseStore(7), bus, MagicMock(), MagicMock())
+    sync.start(0)
+    sync.tick({}, S)  # it begins without answers
+    sync._perform([AskKnown()])
+    sync.tick({}, 2 * S)
+    for tag in dict.fromkeys(call.kwargs["tag"] for call in bus.ask.call_args_list):
+        assert not rights.host.informed
+        for agent in AGENTS[1:]:
+            known = Known(agent=agent, disk=7, generation=0, shards=[])
+            sync.on_cells_event(Replied(tag, KNOWN, {"agent": agent}, known), 3 * S)
+    assert rights.host.informed

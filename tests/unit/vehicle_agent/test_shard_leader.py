@@ -143,6 +143,12 @@ def test_who_is_pushed_and_who_pushes_are_granted_their_cells_by_one_table() -> 
     assert plan(pushed) == {"a1-00": [9, 10], "a2-00": [8, 9]}
 
 
+def test_a_vehicle_for_whose_cell_another_waits_goes_anywhere_rather_than_stay() -> None:
+    stays = {"a1": replace(stand_of("a1", [9], wants=[10]), better=0)}
+    waits = {"a2": replace(stand_of("a2", [8]), end=9, holds=Held.of([(8, 1, 1), (9, 1, 2)]))}
+    assert plan({**stays, **waits}) == {"a1-00": [9, 10], "a2-00": [8, 9]}
+
+
 def test_no_two_exchange_places_and_none_go_around_in_a_ring() -> None:
     swap = {"a1": stand_of("a1", [9], wants=[8]), "a2": stand_of("a2", [8], wants=[9], age=9)}
     assert plan(swap) == {"a1-00": [9], "a2-00": [8]}
