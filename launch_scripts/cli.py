@@ -30,7 +30,7 @@ FAMILIES = {
     "order vehicle": ("vehicle_commands:app", "Add, remove, stop and start vehicles.", ORDER),
     "terrain": ("terrain_commands:app", "Inspect and convert terrain; reach maps.", PREPARE),
     "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
-    "marks": ("map_commands:app", "Inspect and export marks of a store; learned factors.", LEFT),
+    "marks": ("marks_commands:app", "Inspect and export marks of a store; learned factors.", LEFT),
     "study": ("simulation_commands:study_app", "Run scenarios with many settings and seeds.", LEFT),
     "gateway": ("gateway_commands:app", "Connect a running swarm to ROS 2 and MAVLink.", ADMIN),
     "deploy": ("deploy_commands:app", "Plan several machines: archives, certificates, router.", ADMIN),

@@ -51,7 +51,7 @@ class GrowthTimes:
     row       of the strategy, in force now
     full_ns   CPU time of a full growth
     exact_ns  CPU time of an exact move, or of mending the tree
-    in_pieces whether exact trees are `PieceTree`s: on large maps whose cells cost the same from all sides
+    in_pieces whether exact trees are `PartitionedTree`s: on large maps whose cells cost the same from all sides
     """
 
     def __init__(

@@ -34,8 +34,8 @@ from planner_service.kernels import (
     partition_totals,
     pull_routes,
     queue_dial,
-    queue_directed,
     queue_heap,
+    queue_multilevel,
     queue_wide,
     repair,
     route_walk,
@@ -53,7 +53,7 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
+    StepKernel(queue_dial.grow_by_buckets, queue_multilevel.grow_directed_by_buckets),
     parents.point_to_parents,
     StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,

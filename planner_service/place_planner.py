@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from planner_service.followers import Followers
-from planner_service.goal_trees import GoalTrees
+from planner_service.goal_tree_cache import GoalTrees
 from planner_service.planner import FOLLOWER_LEASE_NS, MOST_ROUTES, MOST_STEPS
 from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.tree.cost_grid import CostGrid

@@ -19,7 +19,7 @@ from planner_service.tree.partitioned_tree import GrownTree
 from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
-from shared_map.replication.mark_filter import readable_for_target
+from shared_map.replication.interest import readable_for_target
 from shared_map.sightings import Presence, Sightings, pose_of
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S

@@ -27,7 +27,7 @@ from planner_service.tree.partial_growth import PartialGrowth
 from planner_service.tree.partitioned_tree import (
     AnyTree,
     GrownTree,
-    PieceTree,
+    PartitionedTree,
     can_be_root,
     empty_tree,
     growth_job,
@@ -422,11 +422,11 @@ class TargetTree:
             return Decision("whole")
         if row.on_move is OnMove.EXACT_MOVE:
             # To cut a tree into pieces, or to write a cost into every cell of one, takes as long as to grow it.
-            cuts = self._in_pieces and not isinstance(tree, PieceTree) and not self._is_quick
+            cuts = self._in_pieces and not isinstance(tree, PartitionedTree) and not self._is_quick
             if not self._can_mend or cuts:
                 return Decision("whole")
             return Decision("exact", exact_half(self._grid, tree.root, target_cell) if moved else 0)
-        if isinstance(tree, PieceTree) and not self._is_quick:
+        if isinstance(tree, PartitionedTree) and not self._is_quick:
             return Decision("whole")
         return Decision("window", *self._windows.after_move(row, tree.root, target_cell, self._network is not None))
 
@@ -491,7 +491,7 @@ class TargetTree:
         if not self._is_quick:
             self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
-        if isinstance(self._tree, PieceTree) is not self._in_pieces:
+        if isinstance(self._tree, PartitionedTree) is not self._in_pieces:
             self._tree = empty_tree(self._costs, self._in_pieces)
         self._tree.grow(target_cell)
         self._state = State.CURRENT
@@ -516,7 +516,7 @@ class TargetTree:
     @property
     def _is_whole(self) -> bool:
         """Returns True if a cell without a cost has no path."""
-        return isinstance(self._tree, PieceTree) or self._tree.bound == np.inf
+        return isinstance(self._tree, PartitionedTree) or self._tree.bound == np.inf
 
     def _follow_near(self, target_cell: int, changes: Changes | None) -> Update | None:
         """Follows by a growth that stops; None where the whole tree is to be kept."""
@@ -644,7 +644,7 @@ class TargetTree:
     def _can_mend(self) -> bool:
         """Returns True if the tree can be made exact here and now, by its parents. Where exact trees are in pieces,
         to make another exact takes as long as to grow it."""
-        fits = isinstance(self._tree, PieceTree) or not self.times.in_pieces
+        fits = isinstance(self._tree, PartitionedTree) or not self.times.in_pieces
         return fits and self.times.mends_quickly and self._all_kernels() and self._tree.fine
 
     def _mend(self) -> Update:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared_map.array_files import Floats
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.liveness import POSE_SILENCE_NS, Leases
 from swarm.wire.fields import LONGEST_LEASE_S

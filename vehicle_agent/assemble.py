@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.mark_filter import Interest, MarkFilter, author_of
+from shared_map.replication.interest import Interest, MarkFilter, author_of
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.store import load_homes

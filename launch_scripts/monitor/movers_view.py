@@ -20,7 +20,7 @@ from launch_scripts.monitor.view_outputs import LABEL_COLOUR, Pen, RateLimit, St
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_state import RunState
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario

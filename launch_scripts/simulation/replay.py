@@ -22,7 +22,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.recording.recording import versions
-from swarm.recording.records import FOLDER, SUFFIX, Head, RecordReader
+from swarm.recording.recording_file import FOLDER, SUFFIX, Head, RecordReader
 from swarm.recording.replaying import Outcome, Replaying, replay
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup

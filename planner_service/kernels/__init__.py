@@ -12,7 +12,7 @@ queue              of                                                          w
 =================  ==========================================================  ====================================
 `queue_dial`       growths whose costliest step is at most 256 buckets         0.4 to 0.6 of the time of the next
 `queue_wide`       growths over cell costs of any ratio                        any width is exact: the map decides
-`queue_directed`   growths where uphill is not downhill                        a first offer is not the least there
+`queue_multilevel` growths where uphill is not downhill                        a first offer is not the least there
 `repair.spread`    changes of a tree                                           memory follows the changed cells
 `queue_heap`       strides, tiles of a partition: few cells, served by cost    a key may fall below what was served
 =================  ==========================================================  ====================================

@@ -46,7 +46,7 @@ MOST_KEPT = 1 << 9
 200 tiles in the mean, and a move 170 to 260 (docs/design/incremental-trees.md)."""
 
 
-class PieceTree:
+class PartitionedTree:
     """The exact tree of one root on a `CostGrid` without climbs.
 
     cost_grid  the map that the tree lies on. A caller that changes it calls `repair`, or `take`
@@ -227,19 +227,19 @@ class PieceTree:
         return int(looked) * CELLS
 
 
-AnyTree = CostToGoTree | PieceTree
+AnyTree = CostToGoTree | PartitionedTree
 
 
 def empty_tree(cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
     """One that is to be grown."""
-    return PieceTree(cost_grid) if in_pieces else CostToGoTree(cost_grid)
+    return PartitionedTree(cost_grid) if in_pieces else CostToGoTree(cost_grid)
 
 
-def in_pieces(tree: AnyTree) -> PieceTree:
+def in_pieces(tree: AnyTree) -> PartitionedTree:
     """The tree in pieces, which makes it exact; itself if it is."""
-    if isinstance(tree, PieceTree):
+    if isinstance(tree, PartitionedTree):
         return tree
-    pieces = PieceTree(tree.cost_grid)
+    pieces = PartitionedTree(tree.cost_grid)
     pieces.take(tree.root, tree.parent)
     return pieces
 
@@ -279,7 +279,7 @@ class GrownTree:
     cell_cost: Floats
     reach: float
     offered: NDArray[np.uint8] | None
-    pieces: PieceTree | None = None
+    pieces: PartitionedTree | None = None
 
     def tree_on(self, cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
         """Returns the tree on the current map: to be repaired by the changes since the snapshot."""
@@ -315,7 +315,7 @@ def growth_job(
         pieces = None
         if in_pieces and reach >= 0:
             cost = _NONE  # given back before the pieces take as much
-            pieces = PieceTree(cost_grid)
+            pieces = PartitionedTree(cost_grid)
             pieces.take(target_cell, parent)
         heuristic = None if pieces is not None else cost.copy() if reach >= 0 else cost
         return GrownTree(

@@ -11,7 +11,7 @@ from planner_service.kernels.route_walk import OK
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
-from planner_service.tree.partitioned_tree import PieceTree
+from planner_service.tree.partitioned_tree import PartitionedTree
 from shared_map.array_files import Floats
 from swarm.wire.route_columns import RouteBatch
 
@@ -53,7 +53,10 @@ class LowerBounds:
             self._heuristic = None
 
     def at(
-        self, tree: CostToGoTree | PieceTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
+        self,
+        tree: CostToGoTree | PartitionedTree,
+        starts: NDArray[np.int64],
+        cost: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 
@@ -80,7 +83,7 @@ _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
 def read_routes(
-    tree: CostToGoTree | PieceTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int
+    tree: CostToGoTree | PartitionedTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int
 ) -> RouteBatch:
     """Routes from the cells, in order. Failures are statuses, not exceptions. `max_cells` 0: whole routes."""
     grid = tree.cost_grid

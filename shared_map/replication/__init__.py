@@ -22,7 +22,7 @@
 6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has
    a budget of changed cells. Sets beyond the budget wait; sets beyond the bounds are refused and counted for
    any sender.
-7. *Interest* (`mark_filter`): a replica may hold only regions near its vehicles and only groups
+7. *Interest* (`interest`): a replica may hold only regions near its vehicles and only groups
    that it may read. Then it hears only the digests that can concern it.
 
 `replica` is the core (sets, digests and time in; changed cells and sets to publish out), `replica_sync` its shell

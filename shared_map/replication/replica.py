@@ -14,7 +14,7 @@ from shared_map.learning.measurements import Measurement, columns_of
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held
 from shared_map.replication.held_sets import HeldSets
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from shared_map.replication.marks import (
     NO_STATEMENT,
     NO_STATEMENTS,

@@ -15,7 +15,7 @@ from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
-from swarm.recording.records import (
+from swarm.recording.recording_file import (
     FOLDER,
     SUFFIX,
     Call,

@@ -12,7 +12,7 @@ from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as
-from swarm.recording.records import (
+from swarm.recording.recording_file import (
     Call,
     Called,
     Cut,

@@ -4,8 +4,8 @@ restart.
 The map is divided into *shards* (`lock_regions`). Three agents, or four where certificates prove names,
 are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
 vehicles in a shard or at its border. A *generation* is one incarnation of a host. The leader keeps an order of
-*entries* for each cell (`entries`): the vehicle of an entry enters the cell once all before it are over. An entry
-is never revoked and never runs out: only its host ends it.
+*entries* for each cell (`host_entries`): the vehicle of an entry enters the cell once all before it are over. An
+entry is never revoked and never runs out: only its host ends it.
 
 This package is the side of hosts. Members and leaders are in `vehicle_agent/traffic`; the proof is in
 docs/design/right-of-way.md, and docs/design/external-vehicles.md says how external vehicles come into it. All but

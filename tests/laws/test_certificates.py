@@ -18,7 +18,7 @@ from planner_service.kernels.partition import MOST_SLACK
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.partitioned_tree import PieceTree
+from planner_service.tree.partitioned_tree import PartitionedTree
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
@@ -139,7 +139,7 @@ def test_bounds_are_what_their_slow_twin_proves(seed: int, length_weight: float)
 def test_an_exact_tree_in_pieces_proves_all_but_what_its_pieces_may_lack() -> None:
     tree, _ = a_tree(1)
     costs = tree.cost_grid
-    pieces = PieceTree(costs)
+    pieces = PartitionedTree(costs)
     pieces.grow(tree.root)
     cells = costs.pad_all(np.arange(GRID.cells))
     cells = cells[np.isfinite(pieces.cost_at(cells))]

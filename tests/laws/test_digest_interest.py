@@ -11,7 +11,7 @@ from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.replication.mark_filter import DigestInterest
+from shared_map.replication.interest import DigestInterest
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.wire.messages.map_data import Digest, MarkKind

@@ -14,9 +14,9 @@ from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
 from swarm.config.agents import agent_of
-from swarm.right_of_way.entries import HostEntries
 from swarm.right_of_way.external_vehicle import ExternalVehicle
 from swarm.right_of_way.host import Host
+from swarm.right_of_way.host_entries import HostEntries
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import SILENT_NS, Leader
 

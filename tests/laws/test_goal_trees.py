@@ -6,7 +6,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import WALLS
 from support.planner_strategies import RULES, random_climb, random_pace
 
-from planner_service.goal_trees import GoalTrees
+from planner_service.goal_tree_cache import GoalTrees
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth

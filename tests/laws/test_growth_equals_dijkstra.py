@@ -104,7 +104,7 @@ _SMALL = """
 import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
-from planner_service.goal_trees import GoalTrees
+from planner_service.goal_tree_cache import GoalTrees
 from planner_service.pulled_routes import Puller
 from planner_service.tree.cost_grid import CostGrid
 from support.kernel_oracle import random_grids

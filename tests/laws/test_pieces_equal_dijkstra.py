@@ -20,7 +20,7 @@ from planner_service.kernels.partition import SIDE
 from planner_service.tree import partitioned_tree as pieces
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.partitioned_tree import PieceTree
+from planner_service.tree.partitioned_tree import PartitionedTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
@@ -44,7 +44,7 @@ class Chase:
         self.ground.load(self.pace)
         self.cells = self.ground.pad_all(np.arange(rows * cols))
         with mock.patch.object(pieces, "MOST_KEPT", (1, 2, 5, 1024)[seed // 2 % 4]):
-            self.tree = PieceTree(self.ground)  # what it says must not hang on what it has kept
+            self.tree = PartitionedTree(self.ground)  # what it says must not hang on what it has kept
         self.gave_way = 0
         self.grow(int(rng.choice(np.flatnonzero(np.isfinite(self.pace)))))
 
@@ -195,7 +195,7 @@ def test_a_target_whose_tree_lies_in_pieces_keeps_the_laws(strategy: Strategy, h
             play = Play(pace, PlannerConfig(strategy=strategy, cpu_budget=0.5, **rules), has_worker=has_worker)
             for budget in (1e-9, 0.5, 0.5) if strategy == "auto" else (0.5,):
                 kinds |= play.walk(rng, 7, 7)
-                in_pieces.append(isinstance(play.tree._tree, PieceTree))
+                in_pieces.append(isinstance(play.tree._tree, PartitionedTree))
                 play.tree.times.set_budget(budget)
     assert "exact" in kinds
     assert in_pieces == ([True, False, True] if strategy == "auto" else [True] * len(in_pieces))
@@ -255,7 +255,7 @@ def test_what_loses_its_way_and_has_it_again_is_looked_at_along_its_edge_only() 
     pace = random_pace(np.random.default_rng(8), rows, cols, 3.0, 0.1)
     root = int(np.flatnonzero(np.isfinite(pace))[0])
     ground.load(pace)
-    tree = PieceTree(ground)
+    tree = PartitionedTree(ground)
     tree.grow(root)
     looked = mended = 0
     for far in (cols - 1, (rows - 1) * cols, rows * cols - 1, rows * cols // 2):
@@ -281,7 +281,7 @@ def test_ways_closed_all_over_the_map(seed: int) -> None:
     chase.ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**chase.rules))
     chase.ground.load(chase.pace)
     chase.cells = chase.ground.pad_all(np.arange(chase.pace.size))
-    chase.tree = PieceTree(chase.ground)
+    chase.tree = PartitionedTree(chase.ground)
     chase.grow(int(rng.choice(np.flatnonzero(np.isfinite(chase.pace)))))
     root = divmod(chase.tree.root, cols)
     for factor in (np.inf, np.inf, 5.0):

@@ -23,9 +23,9 @@ from launch_scripts.simulation.worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
-from swarm.recording import records
+from swarm.recording import recording_file
 from swarm.recording.recording import Recording
-from swarm.recording.records import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
+from swarm.recording.recording_file import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
 from swarm.recording.replaying import Outcome
 from swarm.recording.service_boundary import ExternalCalls
 from swarm.runtime.role import RoleSetup
@@ -263,7 +263,7 @@ def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Pa
 def test_a_recording_that_is_full_says_so_and_is_the_same_until_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(records.RecordWriter.__init__, "__defaults__", (5_000,))
+    monkeypatch.setattr(recording_file.RecordWriter.__init__, "__defaults__", (5_000,))
     record(tmp_path, 4, 2)
     found = list(replay_run(tmp_path))
     assert any("at most" in each.outcome.ended for each in found if each.outcome is not None)
@@ -306,4 +306,6 @@ def test_all_that_a_process_is_started_with_is_recorded() -> None:
     # The folder of a process's files, their former owner, and the receiver of its health are no input: the content
     # that it reads there is.
     here = {"run_dir", "record_inputs", "health", "takes_over"}
-    assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(records.Head.__struct_fields__)
+    assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(
+        recording_file.Head.__struct_fields__
+    )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from support.traffic_world import TrafficWorld
 
-from swarm.right_of_way.entries import BEFORE_ALL, HostEntries
+from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
 from swarm.wire.messages.traffic import Entry
 from vehicle_agent.traffic.cell_orders import Orders
 

@@ -14,7 +14,7 @@ from support.planner_strategies import Job, Marks, Move
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.partitioned_tree import GrownTree, PieceTree
+from planner_service.tree.partitioned_tree import GrownTree, PartitionedTree
 from planner_service.tree.strides import StrideNetwork
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -107,7 +107,7 @@ class Play:
         """The tree is, in costs and parents, the one that is grown from scratch; in pieces, its costs are nearer to
         the optimum."""
         mine = self.tree._tree
-        if isinstance(mine, PieceTree):
+        if isinstance(mine, PartitionedTree):
             cells = mine.cost_grid.pad_all(np.arange(self.grid.cells))
             optimum = naive.cost_to_go(self.pace, mine.root, **self.rules).reshape(-1)
             optimum[~np.isfinite(self.pace.reshape(-1))] = np.inf

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Set
 
 import numpy as np
 
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec

@@ -1,7 +1,7 @@
 """Orders: which vehicles may use each cell of a shard, one after the other, as its leader keeps them. Pure.
 
-`swarm.right_of_way.entries` has the rules. Entries are appended at the end of an order, and removed by the word of
-their own host, or by proof that its generation has ended.
+`swarm.right_of_way.host_entries` has the rules. Entries are appended at the end of an order, and removed by the
+word of their own host, or by proof that its generation has ended.
 """
 
 from __future__ import annotations

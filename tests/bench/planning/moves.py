@@ -15,7 +15,7 @@ from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.growth_times import exact_half
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.partitioned_tree import PieceTree
+from planner_service.tree.partitioned_tree import PartitionedTree
 from swarm.config.scenario import PlannerConfig
 
 Course = Literal["random", "straight"]
@@ -38,7 +38,7 @@ class _Walk:
         self.costs = CostGrid(field.grid, PlannerConfig())
         self.costs.load(field.pace)
         self.mended, self.grown = CostToGoTree(self.costs), CostToGoTree(self.costs)
-        self.pieces = PieceTree(self.costs)
+        self.pieces = PartitionedTree(self.costs)
         self.cell = int(field.draw(1, rng)[0])
         self.mended.grow(self.cell)
         self.pieces.take(self.cell, self.mended.parent.copy())

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.agent_world import AgentWorld, pace_of
 
-from shared_map.replication.mark_filter import MarkFilter, readable_for_target
+from shared_map.replication.interest import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
 from swarm.config.agents import readable_groups
 from swarm.config.load import parse_scenario

@@ -3,7 +3,7 @@
 from support.agent_world import AgentWorld, pace_of
 from support.makers import fleet_of
 
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Presence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec

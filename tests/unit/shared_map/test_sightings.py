@@ -8,7 +8,7 @@ from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.replication.mark_filter import MarkFilter
+from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.bus.bus import Heard
 from swarm.clock import NS_PER_S

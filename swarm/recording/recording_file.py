@@ -112,7 +112,7 @@ class Called(Record, frozen=True, tag=1):
 
 
 class Handled(Record, frozen=True, tag=2):
-    """An event that the service handled (`swarm.recording.records`).
+    """An event that the service handled (`swarm.recording.recording_file`).
 
     kind     the name of its class in `swarm.bus.bus`
     topic    its name; empty of an event that has none
