@@ -58,10 +58,11 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 
 def system_named(text: str, what: str) -> Any:
-    """rasterio's CRS of a text. Raises TerrainError, which `what` begins, if it is none."""
+    """rasterio's CRS of a text, of which "local" means metres from anywhere. Raises TerrainError, which `what` begins,
+    if it is none."""
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
-            return rasterio.CRS.from_user_input(text)
+            return rasterio.CRS.from_user_input(METRES if text == "local" else text)
     except (CRSError, ValueError) as error:
         raise TerrainError(f"{what} {text!r} is no coordinate system; write EPSG:32632 or alike") from error
 

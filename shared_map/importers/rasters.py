@@ -130,12 +130,13 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
         check_metres(dataset.transform.a, dataset.transform.c, what)
         notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
         return rasterio.CRS.from_wkt(METRES), dataset.transform, notes
-    if has_place or not (is_cover or own is not None or path.suffix.lower() == ".png"):
+    is_image = path.suffix.lower() == ".png"
+    if has_place or not (is_cover or own is not None or is_image or config.crs == "local"):
         crs = crs_of(dataset.crs, config.crs, what)
-        if crs.is_projected:
+        if not crs.is_geographic:
             check_metres(dataset.transform.a, dataset.transform.c, what)
         return crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform))
-    is_grey = not is_cover and own is None
+    is_grey = is_image and not is_cover and own is None
     if config.resolution_m is None or (is_grey and not config.height_scale):
         scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""
         raise TerrainError(f"{what} does not say how large a cell is; set terrain.resolution_m (metres){scale}")

@@ -119,7 +119,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
                         open ground, or "lethal")
     cover_classes       codes whose class (or pace, or "lethal") differs from the legend: code = class
     resolution_m        cell size to which everything is resampled; default: the source's own
-    crs                 coordinate system of a source which does not state it, such as "EPSG:32632"
+    crs                 coordinate system of a source which does not state it, such as "EPSG:32632", or "local"
     height_scale        metres per unit of height, where the file does not state it (.png)
     elevation_encoding  "metres" if whole numbers which look like codes of land cover are heights
     nodata              cells without a height: "lethal", or "fill" to interpolate them from their surroundings
