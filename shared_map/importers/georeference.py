@@ -58,8 +58,8 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 
 def system_named(text: str, what: str) -> Any:
-    """rasterio's CRS of a text, of which "local" means metres from anywhere. Raises TerrainError, which `what` begins,
-    if it is none."""
+    """rasterio's CRS of a text, of which "local" means metres from anywhere. Raises TerrainError, which `what`
+    begins, if it is none."""
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
             return rasterio.CRS.from_user_input(METRES if text == "local" else text)

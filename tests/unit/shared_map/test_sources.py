@@ -85,7 +85,7 @@ def test_a_rotated_file_is_turned_north_up_and_says_so(tmp_path: Path) -> None:
 
 def test_local_metres_need_no_system(tmp_path: Path) -> None:
     terrain = load(crs="local", **dem(tmp_path, crs=None))
-    assert (terrain.grid.crs, terrain.grid.resolution_m) == ("local", 10.0)
+    assert (terrain.grid.crs, terrain.grid.resolution_m) == ("local", 20.0)
 
 
 def test_a_coarser_resolution_averages(tmp_path: Path) -> None:
