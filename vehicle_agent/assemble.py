@@ -42,7 +42,7 @@ from vehicle_agent.traffic.steering import FAR_CELLS
 
 _ACTS = 10
 """Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them. Each lets
-those behind wait for a moment: 5 cost a twentieth of the flow of a crowd (docs/design/right-of-way.md)."""
+those behind wait for a moment: 5 cost a twentieth of the flow (`bench crowd --worlds corridor --seeds 1:2`)."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least, so that they are there before a vehicle is."""
 
