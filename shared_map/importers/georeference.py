@@ -154,7 +154,7 @@ def is_local(crs: Any) -> bool:
     """Returns True if a system has metres without a place on Earth, as surveys of sites and arenas use."""
     known = crs.to_dict(projjson=True)
     axes = known.get("coordinate_system", {}).get("axis", [])
-    return known.get("type") == "EngineeringCRS" and {axis.get("unit") for axis in axes} == {"metre"}
+    return known.get("type") == "EngineeringCRS" and {str(axis.get("unit")) for axis in axes} == {"metre"}
 
 
 def degrees_of(crs: Any) -> Any:

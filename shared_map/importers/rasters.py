@@ -133,7 +133,7 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
     is_image = path.suffix.lower() == ".png"
     if has_place or not (is_cover or own is not None or is_image or config.crs == "local"):
         crs = crs_of(dataset.crs, config.crs, what)
-        if not crs.is_geographic:
+        if crs.is_projected:
             check_metres(dataset.transform.a, dataset.transform.c, what)
         return crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform))
     is_grey = is_image and not is_cover and own is None

@@ -170,8 +170,8 @@ def test_doctor_looks_at_everything_and_says_how_it_is(
     ("about", "replaced", "value", "level", "words"),
     [
         ("python", "platform.python_version", lambda: "3.9.1", "failure", "3.9.1, expected >=3.11"),
-        ("packages", "_version", lambda package: None, "failure", "numba is missing, expected >=0.63 (planner)"),
-        ("packages", "_version", lambda package: "0.1", "failure", "eclipse-zenoh is 0.1, expected "),
+        ("packages", "version_of", lambda package: None, "failure", "numba is missing, expected >=0.63 (planner)"),
+        ("packages", "version_of", lambda package: "0.1", "failure", "eclipse-zenoh is 0.1, expected "),
         ("cores", "os.sched_getaffinity", lambda pid: {0}, "warning", "1: processes take turns"),
         ("cores", "os.getloadavg", lambda: (99.0, 1.0, 1.0), "warning", "load of 99.0"),
         ("memory", "available_bytes", lambda: 1 << 28, "warning", "0.3 GB are free"),

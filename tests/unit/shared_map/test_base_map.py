@@ -252,7 +252,7 @@ def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
         fetched.append("again")
         return TERRAIN
 
-    monkeypatch.setattr(fetched_terrain, "open_bus", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(fetched_terrain, "open_bus", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(fetched_terrain, "fetch_base_map", fetch)
     info = RunInfo(
         run_id="r", role="keeper", id="0", incarnation=1, scenario="s", terrain=TERRAIN.digest, rows=300, cols=520,

@@ -228,5 +228,5 @@ def test_generations_are_on_file_before_they_speak_and_one_process_has_the_file(
     again.close()
     other = tmp_path / "other"
     other.write_text("4\nnine\n")
-    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'lives 1', found b'4"):
+    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'generations 1', found b'4"):
         GenerationFile(other)
