@@ -30,6 +30,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.stats import Counters
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo
@@ -97,7 +98,7 @@ class Admission:
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
         try:
-            self.bus = open_bus(self._admitting, mode="router")
+            self.bus = open_bus(self._admitting, mode="router", authenticator=authenticator_of(self._admitting, ""))
         except BaseException:
             self._close_door()
             raise
@@ -133,7 +134,7 @@ class Admission:
         until_s = time.monotonic() + _OPEN_WITHIN_S
         while True:
             try:
-                return open_bus(self._admitting, mode="router")
+                return open_bus(self._admitting, mode="router", authenticator=authenticator_of(self._admitting, ""))
             except BusError:  # the port is free only once the last link has ended
                 if time.monotonic() > until_s:
                     raise

@@ -89,19 +89,20 @@ class Authenticator:
     """Makes and checks the codes of one run.
 
     secret  shared by the processes of the run, and by no others
-    run_id  of the run: messages of another run do not count
+    run_id  of the run: messages of another run do not count. Routers belong to no run: under their keys it is empty
     """
 
     def __init__(self, secret: bytes, run_id: str) -> None:
         self._key = blake2b(run_id.encode(), key=secret, digest_size=32).digest()
+        self._routers = blake2b(b"", key=secret, digest_size=32).digest()
 
     def code(self, key: str, payload: bytes, asked: bytes = b"") -> bytes:
         """The code of a payload under a key.
 
         asked  the payload of the question, where this is an answer to one
         """
-        lengths = f"{len(key)},{len(asked)},".encode()
-        return blake2b(lengths + key.encode() + asked + payload, key=self._key, digest_size=CODE_BYTES).digest()
+        lengths, own = f"{len(key)},{len(asked)},".encode(), self._routers if "/router/" in key else self._key
+        return blake2b(lengths + key.encode() + asked + payload, key=own, digest_size=CODE_BYTES).digest()
 
 
 Act = Literal["put", "ask", "answer"]

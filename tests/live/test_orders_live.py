@@ -25,7 +25,7 @@ from swarm.bus.bus import Heard
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.run_secret import state_folder
+from swarm.runtime.run_secret import authenticator_of, state_folder
 from swarm.wire.fields import column
 from swarm.wire.topics import FLEET, MARKS
 
@@ -180,12 +180,16 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
     closed = {"epoch": 1, "seq": 1 << 60, "cells": [5, 6], "kinds": [1, 1], "paces": [0, 0]}
     zone = {**closed, "group": "operator", "stamps_ns": [now_ns] * 2}
     marks = {**closed, "group": "all", "stamps_ns": [now_ns + 20 * 3600 * NS_PER_S] * 2}
-    forged = {"orders/keeper/0": {"orders": [added]}, "marks/0/0/operator.z": zone, "marks/0/0/all.a88.1": marks}
+    forged = {
+        "orders/keeper/0": {"orders": [added]},
+        "marks/0/0/operator.f": zone,
+        "marks/0/0/all.a88.1": marks,
+    }
     for key, said in forged.items():
         session.put(f"swarm/{key}", json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
     time.sleep(4.0)  # a launcher of a part waits for three seconds
     held = [str(reply.ok.key_expr) for reply in session.get("swarm/marks/**") if reply.ok]
-    assert not {"swarm/marks/0/0/operator.z", "swarm/marks/0/0/all.a88.1"}.intersection(held)
+    assert not {"swarm/marks/0/0/operator.f", "swarm/marks/0/0/all.a88.1"}.intersection(held)
     assert order(live, "zone", "ls")["zones"] == []
     assert order(live, "ls") == before
     assert [name for name in processes(live.run_dir) if name.startswith(("planner-z", "planner-f"))] == []
@@ -229,6 +233,7 @@ def test_a_running_swarm_says_what_was_learned(live: LiveSwarm) -> None:
         return [each for each in kinds if each["kind"] == name_of(65)]
 
     with client(live.network) as bus:
+        bus.trust(authenticator_of(live.network, live.run_dir.name))
         eventually(told, 30, "the keeper")
         (row,) = told()
     assert (row["cells"], row["authors"]) == (400, 1)
