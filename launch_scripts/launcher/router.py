@@ -92,13 +92,14 @@ class Admission:
     """The router's session, reopened whenever the list of revoked names changes."""
 
     def __init__(self, network: NetworkConfig) -> None:
+        self._authenticator = authenticator_of(network, "")  # a router belongs to no run
         self._door, network = behind_door(network)
         self._network = network
         self._admitting = with_revocations(network)
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
         try:
-            self.bus = open_bus(self._admitting, mode="router", authenticator=authenticator_of(self._admitting, ""))
+            self.bus = open_bus(self._admitting, mode="router", authenticator=self._authenticator)
         except BaseException:
             self._close_door()
             raise
@@ -134,7 +135,7 @@ class Admission:
         until_s = time.monotonic() + _OPEN_WITHIN_S
         while True:
             try:
-                return open_bus(self._admitting, mode="router", authenticator=authenticator_of(self._admitting, ""))
+                return open_bus(self._admitting, mode="router", authenticator=self._authenticator)
             except BusError:  # the port is free only once the last link has ended
                 if time.monotonic() > until_s:
                     raise

@@ -89,7 +89,7 @@ class Authenticator:
     """Makes and checks the codes of one run.
 
     secret  shared by the processes of the run, and by no others
-    run_id  of the run: messages of another run do not count. Routers belong to no run: under their keys it is empty
+    run_id  of the run: messages of another run do not count. Routers have none: for their figures it is empty
     """
 
     def __init__(self, secret: bytes, run_id: str) -> None:
@@ -101,7 +101,7 @@ class Authenticator:
 
         asked  the payload of the question, where this is an answer to one
         """
-        lengths, own = f"{len(key)},{len(asked)},".encode(), self._routers if "/router/" in key else self._key
+        lengths, own = f"{len(key)},{len(asked)},".encode(), self._routers if "stats/router/" in key else self._key
         return blake2b(lengths + key.encode() + asked + payload, key=own, digest_size=CODE_BYTES).digest()
 
 

@@ -32,6 +32,13 @@ def test_a_code_is_good_for_what_it_was_made_for_and_nothing_else(one, other) ->
             check_code(Authenticator(secret, run), code, TABLE, "put", key, payload, asked)
 
 
+def test_figures_of_a_router_count_in_each_run_of_its_user_and_nothing_else_does() -> None:
+    router, member = Authenticator(b"secret", ""), Authenticator(b"secret", "run")
+    assert router.code("stats/router/0", b"figures") == member.code("stats/router/0", b"figures")
+    for key in ("stats/keeper/0", "left/router/a0", "target/router/pose"):
+        assert router.code(key, b"said") != member.code(key, b"said")
+
+
 def test_no_code_is_no_good_but_for_what_a_topic_leaves_free() -> None:
     ours = Authenticator(b"secret", "run")
     with pytest.raises(ProtocolError, match="no code"):
