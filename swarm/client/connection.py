@@ -263,7 +263,7 @@ class Swarm:
         """Opens the session of right of way for an external vehicle. Raises StoreError if another program has the
         file."""
         from swarm.right_of_way.external_session import ExternalSession
-        from swarm.right_of_way.incarnations import GenerationFile
+        from swarm.right_of_way.generations import GenerationFile
         from swarm.runtime.run_secret import state_folder
 
         generations = GenerationFile(file or state_folder() / "vehicles" / self.run_id / id)

@@ -19,9 +19,9 @@ from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal, SaveGenerations
+from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.incarnations import MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer, Roster
+from swarm.right_of_way.generations import first_generation, is_far_ahead
 from swarm.right_of_way.holdings import Holdings, Tell, Wish
-from swarm.right_of_way.incarnations import first_generation, is_far_ahead
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Granted, Left, Word
 

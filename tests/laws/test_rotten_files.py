@@ -18,7 +18,7 @@ from support.map_strategies import set_of
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
-from swarm.right_of_way.incarnations import GenerationFile
+from swarm.right_of_way.generations import GenerationFile
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.traffic import Held, Table

@@ -20,7 +20,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.client import connect
 from swarm.grid import GridSpec
 from swarm.right_of_way.external_session import ExternalSession
-from swarm.right_of_way.incarnations import GenerationFile
+from swarm.right_of_way.generations import GenerationFile
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest

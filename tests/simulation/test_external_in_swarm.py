@@ -10,7 +10,7 @@ from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
-from swarm.right_of_way.incarnations import MemoryGenerations
+from swarm.right_of_way.generations import MemoryGenerations
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE, OBSTACLE

@@ -24,7 +24,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.liveness import ranked_id
 from swarm.right_of_way.external_session import ExternalService
-from swarm.right_of_way.incarnations import MemoryGenerations
+from swarm.right_of_way.generations import MemoryGenerations
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import CAPTURES_BY
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, SendVehicle, ZoneOrder

@@ -16,8 +16,8 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.incarnations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside

@@ -8,8 +8,8 @@ from swarm.errors import ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
+from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.holdings import Tell
-from swarm.right_of_way.incarnations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table

@@ -14,8 +14,8 @@ from support.shard_tables import (
     table_of,
 )
 
+from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.right_of_way.holdings import Wish
-from swarm.right_of_way.incarnations import HEARTBEAT_NS
 from swarm.wire.messages.traffic import Entry, Left
 from swarm.wire.topics import HOST_STATE
 

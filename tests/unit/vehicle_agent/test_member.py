@@ -11,7 +11,7 @@ from support.shard_tables import (
     table_of,
 )
 
-from swarm.right_of_way.incarnations import HEARTBEAT_NS
+from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
 from vehicle_agent.traffic.member import Member, Refused, Save

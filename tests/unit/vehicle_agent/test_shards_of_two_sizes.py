@@ -14,7 +14,7 @@ import swarm.right_of_way.lock_regions
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_SHARDS, REGION_CELLS, GridSpec
 from swarm.right_of_way.external_session import ExternalService
-from swarm.right_of_way.incarnations import MemoryGenerations
+from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.lock_regions import Shards
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
