@@ -22,7 +22,7 @@ from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, fli
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS
 from swarm.plugins.find import named_plugin
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent

@@ -30,7 +30,7 @@ from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.places import Given, cell_of
 from swarm.plugins.find import find_plugin
-from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Shards, fitting_regions
+from swarm.right_of_way.shards import FEWEST_FOR_MAJORITY, Shards, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 _MOST_STEPS_CELLS = 1 << 21

@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import flies
-from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
+from swarm.right_of_way.shards import FEWEST_FOR_MAJORITY
 
 RELINK_S = 0.3
 """Seconds until a client has found its router again: the retry period, and a session's start."""

@@ -1,7 +1,7 @@
 """Right of way: no two vehicles are in one cell, even if messages are lost, late or repeated and processes stop or
 restart.
 
-The map is divided into *shards* (`lock_regions`). Three agents, or four where certificates prove names,
+The map is divided into *shards* (`shards`). Three agents, or four where certificates prove names,
 are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
 vehicles in a shard or at its border. A *generation* is one incarnation of a host. The leader keeps an order of
 *entries* for each cell (`host_entries`): the vehicle of an entry enters the cell once all before it are over. An

@@ -22,7 +22,7 @@ from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Remova
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import check_id
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left, Word

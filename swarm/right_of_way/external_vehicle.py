@@ -12,7 +12,7 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Known, Left, Word
 

@@ -12,7 +12,7 @@ import msgspec
 
 from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said
 from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2

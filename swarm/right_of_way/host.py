@@ -10,7 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import Peer, Roster
 from swarm.right_of_way.generations import first_generation, is_far_ahead
 from swarm.right_of_way.holdings import Holdings, Tell, Wish
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, Left, Word
 
 GENERATIONS_KEPT = 32

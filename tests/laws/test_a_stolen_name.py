@@ -18,7 +18,7 @@ from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.host_entries import HostEntries
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
 from vehicle_agent.traffic import member
 from vehicle_agent.traffic.member import Member

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from swarm.grid import GridSpec
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import KnownRequest
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 

@@ -16,7 +16,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.agent import Agent

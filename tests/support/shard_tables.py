@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, Held, HostState, Number, Stand, Table
 from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay

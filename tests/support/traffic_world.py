@@ -15,7 +15,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table, Word
 from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save

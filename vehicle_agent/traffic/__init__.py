@@ -1,6 +1,6 @@
 """Right of way for those who decide it: the members and leaders of shards, and where vehicles would go next.
 
-The map is cut into shards (`swarm.right_of_way.lock_regions`). Each shard has three members, which are agents, or
+The map is cut into shards (`swarm.right_of_way.shards`). Each shard has three members, which are agents, or
 four where certificates prove names; one is its leader. The host's part is in `swarm.right_of_way`;
 docs/design/right-of-way.md has the proof. Here:
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table, Word
 from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
 from vehicle_agent.traffic.witness import Witness, agreed

@@ -18,7 +18,7 @@ from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Held, HostState, Known, KnownRequest, Left, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
 

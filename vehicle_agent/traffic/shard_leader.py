@@ -18,7 +18,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round

@@ -19,7 +19,7 @@ from swarm.right_of_way.generations import is_said
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.host_entries import BEFORE_ALL
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Number, Stamp, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.shard_leader import MOST_CELLS, SILENT_NS, exceeds_externals, is_entering

@@ -11,7 +11,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError
-from swarm.right_of_way.lock_regions import fitting_regions
+from swarm.right_of_way.shards import fitting_regions
 
 CELLS_PER_VEHICLE = 262.144
 """The ratio of `thousand`: 512 x 512 cells for 1,000 vehicles."""

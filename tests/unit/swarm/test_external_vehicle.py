@@ -10,7 +10,7 @@ from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
 from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.holdings import Tell
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table
 from vehicle_agent.traffic import shard_leader as leaders

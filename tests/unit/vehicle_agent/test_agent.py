@@ -19,7 +19,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import column
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.route_columns import RouteBatch

@@ -10,7 +10,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
 from swarm.wire.topics import KNOWN

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
-import swarm.right_of_way.lock_regions
+import swarm.right_of_way.shards
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_SHARDS, REGION_CELLS, GridSpec
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations
-from swarm.right_of_way.lock_regions import Shards
+from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
@@ -72,7 +72,7 @@ class Mixed(TrafficWorld):
 def test_vehicles_of_agents_with_shards_of_two_sizes_do_not_meet(
     agents: int, per_agent: int, side: int, others: set[str], other_side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(swarm.right_of_way.lock_regions, "REGION_CELLS", 4)
+    monkeypatch.setattr(swarm.right_of_way.shards, "REGION_CELLS", 4)
     for seed in range(4):
         world = Mixed(seed, agents, per_agent, side, others, other_side)
         world.run(12)
