@@ -26,7 +26,7 @@ from typing import Any
 from planner_service.kernels import (
     cell_costs,
     costs_from_parents,
-    crops,
+    cut_trees,
     lower_bounds,
     parents,
     partition,
@@ -42,14 +42,21 @@ from planner_service.kernels import (
     stride_growth,
     stride_network,
 )
-from planner_service.kernels.compile import BEFORE_LOAD, StepKernel, cache_folder, is_loaded, is_on_disk, load
+from planner_service.kernels.kernel_decorators import (
+    BEFORE_LOAD,
+    StepKernel,
+    cache_folder,
+    is_loaded,
+    is_on_disk,
+    load,
+)
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes, first_classes
 from swarm.runtime.first_use import note
 
 BEFORE_LOAD.append(note)
 Kernel = Any
-"""Result of `kernels.compile.kernel`; numba has no types."""
+"""Result of `kernels.kernel_decorators.kernel`; numba has no types."""
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
@@ -57,7 +64,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     parents.point_to_parents,
     StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,
-    StepKernel(crops.box_of, None),
+    StepKernel(cut_trees.box_of, None),
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
     route_walk.drive_rests,
@@ -91,7 +98,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
-GOALS = crops.walk_by_costs, queue_dial.resume, crops.stays_exact
+GOALS = cut_trees.walk_by_costs, queue_dial.resume, cut_trees.stays_exact
 """Beside those of `FIRST`, for `GoalTrees`."""
 
 PULL = pull_routes.pull_routes

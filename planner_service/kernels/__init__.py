@@ -1,8 +1,9 @@
 """Searches over padded arrays, compiled by numba: they see arrays only, no grid, map or message.
 
-`layout` says what the arrays are, `compile` how kernels are compiled and kept, `climbs` what a step's rise does to
-its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and `partition*`,
-thinned out far from their root by `stride_*`, and read by `route_walk`, `pull_routes` and `lower_bounds`.
+`layout` says what the arrays are, `kernel_decorators` how kernels are compiled and kept, `climbs` what a step's
+rise does to its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and
+`partition*`, thinned out far from their root by `stride_*`, and read by `route_walk`, `pull_routes` and
+`lower_bounds`.
 
 Cells leave a queue in the order of their costs. There is one for each kind of search, as one for all would take 2.5
 to 3 times as long (docs/design/bucket-queues.md, on two shared cores):
