@@ -9,7 +9,7 @@ from contextlib import closing
 
 from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, NeededKernels, needed_kernels, place_kernels
-from planner_service.place_planner import PlacesService
+from planner_service.places_service import PlacesService
 from planner_service.planning_process import Planning
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService

@@ -10,8 +10,8 @@ import pytest
 from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, rough
 from support.swarm_model import SwarmModel
 
-import planner_service.place_planner as places
-from planner_service.place_planner import PlacesService, _ClassTrees
+import planner_service.places_service as places
+from planner_service.places_service import PlacesService, _ClassTrees
 from planner_service.planning_process import Planning
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.bus_world import answer_of
 
-from planner_service.place_planner import PlacesService
+from planner_service.places_service import PlacesService
 from planner_service.planning_process import Planning
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event, Heard
