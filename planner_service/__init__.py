@@ -27,7 +27,7 @@ an earlier one. Values are returned; no step calls back. The bus and the codec p
    `tree/partitioned_tree.py` instead.
 7. `followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects those to push now.
 8. `tree/route_bounds.py`: `read_routes` reads their new routes with proven bounds.
-9. `pulled_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
+9. `any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
 10. `service.py`: `_perform` publishes each `PushedRoute`.
 
 The states of a planner:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from planner_service.any_angle_routes import Puller, pulls
 from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, MapIntake
 from planner_service.gap_statistics import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place

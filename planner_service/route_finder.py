@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.any_angle_routes import Puller
 from planner_service.goal_tree_cache import GoalTrees
-from planner_service.pulled_routes import Puller
 from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid

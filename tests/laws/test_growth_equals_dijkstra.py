@@ -105,7 +105,7 @@ import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
 from planner_service.goal_tree_cache import GoalTrees
-from planner_service.pulled_routes import Puller
+from planner_service.any_angle_routes import Puller
 from planner_service.tree.cost_grid import CostGrid
 from support.kernel_oracle import random_grids
 from support.planner_play import Play

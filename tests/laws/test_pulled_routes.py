@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from support.effort import few
 from support.segments import Cell, crossed
 
-from planner_service.pulled_routes import Puller
+from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
 from swarm.client.route import Route as ClientRoute
 from swarm.client.terrain_frame import Frame

@@ -15,7 +15,7 @@ from support.effort import few
 from support.kernel_oracle import inner
 from support.segments import crossed
 
-from planner_service.pulled_routes import Puller
+from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
 from planner_service.search.search_routes import Ways
 from planner_service.tree.cost_grid import CostGrid

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from planner_service import kernel_build
+from planner_service.any_angle_routes import pulls
 from planner_service.kernel_build import KernelLoader, all_kernels, name_of, needed_kernels
 from planner_service.kernels.kernel_decorators import KERNELS
-from planner_service.pulled_routes import pulls
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.load import parse_scenario
