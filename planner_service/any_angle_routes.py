@@ -44,7 +44,7 @@ class Puller:
         self, pace: Floats, resolution_m: float, config: PlannerConfig, climb: Climb | None = None
     ) -> None:
         # Compiled only for planners of any-angle routes: no other process waits for it at a first start.
-        from planner_service.kernels.kernel_decorators import load
+        from planner_service.kernels.decorators import load
         from planner_service.kernels.layout import step_offsets
         from planner_service.kernels.pull_routes import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 

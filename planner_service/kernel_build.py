@@ -42,21 +42,14 @@ from planner_service.kernels import (
     stride_growth,
     stride_network,
 )
-from planner_service.kernels.kernel_decorators import (
-    BEFORE_LOAD,
-    StepKernel,
-    cache_folder,
-    is_loaded,
-    is_on_disk,
-    load,
-)
+from planner_service.kernels.decorators import BEFORE_LOAD, StepKernel, cache_folder, is_loaded, is_on_disk, load
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes, first_classes
 from swarm.runtime.first_use import note
 
 BEFORE_LOAD.append(note)
 Kernel = Any
-"""Result of `kernels.kernel_decorators.kernel`; numba has no types."""
+"""Result of `kernels.decorators.kernel`; numba has no types."""
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,

@@ -210,7 +210,7 @@ def _packages(runs: Path) -> Said:
 
 def _planner_kernels(runs: Path) -> Said:
     from planner_service.kernel_build import all_kernels
-    from planner_service.kernels.kernel_decorators import cache_folder, code_folder, is_on_disk
+    from planner_service.kernels.decorators import cache_folder, code_folder, is_on_disk
 
     folder, kernels = code_folder(), list(all_kernels())
     if folder is None:

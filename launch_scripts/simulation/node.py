@@ -10,7 +10,7 @@ from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.world.walks import WAY_MODULES
 from planner_service.kernel_build import needed_kernels, place_kernels
-from planner_service.kernels.kernel_decorators import load
+from planner_service.kernels.decorators import load
 from planner_service.places_service import PlacesService
 from planner_service.planning_process import Planning
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts

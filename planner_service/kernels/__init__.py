@@ -1,6 +1,6 @@
 """Searches over padded arrays, compiled by numba: they see arrays only, no grid, map or message.
 
-`layout` says what the arrays are, `kernel_decorators` how kernels are compiled and kept, `climbs` what a step's
+`layout` says what the arrays are, `decorators` how kernels are compiled and kept, `climbs` what a step's
 rise does to its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and
 `partition*`, thinned out far from their root by `stride_*`, and read by `route_walk`, `pull_routes` and
 `lower_bounds`.

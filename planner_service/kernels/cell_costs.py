@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import BOX, INF
 
 CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)

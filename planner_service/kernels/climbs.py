@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper
+from planner_service.kernels.decorators import helper
 
 Floats = NDArray[np.float32]
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
-from planner_service.kernels.kernel_decorators import helper, prefetch, step_kernel
+from planner_service.kernels.decorators import helper, prefetch, step_kernel
 from planner_service.kernels.layout import BUCKETS, GRID, LABELS, NONE, RULE_OCTILE, SQRT2, step_offsets
 from planner_service.kernels.repair import (
     ANY_COST,

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper
+from planner_service.kernels.decorators import helper
 
 RULE_FOUR = 0
 """4 neighbours."""
@@ -48,7 +48,7 @@ LongRows = NDArray[np.int64]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 DoubleRows = NDArray[np.float64]
-"""Arrays of one axis, and of two, as fields of NamedTuples: `kernel_decorators.type_of` reads these names."""
+"""Arrays of one axis, and of two, as fields of NamedTuples: `decorators.type_of` reads these names."""
 
 TOO_FINE = -1
 """Returned by a growth whose keys grew so large, in lowest cell costs, that float32 could not tell them apart."""

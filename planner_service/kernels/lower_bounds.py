@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import BOX, INF, check_cells
 
 WindowBound = tuple[NDArray[np.float32], tuple[int, int, int, int], NDArray[np.int64], NDArray[np.float64]]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.climbs import CLIMBS, offered, offers_of_row
-from planner_service.kernels.kernel_decorators import helper, step_kernel
+from planner_service.kernels.decorators import helper, step_kernel
 from planner_service.kernels.layout import (
     BOX,
     GRID,

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import helper, kernel, type_of
+from planner_service.kernels.decorators import helper, kernel, type_of
 from planner_service.kernels.layout import (
     GRID,
     NONE,

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels import partition
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import BOX, GRID, INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2_EXACT, cuts_corner
 from planner_service.kernels.partition import BITS, CELLS, PIECES, SIDE, TOTAL, WIDE
 from planner_service.kernels.partition_totals import begin, evaluate_totals, queue_checks, settle

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels import partition
-from planner_service.kernels.kernel_decorators import helper, kernel, prefetch
+from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, NONE, check_cells
 from planner_service.kernels.partition import BITS, CELLS, INSIDE, OFFSET, PIECES, SIDE, SUCCESSOR, TOTAL, WIDE
 

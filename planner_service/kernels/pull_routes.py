@@ -31,7 +31,7 @@ import math
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import helper, step_kernel
+from planner_service.kernels.decorators import helper, step_kernel
 
 LOOK_BACK = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Largest number of cells back at which a segment may begin, beside the cell before and the last turn of the path

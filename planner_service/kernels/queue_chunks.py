@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper
+from planner_service.kernels.decorators import helper
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

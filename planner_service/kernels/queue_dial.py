@@ -29,7 +29,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper, kernel, prefetch
+from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.layout import (
     BOX,
     BUCKETS,
@@ -279,8 +279,8 @@ def grow_whole(grid: PaddedGrid, cost: Floats, root: int, buckets: Buckets, scra
 
 @kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], {BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
-    """Goes back to a tree that was cut out (see `cut_trees`): to its costs in buckets below `first`, which are exact
-    on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
+    """Goes back to a tree that was cut out (see `cut_trees`): to its costs in buckets below `first`, which are
+    exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
     cell_cost, _, stride, rule, _ = grid
     width, circle = buckets
     touched, batch, queue = scratch

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import INF
 
 

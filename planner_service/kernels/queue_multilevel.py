@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy
-from planner_service.kernels.kernel_decorators import helper, kernel, prefetch
+from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, WALL, diagonal_length
 from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.queue_dial import (

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
-from planner_service.kernels.kernel_decorators import helper, step_kernel
+from planner_service.kernels.decorators import helper, step_kernel
 from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, cuts_corner, diagonal_length
 from planner_service.kernels.parents import point_row_to_parents
 

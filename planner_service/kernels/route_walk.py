@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, step_price
-from planner_service.kernels.kernel_decorators import helper, step_kernel
+from planner_service.kernels.decorators import helper, step_kernel
 from planner_service.kernels.layout import INF, NONE, RULE_OCTILE, SQRT2_EXACT, check_cells, step_offsets
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)

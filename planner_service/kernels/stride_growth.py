@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
-from planner_service.kernels.kernel_decorators import helper, step_kernel
+from planner_service.kernels.decorators import helper, step_kernel
 from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, check_cells, step_length
 from planner_service.kernels.queue_heap import heap_lower, heap_pop
 

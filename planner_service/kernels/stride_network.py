@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import helper, kernel
+from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.layout import GRID, INF, NONE, RULE_FOUR, step_length
 from planner_service.kernels.queue_heap import heap_lower, heap_pop
 

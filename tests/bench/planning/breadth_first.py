@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_service.kernels.kernel_decorators import kernel
+from planner_service.kernels.decorators import kernel
 from planner_service.kernels.layout import GRID, INF, WALL
 
 

@@ -13,7 +13,7 @@ import typer
 from bench.harness import benchmark, track
 from bench.isolated import isolated
 from bench.planning.first_use import first_use
-from planner_service.kernels.kernel_decorators import KERNELS
+from planner_service.kernels.decorators import KERNELS
 
 STAGES = {
     "tree": "first tree, one process",

@@ -12,7 +12,7 @@ import pytest
 from planner_service import kernel_build
 from planner_service.any_angle_routes import pulls
 from planner_service.kernel_build import KernelLoader, all_kernels, name_of, needed_kernels
-from planner_service.kernels.kernel_decorators import KERNELS
+from planner_service.kernels.decorators import KERNELS
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.load import parse_scenario
@@ -77,11 +77,11 @@ _KERNELS = "\n\n\n".join(f'@kernel("(i8,)")\ndef k{n}(x):\n    return x + {n}' f
 _SCRIPT = f"""
 import os, sys, time
 from planner_service.kernel_build import build, is_building
-from planner_service.kernels import kernel_decorators
-from planner_service.kernels.kernel_decorators import is_loaded, kernel, load
+from planner_service.kernels import decorators
+from planner_service.kernels.decorators import is_loaded, kernel, load
 {_KERNELS}
 all = [k0, k1, k2, k3, k4, k5]
-assert kernel_decorators.cache_folder() is not None
+assert decorators.cache_folder() is not None
 """
 _SEVERAL = (
     _SCRIPT
@@ -108,7 +108,7 @@ _KILLED = (
     _SCRIPT
     + """
 import signal
-slow = kernel_decorators.load
+slow = decorators.load
 import planner_service.kernel_build as kb
 if not (pid := os.fork()):
     kb.load = lambda each: time.sleep(60)

@@ -11,10 +11,10 @@ from types import CodeType
 import pytest
 
 from planner_service.kernel_build import all_kernels
-from planner_service.kernels import kernel_decorators
+from planner_service.kernels import decorators
 
 _HELPER = """
-from kernels.kernel_decorators import helper
+from kernels.decorators import helper
 
 FACTOR = 3
 
@@ -24,7 +24,7 @@ def scaled(x):
     return x * FACTOR
 """
 _KERNEL = """
-from kernels.kernel_decorators import kernel
+from kernels.decorators import kernel
 from kernels.helper import scaled
 
 
@@ -33,7 +33,7 @@ def f(x):
     return scaled(x)
 """
 _ANOTHER = """
-from kernels.kernel_decorators import kernel
+from kernels.decorators import kernel
 from kernels.helper import scaled
 
 
@@ -53,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
     """A package of two kernels, the one of which calls the other, beside the project's own decorator."""
     kernels = tmp_path / "kernels"
     kernels.mkdir()
-    shutil.copy(str(kernel_decorators.__file__), kernels / "kernel_decorators.py")
+    shutil.copy(str(decorators.__file__), kernels / "decorators.py")
     (kernels / "__init__.py").write_text("")
     (kernels / "helper.py").write_text(_HELPER)
     (kernels / "kernel.py").write_text(_KERNEL)
@@ -96,8 +96,8 @@ def test_what_a_kernel_from_disk_shares_with_another_is_linked_to_when_that_is_c
 
 def test_no_kernel_calls_another_so_that_none_needs_bitcode_from_disk() -> None:
     all_kernels()  # all modules are imported
-    kernels = {id(each): name for name, each in kernel_decorators.KERNELS.items()}
-    for name, each in kernel_decorators.KERNELS.items():
+    kernels = {id(each): name for name, each in decorators.KERNELS.items()}
+    for name, each in decorators.KERNELS.items():
         function = each.py_func
         known = [function.__globals__.get(word) for word in _names(function.__code__)]
         assert [kernels[id(value)] for value in known if id(value) in kernels] == [], name

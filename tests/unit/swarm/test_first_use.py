@@ -9,8 +9,8 @@ from unittest import mock
 import pytest
 
 import planner_service.kernel_build  # noqa: F401  it watches
-from planner_service.kernels import kernel_decorators
-from planner_service.kernels.kernel_decorators import BEFORE_LOAD
+from planner_service.kernels import decorators
+from planner_service.kernels.decorators import BEFORE_LOAD
 from swarm.runtime import first_use
 from swarm.runtime.first_use import FirstUseError, Modules, in_loop, note
 from swarm.runtime.stats import FIRST_USES, Counters
@@ -67,5 +67,5 @@ def test_a_kernel_that_a_loop_would_load_fails_before_it_is_compiled() -> None:
     kernel = mock.Mock(declared="void(i8)", overloads={}, __name__="grow")
     assert note in BEFORE_LOAD, "planners are watched"
     with in_loop(None), pytest.raises(FirstUseError, match="kernel grow"):
-        kernel_decorators._load(kernel)
+        decorators._load(kernel)
     kernel.compile.assert_not_called()
