@@ -19,8 +19,8 @@ The walk from a pose to a pushed route. `PlannerService.tick` calls steps 1, 4 a
 an earlier one. Values are returned; no step calls back. The bus and the codec precede step 1.
 
 1. `service.py`: `_take_collected` takes the poses since the last tick from the bus.
-2. `target_watch.py`: `TargetWatch.on_pose` stores the pose if it counts, and reports oddities.
-3. `swarm/runtime/tracking.py`: `Tracking.judge` decides if the pose's tracker owns the target.
+2. `tracker_notes.py`: `TargetWatch.on_pose` stores the pose if it counts, and reports oddities.
+3. `swarm/runtime/tracker_ownership.py`: `Tracking.judge` decides if the pose's tracker owns the target.
 4. `planner.py`: `Planner.tick` compares the target's cell and the map's version with those of the tree.
 5. `target_tree.py`: `TargetTree.update` repairs the tree and decides by the strategy how to reach the new cell.
 6. `tree/cost_to_go.py`: `CostToGoTree.move` grows a window with the kernels. A large exact tree uses
@@ -46,7 +46,7 @@ standby       as above, but it pushes nothing                 the leader falls s
                                                               to every follower
 ============  ==============================================  =====================================================
 
-The tree's own states are `target_tree.State`; `search.target_search` holds whether a search runs, the candidacy
+The tree's own states are `target_tree.State`; `search.search_triggers` holds whether a search runs, the candidacy
 which process leads. The same without a process, a network or a file:
 
 >>> import numpy as np

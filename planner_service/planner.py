@@ -13,11 +13,11 @@ from planner_service.any_angle_routes import Puller, pulls
 from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, MapIntake
 from planner_service.gap_statistics import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.search.search_routes import Ways
-from planner_service.search.searcher import Searcher
-from planner_service.search.target_search import TargetSearch, is_place
+from planner_service.search.growth_from_vehicle import Ways
+from planner_service.search.search_places import Searcher
+from planner_service.search.search_triggers import TargetSearch, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
-from planner_service.target_watch import TargetWatch
+from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
 from planner_service.tree.strides import StrideNetwork
 from shared_map.cost_map import CostMap, merged

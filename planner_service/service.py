@@ -11,10 +11,10 @@ import msgspec
 from planner_service.planner import Action, Answer, Planner, Refusal, Work
 from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.prepared_costs import PreparedCosts
-from planner_service.search.target_search import TargetSearch, hidden_target
+from planner_service.search.search_triggers import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
-from planner_service.target_watch import TargetWatch
+from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
 from planner_service.tree.strides import StrideNetwork
 from planner_service.vehicle_class_planners import ClassPlanners

@@ -17,7 +17,7 @@ from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
-from swarm.runtime.tracking import Trackings
+from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlaceRouteReply, PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts

@@ -23,7 +23,7 @@ from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
-from swarm.runtime.tracking import Trackings
+from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders

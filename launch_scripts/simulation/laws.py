@@ -25,7 +25,7 @@ import numpy as np
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from planner_service.search.target_search import LISTEN_NS
+from planner_service.search.search_triggers import LISTEN_NS
 from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Event, Heard

@@ -9,7 +9,7 @@ from swarm.bus.bus import Event, Heard, LinkChanged, Replied
 from swarm.client.session import Session, Stream
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, walk
-from swarm.runtime.tracking import Trackings
+from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note

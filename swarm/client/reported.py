@@ -10,7 +10,7 @@ from swarm.bus.bus import Event, Heard, LinkChanged
 from swarm.client.session import Session
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
-from swarm.runtime.tracking import Tracking, Verdict
+from swarm.runtime.tracker_ownership import Tracking, Verdict
 from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.topics import POSE, Topic

@@ -28,7 +28,7 @@ stats                   figures kept by keepers, and answered       4,096 names,
 base-map, base-tiles    pieces packed, beside the loop              a number of pieces in one request, a cache
 fleet, status, lead     kept by observers                           2^14 names
 chasers                 a tree of another class                     classes of the scenario; dropped after 60 s
-pose, true-pose         trackers, poses of targets                  names of `runtime.tracking`
+pose, true-pose         trackers, poses of targets                  names of `runtime.tracker_ownership`
 sighted                 kept by planners and keepers                10,000; saved for targets that there are
 obstacle                cells closed                                256 obstacles, a radius of 100 m, a lease of 10
                                                                     s; 50,000 cells an id

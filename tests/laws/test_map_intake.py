@@ -13,9 +13,9 @@ from support.scripted_planner import TICK, World, chasers
 
 from planner_service.followers import LONGEST_WAIT_NS
 from planner_service.planner import Planner
-from planner_service.search.target_search import Hidden, TargetSearch
+from planner_service.search.search_triggers import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree
-from planner_service.target_watch import TargetWatch
+from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S

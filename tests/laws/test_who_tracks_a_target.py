@@ -1,4 +1,4 @@
-"""The owner of a target: the law of `swarm.runtime.tracking`, attacked with loss, delay, order and clocks."""
+"""The owner of a target: the law of `runtime.tracker_ownership`, attacked with loss, delay, order and clocks."""
 
 import random
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from support.makers import target_pose
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.runtime.tracking import LONGEST_AGE_NS, MOST_GENERATIONS, SAME_NS, Tracking, Trackings, Verdict
+from swarm.runtime.tracker_ownership import LONGEST_AGE_NS, MOST_GENERATIONS, SAME_NS, Tracking, Trackings, Verdict
 from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 GRID = GridSpec(25, 40, 10.0)

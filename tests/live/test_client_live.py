@@ -20,7 +20,7 @@ from support.processes import eventually
 
 from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, connect
 from swarm.clock import NS_PER_S
-from swarm.runtime.tracking import SAME_NS
+from swarm.runtime.tracker_ownership import SAME_NS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

@@ -18,7 +18,7 @@ from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import TargetConfig
-from swarm.runtime.tracking import Tracking
+from swarm.runtime.tracker_ownership import Tracking
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,

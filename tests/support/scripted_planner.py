@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Action, Planner, Work
 from planner_service.target_tree import TargetTree, Update
-from planner_service.target_watch import TargetWatch, Tell
+from planner_service.tracker_notes import TargetWatch, Tell
 from planner_service.tree.partitioned_tree import GrownTree
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace

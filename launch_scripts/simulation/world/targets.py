@@ -36,7 +36,7 @@ from swarm.errors import ConfigError
 from swarm.places import cell_of, written
 from swarm.plugins.find import find_plugin
 from swarm.runtime.order_book import OrderBook
-from swarm.runtime.tracking import Trackings
+from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Obstacle, VehicleState

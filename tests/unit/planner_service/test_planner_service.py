@@ -10,7 +10,7 @@ from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s
 from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree
-from planner_service.target_watch import TargetWatch
+from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace

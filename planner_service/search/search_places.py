@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.search.belief import Belief, Blocks, blocks_of
-from planner_service.search.search_routes import Way, Ways
+from planner_service.search.growth_from_vehicle import Way, Ways
 from shared_map.array_files import Bools, Floats
 from swarm.wire.route_columns import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, RouteBatch
 

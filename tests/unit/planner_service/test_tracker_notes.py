@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from support.makers import target_pose
 
-from planner_service.target_watch import TargetWatch, Tell
+from planner_service.tracker_notes import TargetWatch, Tell
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
-from swarm.runtime.tracking import Tracking, Verdict
+from swarm.runtime.tracker_ownership import Tracking, Verdict
 from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 COUNTS = ("poses_refused", "poses_outside", "trackers_lost")
