@@ -23,7 +23,7 @@ from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import JobSlots, Service, ThreadWorker, tick_phase
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 log = logging.getLogger(__name__)
 

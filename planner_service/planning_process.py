@@ -19,7 +19,7 @@ from swarm.liveness import job_of
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.topics import PUSHED_ROUTE, Topic

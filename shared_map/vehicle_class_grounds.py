@@ -35,7 +35,7 @@ from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, ClassConfig, class_named, driven_classes, flies, of_class
 from swarm.errors import TerrainError
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSet
 
 

@@ -24,7 +24,7 @@ from swarm.grid import REGION_CELLS
 from swarm.plugins.find import named_plugin
 from swarm.right_of_way.shards import Shards
 from swarm.runtime.membership import Member
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import AgentMaps, ZonesAround
 from vehicle_agent.assignment import AssignmentWorld, assigner_of, shares_costs

@@ -13,7 +13,7 @@ from swarm.recording.service_boundary import Boundary
 from swarm.runtime.health import GENERATION_BEFORE
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import tick_phase
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 

@@ -15,7 +15,7 @@ from swarm.config.agents import plan_agents
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Message
 from swarm.wire.messages.traffic import (
     Claim,

@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import place_job
 from swarm.liveness import Roster, job_of
 from swarm.runtime.obedience import Obedience
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages import Message

@@ -136,7 +136,7 @@ def run_role(
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import TABLE, check_name, processes_of
     from swarm.config.agents import added_agent
-    from swarm.runtime.role import RoleSetup
+    from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"
     scenario = options.with_network(

@@ -22,7 +22,7 @@ from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
 from swarm.files import discard_output
 from swarm.runtime.health import Board, Health
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 CRASHED = 70
 """Exit code of a process that crashed by a bug."""

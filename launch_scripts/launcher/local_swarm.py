@@ -25,7 +25,7 @@ from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.guard import KILLED_BY
 from swarm.runtime.health import BOARD_BYTES, Board, Phase
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 log = logging.getLogger(__name__)
 

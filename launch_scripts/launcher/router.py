@@ -29,7 +29,7 @@ from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.stats import Counters
 from swarm.wire.messages import WIRE_VERSION

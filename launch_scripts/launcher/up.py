@@ -57,7 +57,7 @@ from swarm.liveness import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
 

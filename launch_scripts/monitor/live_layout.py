@@ -26,7 +26,7 @@ from launch_scripts.observe import palette
 from launch_scripts.observe.run_alarms import KINDS
 from launch_scripts.observe.run_state import RunState
 from swarm.config.scenario import Scenario
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.vehicles import VehicleState
 
 BACKGROUND = (17, 22, 28)

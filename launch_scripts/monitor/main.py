@@ -11,7 +11,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
 FRAME_HZ = 10.0

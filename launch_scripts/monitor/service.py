@@ -42,7 +42,7 @@ from swarm.config.ground import HiddenConfig
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import VIEWERS, Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats

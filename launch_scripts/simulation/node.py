@@ -31,7 +31,7 @@ from swarm.recording.recording import Recording
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.first_use import Modules, in_loop
 from swarm.runtime.process import Service
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import ENDED
 from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
 from vehicle_agent.service import AgentService

@@ -25,7 +25,7 @@ from swarm.recording.recording import versions
 from swarm.recording.recording_file import FOLDER, SUFFIX, Head, RecordReader
 from swarm.recording.replaying import Outcome, Replaying, replay
 from swarm.runtime.process import Service
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.codec import decode
 from swarm.wire.messages.processes import Stats
 

@@ -14,7 +14,7 @@ from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 TICK_HZ = 10.0
 """Marks wait a tenth of a second for the disk at most, and one commit takes in what came meanwhile."""

@@ -27,7 +27,7 @@ from swarm.errors import StoreError
 from swarm.liveness import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.order_book import described
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import figures
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import Order, VehicleGoals, ZoneOrder, Zones

@@ -38,7 +38,7 @@ from swarm.errors import StoreError, TerrainError
 from swarm.files import write_file, writing
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 log = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from swarm.recording.recording_file import (
 )
 from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack
 from swarm.runtime.process import Service
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import Counters
 
 T = TypeVar("T")

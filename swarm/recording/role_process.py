@@ -11,7 +11,7 @@ from swarm.recording.recording import recorded
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, Service
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
 Make = Callable[[Boundary, Bus, Callable[[], None]], Service]

@@ -9,5 +9,5 @@ and answers in time under overload. Mechanisms of every role:
                  those who order.
 `tracker_ownership`  Decides which of several trackers owns a target.
 `health`         Tells whether the loop turns, to other threads and processes and to systemd.
-`role`           The setup that a process is started with. `run_secret` is what processes of one user share.
+`role_setup`     The setup that a process is started with. `run_secret` is what processes of one user share.
 """

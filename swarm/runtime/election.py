@@ -14,7 +14,7 @@ from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.liveness import job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.processes import Heartbeat
 from swarm.wire.topics import LEAD
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.runtime.order_book import GoalBook, OrderBook
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import DIGEST_ROW_BYTES
 from swarm.wire.messages.orders import Goals, Obey, Obeyed, Orders

@@ -30,7 +30,7 @@ from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.map_data import DIGEST_ROW, SEQ_STEP, Digest, MarkKind
 from swarm.wire.topics import DIGEST, MARKS
 

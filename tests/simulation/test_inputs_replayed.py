@@ -28,7 +28,7 @@ from swarm.recording.recording import Recording
 from swarm.recording.recording_file import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
 from swarm.recording.replaying import Outcome
 from swarm.recording.service_boundary import ExternalCalls
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from vehicle_agent.agent import Agent
 
 SECONDS = 6

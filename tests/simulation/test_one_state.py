@@ -27,7 +27,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import added_agent
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 
 _SIDE = 24

@@ -17,7 +17,7 @@ from swarm.errors import ConfigError
 from swarm.plugins.guard import call_within
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import Counters
 
 Built = Callable[[], None]

@@ -20,7 +20,7 @@ from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.access import Authenticator
 from swarm.wire.topics import Topic

@@ -13,7 +13,7 @@ from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 
 def run(setup: RoleSetup, built: Callable[[], None]) -> None:

@@ -17,7 +17,7 @@ from swarm.liveness import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, TargetPose

@@ -46,7 +46,7 @@ from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.map_data import MarkKind
 
 SIDES = ("east", "west")

@@ -24,7 +24,7 @@ from swarm.config.scenario import NetworkConfig, Scenario, TargetConfig
 from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import ThreadWorker
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.codec import encode
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet

@@ -33,7 +33,7 @@ from launch_scripts.web.server import MOST_CONNECTIONS, Server, refusal
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 _NOW_NS = 100_000_000_000
 

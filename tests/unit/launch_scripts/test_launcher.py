@@ -22,7 +22,7 @@ from launch_scripts.process_table import TABLE, ProcessSpec
 from planner_service import kernel_build
 from planner_service.kernel_build import name_of, needed_kernels, place_kernels
 from swarm.config.scenario import Scenario
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 # Marked as network tests, like those: its tests wait for processes.
 pytestmark = [
@@ -260,7 +260,7 @@ from launch_scripts.launcher.local_swarm import LocalSwarm
 from launch_scripts.launcher.forkserver import ROLES_ONLY, WarmUp
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 asked = []
 signal.signal(signal.SIGINT, lambda number, _: asked.append(number))

@@ -14,7 +14,7 @@ from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, RunMismatchError, TerrainError
 from swarm.runtime.membership import check_same_run
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 SCENARIO = """
 [terrain]

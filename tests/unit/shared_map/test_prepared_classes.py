@@ -16,7 +16,7 @@ from shared_map.vehicle_class_grounds import (
 )
 from swarm.config.load import parse_scenario
 from swarm.errors import TerrainError
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 _TEXT = """
 seed = 5

@@ -25,7 +25,7 @@ from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 
 SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
 SMALL = Scenario(seed=2, terrain=TerrainConfig(source="synthetic", rows=48, cols=64, relief_m=150))

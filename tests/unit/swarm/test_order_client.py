@@ -10,7 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.order_book import GoalBook
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import Goals, Obey, Order, Orders, VehicleGoals
 from swarm.wire.topics import GOALS, OBEYED, ORDERS

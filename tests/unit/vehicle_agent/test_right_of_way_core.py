@@ -11,7 +11,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shards import Shards
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
 from swarm.wire.topics import KNOWN
 from vehicle_agent.promise_store import PromiseStore

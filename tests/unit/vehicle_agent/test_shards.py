@@ -11,7 +11,7 @@ from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import MAX_CELLS, MOST_SHARD_REGIONS, REGION_CELLS, GridSpec
 from swarm.right_of_way.shards import MOST_SHARDS_AN_AGENT, Shards, fitting_regions
-from swarm.runtime.role import RoleSetup
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.traffic import Known, KnownRequest
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
