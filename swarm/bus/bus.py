@@ -31,7 +31,7 @@ from typing import Protocol, TypeVar
 
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.meant import MisroutedError
+from swarm.wire.meant_key import MisroutedError
 from swarm.wire.messages import Message
 from swarm.wire.topics import NO_ASKER, Topic
 

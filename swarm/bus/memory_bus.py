@@ -36,7 +36,7 @@ from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
-from swarm.wire.meant import SHARED, check_meant, meant_for
+from swarm.wire.meant_key import SHARED, check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic, check_size
 

@@ -55,7 +55,7 @@ from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
-from swarm.wire.meant import check_meant, meant_for
+from swarm.wire.meant_key import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of
 

@@ -35,7 +35,7 @@ from swarm.wire.codec import (
     may_be_json,
     packed_json,
 )
-from swarm.wire.meant import SHARED, check_meant, check_named
+from swarm.wire.meant_key import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
 

@@ -7,9 +7,9 @@ with connect("tcp/127.0.0.1:7447") as swarm, swarm.vehicle("rover", radius_m=2.0
     print(rover.route("t0").cost_s)
 """
 
-from swarm.client.connection import Orders, Swarm, connect
+from swarm.client.connected_swarm import Orders, Swarm, connect
 from swarm.client.observer import Mark, Observer, SeenTarget, SeenVehicle
-from swarm.client.reported import Target
+from swarm.client.own_reports import Target
 from swarm.client.route import Route
 from swarm.client.session import Stream
 from swarm.client.terrain_frame import Frame

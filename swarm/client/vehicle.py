@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged
-from swarm.client.reported import Reported
+from swarm.client.own_reports import Reported
 from swarm.client.route import Route
 from swarm.client.session import Session, Stream
 from swarm.client.terrain_frame import checked_cells

@@ -37,7 +37,7 @@ from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
 from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode
-from swarm.wire.meant import meant_for
+from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostRequest

@@ -13,7 +13,7 @@ from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode, encode_json
-from swarm.wire.meant import meant_for
+from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored

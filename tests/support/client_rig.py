@@ -6,7 +6,7 @@ from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from swarm.bus.bus import Event
-from swarm.client.connection import Swarm
+from swarm.client.connected_swarm import Swarm
 from swarm.client.session import TICK_S, Session
 from swarm.clock import NS_PER_S, Clock
 from swarm.grid import GridSpec

@@ -10,7 +10,7 @@ from support.makers import run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.wire.codec import encode
-from swarm.wire.meant import meant_for
+from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Claim, Table

@@ -23,7 +23,7 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Heard, LinkChanged
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
-from swarm.client.connection import agreed
+from swarm.client.connected_swarm import agreed
 from swarm.client.observer import marked
 from swarm.client.vehicle import OwnMarks
 from swarm.clock import NS_PER_S

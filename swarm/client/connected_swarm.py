@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from swarm.client.observer import EVERY_S, Observer
-from swarm.client.reported import Target
+from swarm.client.own_reports import Target
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.terrain_frame import Frame, Point
