@@ -27,7 +27,7 @@ from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.driving.driven_vehicle import PLACES, Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.goals import REASONS, GoalQueues
+from vehicle_agent.goal_queues import REASONS, GoalQueues
 from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces

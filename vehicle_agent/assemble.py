@@ -30,12 +30,12 @@ from vehicle_agent.agent_maps import AgentMaps, ZonesAround
 from vehicle_agent.assignment import AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
 from vehicle_agent.obstacles import Obstacles, TargetObstacles
-from vehicle_agent.placement import Spawning, entry_cells, spawn_cells
+from vehicle_agent.position_reports import ChasersReport, FleetReport
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.reports import ChasersReport, FleetReport
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.start_cells import Spawning, entry_cells, spawn_cells
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.steering import FAR_CELLS

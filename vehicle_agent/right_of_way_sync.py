@@ -30,8 +30,8 @@ from swarm.wire.messages.traffic import (
 )
 from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, WORD, Topic
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.member import SLOW_NS, AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.shard_member import SLOW_NS, AskPromises, Refused, Save
 
 
 class OwnTime:

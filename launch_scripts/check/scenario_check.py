@@ -31,7 +31,7 @@ from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.places import Given, cell_of
 from swarm.plugins.find import find_plugin
 from swarm.right_of_way.shards import FEWEST_FOR_MAJORITY, Shards, fitting_regions
-from vehicle_agent.placement import spawn_cells
+from vehicle_agent.start_cells import spawn_cells
 
 _MOST_STEPS_CELLS = 1 << 21
 """Each cell has eight steps: more would take seconds and gigabytes."""

@@ -85,8 +85,8 @@ def _simulate_once(
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
+    from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.simulate import Simulation, run_to_end
-    from launch_scripts.simulation.worlds import WORLDS
 
     if name in WORLDS:
         raise ConfigError(f"{name!r} is a small world, which goes with --seeds A:B; without it give a scenario")
@@ -132,8 +132,8 @@ def _simulate_once(
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json: bool) -> bool:
     """Runs many seeds with faults, and prints what they break. True if every law held in all of them."""
     from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.trials import MIX, SECONDS, Trial, parse_seeds, replay_of, run_trial, world_of
-    from launch_scripts.simulation.worlds import WORLDS
 
     some, name = parse_seeds(seeds), name or MIX
     given = None if name in (MIX, *WORLDS) else find_scenario(name)

@@ -23,8 +23,8 @@ import msgspec
 import numpy as np
 
 from launch_scripts.simulation.faults import OBSERVER
-from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulated_process import Node
 from planner_service.search.search_triggers import LISTEN_NS
 from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
@@ -39,8 +39,8 @@ from swarm.wire.messages.vehicles import Obstacle, VehicleState
 from swarm.wire.topics import DIGEST, OBSTACLE
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.obstacles import capsule_of
-from vehicle_agent.placement import spawn_cells
 from vehicle_agent.service import AgentService
+from vehicle_agent.start_cells import spawn_cells
 
 LONGEST_WAIT_S = 10.0
 ROUTED_WITHIN_S = 5.0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from launch_scripts.process_table import SIMULATED_ROLES
-from launch_scripts.simulation.node import built
+from launch_scripts.simulation.simulated_process import built
 from planner_service.prepared_costs import PreparedCosts
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth

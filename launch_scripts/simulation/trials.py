@@ -20,8 +20,8 @@ import msgspec
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import SLOW_MS, BrokenLaw, LawBook
+from launch_scripts.simulation.sample_worlds import MIXED, world
 from launch_scripts.simulation.simulate import Simulation, run_to_end
-from launch_scripts.simulation.worlds import MIXED, world
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError

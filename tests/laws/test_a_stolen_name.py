@@ -20,9 +20,9 @@ from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.host_entries import HostEntries
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
-from vehicle_agent.traffic import member
-from vehicle_agent.traffic.member import Member
-from vehicle_agent.traffic.witness import Witness, _Host
+from vehicle_agent.traffic import shard_member
+from vehicle_agent.traffic.shard_member import Member
+from vehicle_agent.traffic.shard_witness import Witness, _Host
 
 LIES_S = 8.0
 SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))
@@ -138,7 +138,7 @@ def members_hear_of_no_revoked_name(patch: pytest.MonkeyPatch) -> None:
 
 
 def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(member, "agreed", lambda tables: tables[0])
+    patch.setattr(shard_member, "agreed", lambda tables: tables[0])
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from swarm.runtime.order_book import GoalBook
 from swarm.wire.messages.orders import Then, VehicleGoals
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.driving.driven_vehicle import Vehicle, goal_name
-from vehicle_agent.goals import GoalQueues, arrival_cells, is_over, next_cell
+from vehicle_agent.goal_queues import GoalQueues, arrival_cells, is_over, next_cell
 
 GRID = GridSpec(12, 12, 1.0)
 VEHICLES = ("a0-00", "a0-01")

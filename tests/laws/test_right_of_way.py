@@ -14,9 +14,9 @@ from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.shard_leader import Leader
+from vehicle_agent.traffic.shard_member import Member
 
 QUIET_S = 12.0
 SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4), (1, 5, 7, 4))

@@ -9,7 +9,7 @@ import pytest
 from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulated_process import Node
 from shared_map.terrain.air import clearance_floor
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.load import parse_scenario

@@ -10,9 +10,9 @@ import pytest
 from launch_scripts.commands.simulation_commands import simulate_seeds
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
+from launch_scripts.simulation.sample_worlds import MIXED, SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trials import MIX, SECONDS, Result, Trial, replay_of, run_trial, world_of
-from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.config.scenario import Scenario
 from vehicle_agent.traffic.steering import Steering
 

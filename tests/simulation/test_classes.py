@@ -11,7 +11,7 @@ from support.simulated import OrderedSimulation, agents, captures_by_class, cell
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulated_process import Node
 from shared_map.array_files import Bools
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds

@@ -7,8 +7,8 @@ from support.simulated import cells
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import CROWDS, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import CROWDS, crowd, seeded
 from swarm.config.scenario import TlsConfig
 from swarm.wire.messages.vehicles import VehicleState
 

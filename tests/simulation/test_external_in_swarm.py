@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
-from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.worlds import crowd, seeded
+from launch_scripts.simulation.sample_worlds import crowd, seeded
+from launch_scripts.simulation.simulated_process import Node
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
 from swarm.right_of_way.generations import MemoryGenerations

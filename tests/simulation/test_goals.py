@@ -9,7 +9,7 @@ from support.simulated import OrderedSimulation, cells, vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.worlds import SMALL, seeded
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from planner_service.route_finder import RouteFinder
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario

@@ -3,8 +3,8 @@ another."""
 
 import numpy as np
 
-from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulated_process import Node
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

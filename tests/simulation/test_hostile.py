@@ -5,8 +5,8 @@ import random
 from support.wire_strategies import BY_TYPE
 
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import seeded
 from swarm.wire.codec import encode
 from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic

@@ -17,8 +17,8 @@ from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
 from launch_scripts.simulation.faults import Partition, random_plan
 from launch_scripts.simulation.laws import ROUTED_WITHIN_S, LawBook
-from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.worlds import SMALL, crowd, seeded
+from launch_scripts.simulation.sample_worlds import SMALL, crowd, seeded
+from launch_scripts.simulation.simulated_process import Node
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
 from swarm.config.agents import added_agent

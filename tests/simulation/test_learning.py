@@ -4,8 +4,8 @@ import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.sample_worlds import seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import seeded
 from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import name_of
 from swarm.config.scenario import Scenario

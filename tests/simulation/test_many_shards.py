@@ -6,8 +6,8 @@ from support.simulated import agents
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import WIDE, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import WIDE, seeded
 
 SECONDS = 24.0
 

@@ -7,9 +7,9 @@ import pytest
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import CROWDS, SMALL, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.world.service import TargetsService
-from launch_scripts.simulation.worlds import CROWDS, SMALL, crowd, seeded
 from swarm.config.scenario import RoverConfig
 from vehicle_agent.traffic.steering import Steering
 

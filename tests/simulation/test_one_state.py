@@ -20,7 +20,7 @@ from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.run_state import RunState
-from launch_scripts.simulation.node import EPOCH_NS
+from launch_scripts.simulation.simulated_process import EPOCH_NS
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S

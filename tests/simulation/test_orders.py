@@ -9,9 +9,9 @@ from support.simulated import OrderedSimulation, agents, cells, vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
+from launch_scripts.simulation.simulated_process import Node
 from launch_scripts.simulation.world.service import TargetsService
-from launch_scripts.simulation.worlds import SMALL, seeded
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.wire.messages.orders import GiveOrder, Obey, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState

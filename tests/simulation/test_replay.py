@@ -9,12 +9,12 @@ import pytest
 from support.simulated import simulate
 
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.worlds import SMALL, seeded
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 
 RUN = """
 import json, sys
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.worlds import SMALL
+from launch_scripts.simulation.sample_worlds import SMALL
 from support.simulated import simulate
 with open(sys.argv[1], "w") as trace:
     seed = int(sys.argv[2])

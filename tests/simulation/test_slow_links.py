@@ -5,8 +5,8 @@ from support.simulated import cells
 
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import world
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import world
 
 
 def drive(delay_ms: float, until_s: float, jitter_ms: float = 0.0) -> tuple[Simulation, LawBook, int]:

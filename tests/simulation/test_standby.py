@@ -8,8 +8,8 @@ import pytest
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Node, Simulation
-from launch_scripts.simulation.worlds import SMALL, seeded
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.config.scenario import Scenario, StandbyConfig

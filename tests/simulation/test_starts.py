@@ -2,9 +2,9 @@
 
 import pytest
 
-from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL, seeded
+from launch_scripts.simulation.simulated_process import Node
 from vehicle_agent.service import AgentService
 
 WITHIN_S = 1.3

@@ -6,9 +6,9 @@ import pytest
 
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.sample_worlds import crowd
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import crowd
+from launch_scripts.simulation.simulated_process import Node
 from vehicle_agent.service import AgentService
 
 SECONDS = 12.0

@@ -7,8 +7,8 @@ from support.simulated import agents, cells, simulate
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL, seeded
 
 SECONDS = 24.0
 

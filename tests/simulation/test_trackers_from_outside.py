@@ -10,10 +10,10 @@ from support.simulated import vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.node import EPOCH_NS
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulated_process import EPOCH_NS
 from launch_scripts.simulation.world.service import TargetsService
-from launch_scripts.simulation.worlds import SMALL, seeded
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.clock import NS_PER_S

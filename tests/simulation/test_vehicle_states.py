@@ -4,8 +4,8 @@ import pytest
 from support.vehicle_states import record, table
 
 from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.sample_worlds import world
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import world
 
 SECONDS = 8.0
 

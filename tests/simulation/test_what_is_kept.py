@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.sample_worlds import SMALL, WIDE, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario

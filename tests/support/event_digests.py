@@ -15,8 +15,8 @@ import msgspec
 
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.sample_worlds import WORLDS, world
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import WORLDS, world
 
 SECONDS = 12.0
 RUNS = (

@@ -9,8 +9,8 @@ import pytest
 
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
-from launch_scripts.simulation.node import EPOCH_NS as BEGAN_NS
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulated_process import EPOCH_NS as BEGAN_NS
 from shared_map.array_files import Floats
 from shared_map.terrain.terrain import Terrain
 from swarm.config.load import parse_scenario

@@ -10,8 +10,8 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, Held, HostState, Number, Stand, Table
-from vehicle_agent.traffic.member import RoundTrips
 from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
+from vehicle_agent.traffic.shard_member import RoundTrips
 
 GRID = GridSpec(8, 8, 1.0)
 AGENTS = [f"a{n}" for n in range(5)]

@@ -13,8 +13,8 @@ from msgspec.structs import replace
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.faults import OBSERVER, FaultPlan
-from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation, run_to_end
+from launch_scripts.simulation.simulated_process import Node
 from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied

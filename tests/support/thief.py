@@ -14,8 +14,8 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.holdings import Tell, part_of
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Left, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.member import AskPromises
 from vehicle_agent.traffic.right_of_way_core import Action
+from vehicle_agent.traffic.shard_member import AskPromises
 
 _EPOCHS = (0, 1, 1, 2, 50)
 """Number of its own epochs by which a lie is ahead."""

@@ -18,8 +18,8 @@ from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table, Word
 from vehicle_agent.right_of_way_sync import OwnTime
-from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.shard_member import AskPromises, Refused, Save
 
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS

@@ -13,7 +13,7 @@ docs/design/right-of-way.md has the proof. Here:
 4. A leader that is silent for a lease is replaced: a member claims a higher epoch, and the others promise to store
    no table of a lower one (Paxos). The new leader begins with the newest table that a majority knows.
    Where certificates prove names, hosts count the members themselves, and a member judges each table before it
-   stores it (`witness`): then one member may lie.
+   stores it (`shard_witness`): then one member may lie.
 5. Promises and stored tables are on file before any message states them. No clock decides anything but when to
    claim.
 

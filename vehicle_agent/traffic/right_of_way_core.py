@@ -20,7 +20,7 @@ from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Held, HostState, Known, KnownRequest, Left, Stored, Table
-from vehicle_agent.traffic.member import Member, MemberAction, Refused, RoundTrips
+from vehicle_agent.traffic.shard_member import Member, MemberAction, Refused, RoundTrips
 
 _ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
 """Names of fields in files, which stay as they were."""

@@ -12,10 +12,10 @@ from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 
-from launch_scripts.gateways.ros2.gateway import Channel, Gateway, Health, Put, ToWgs84
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
+from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros

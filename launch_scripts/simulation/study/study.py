@@ -23,8 +23,8 @@ from msgspec import Meta
 
 from launch_scripts.deploy.kits import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
+from launch_scripts.simulation.sample_worlds import WORLDS
 from launch_scripts.simulation.trials import MIX, SECONDS, Trial, code_version, parse_seeds, world_of
-from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
 from swarm.config.load import flat, parse_scenario

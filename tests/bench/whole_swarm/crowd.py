@@ -18,9 +18,9 @@ import typer
 from bench.harness import benchmark, names_of, track
 from bench.isolated import TimeLimit
 from bench.whole_swarm.ideal_crowd import drive_ideal
-from launch_scripts.simulation import worlds as crowded
+from launch_scripts.simulation import sample_worlds as crowded
+from launch_scripts.simulation.sample_worlds import CROWDS
 from launch_scripts.simulation.trials import parse_seeds
-from launch_scripts.simulation.worlds import CROWDS
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.runtime.process import collected_rarely
@@ -28,7 +28,7 @@ from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
 STEP_S = 0.1
-"""The pace of `worlds.crowd`: seconds a cell, and the period of its agents' ticks."""
+"""The pace of `sample_worlds.crowd`: seconds a cell, and the period of its agents' ticks."""
 LONG_S = 10.0
 WANTED_LONGEST_S, WANTED_LONG_SHARE = 15.0, 0.005
 """Goals of the project."""

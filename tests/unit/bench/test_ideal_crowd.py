@@ -3,7 +3,7 @@
 import pytest
 from bench.whole_swarm.ideal_crowd import drive_ideal
 
-from launch_scripts.simulation.worlds import CROWDS, crowd
+from launch_scripts.simulation.sample_worlds import CROWDS, crowd
 
 
 @pytest.mark.parametrize("kind", CROWDS)

@@ -9,8 +9,8 @@ import pytest
 
 from launch_scripts.deploy.service_files import zenohd_config
 from launch_scripts.process_table import certificate_name, certificate_names
+from launch_scripts.simulation.sample_worlds import SMALL
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.zenoh_config import access_control, bearer, common_name, low_pass_filter
 from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, StandbyConfig, TargetConfig, TlsConfig

@@ -12,7 +12,7 @@ from launch_scripts.simulation.faults import (
     few_of_layer,
     random_plan,
 )  # fmt: skip
-from launch_scripts.simulation.worlds import SMALL
+from launch_scripts.simulation.sample_worlds import SMALL
 from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -29,7 +29,7 @@ from swarm.config.setting_types import Preset, Walk
 from swarm.config.write import commented
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from vehicle_agent.placement import spawn_cells
+from vehicle_agent.start_cells import spawn_cells
 
 ROOMY = machine.Machine(64, 1 << 40, 1 << 50)
 

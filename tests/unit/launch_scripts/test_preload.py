@@ -18,7 +18,7 @@ import launch_scripts.launcher.preloaded
 from launch_scripts.simulation import simulate
 simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m
 # A live run has both of them prepared, and imports nothing to find them.
-from launch_scripts.simulation.worlds import crowd
+from launch_scripts.simulation.sample_worlds import crowd
 from swarm.bus.endpoints import listening
 
 from launch_scripts.simulation.world.walks import WAY_MODULES
@@ -64,7 +64,7 @@ import json, sys
 import numpy as np
 import launch_scripts.cli
 from launch_scripts.launcher import up
-from launch_scripts.simulation.worlds import crowd
+from launch_scripts.simulation.sample_worlds import crowd
 
 scenario, terrain = crowd("open", 1, 8, 4)
 up.check_places(scenario, terrain, terrain.pace_s_per_m, np.isfinite(terrain.pace_s_per_m))

@@ -16,10 +16,10 @@ from msgspec.structs import replace
 from support.effort import few
 from support.ros_messages import path
 
-from launch_scripts.gateways.ros2.gateway import Channel, Gateway, Health, Put
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed
 from launch_scripts.gateways.ros2.map_messages import corners
+from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put
 from launch_scripts.gateways.ros2.rmw import NO_HASH, Endpoint, Kind, NodeName, PeerWatch, Qos
 from launch_scripts.gateways.ros2.ros_messages import (
     ODOMETRY,
@@ -216,7 +216,7 @@ def test_velocity_is_the_difference_of_places_along_the_heading() -> None:
 
 
 def test_robots_of_ros_and_more_vehicles_than_there_may_be_are_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.gateways.ros2.gateway.MOST_VEHICLES", 1)
+    monkeypatch.setattr("launch_scripts.gateways.ros2.outgoing.MOST_VEHICLES", 1)
     core = gateway()
     world = World({id: vehicle(id) for id in ("robot", "a", "b")})
     actions = core.tick(0, BEGAN_NS, BEGAN_NS, world, Health(), {"robot"})

@@ -20,7 +20,7 @@ from support.ros_node import FakeNode
 from launch_scripts.gateways.ros2.gateway_settings import (
     Robots,
 )
-from launch_scripts.gateways.ros2.incoming.readings import (
+from launch_scripts.gateways.ros2.incoming.ros_places import (
     MOST_CELLS,
     FrameReader,
     Place,

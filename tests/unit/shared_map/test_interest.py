@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import of_file, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import of_file, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync

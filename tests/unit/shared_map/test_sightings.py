@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.sample_worlds import SMALL
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import LONGEST_NS, Sightings, pose_of

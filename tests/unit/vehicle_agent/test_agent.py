@@ -26,9 +26,9 @@ from swarm.wire.route_columns import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
-from vehicle_agent.placement import spawn_cells
-from vehicle_agent.reports import FleetReport
+from vehicle_agent.position_reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.start_cells import spawn_cells
 from vehicle_agent.target_choice import AskCosts, choose, have_answered
 
 GRID = GridSpec(12, 12, 10.0)

@@ -7,7 +7,7 @@ from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.swarm_model import LossyLinks
 
 from shared_map.vehicle_class_grounds import class_grounds
-from vehicle_agent.placement import spawn_cells
+from vehicle_agent.start_cells import spawn_cells
 
 TWO_WAYS = """
 seed = {seed}

@@ -9,7 +9,7 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
 from vehicle_agent.driving.driven_vehicle import goal_name
-from vehicle_agent.reports import HEARTBEAT_NS, ChasersReport
+from vehicle_agent.position_reports import HEARTBEAT_NS, ChasersReport
 
 TICK_NS = NS_PER_S // 10
 GRID = GridSpec(rows=64, cols=64, resolution_m=10.0)

@@ -13,8 +13,8 @@ import pytest
 from support.effort import few
 from support.simulated import agents
 
+from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import SMALL, seeded
 from swarm.config.revocations import revoke
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import DamagedError, StoreError

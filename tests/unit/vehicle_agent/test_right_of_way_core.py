@@ -16,8 +16,8 @@ from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
 from swarm.wire.topics import KNOWN
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.shard_member import AskPromises, Save
 
 THREE = ["a0", "a1", "a2"]
 SHARDS_OF_THREE = Shards(GridSpec(8, 8, 1.0), THREE)

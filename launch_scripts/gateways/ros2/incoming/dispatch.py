@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.readings import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.incoming.robot import Robot, RouteQuestions
+from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name

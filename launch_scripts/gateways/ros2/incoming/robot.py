@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.readings import FrameReader, Place, Track
+from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, Place, Track
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages

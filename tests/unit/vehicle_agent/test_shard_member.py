@@ -14,7 +14,7 @@ from support.shard_tables import (
 from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
-from vehicle_agent.traffic.member import Member, Refused, Save
+from vehicle_agent.traffic.shard_member import Member, Refused, Save
 
 
 def member_of(promised: int = 0) -> Member:

@@ -1,7 +1,7 @@
 """Vehicles of an added agent enter the map on free cells: no obstacle, and no zone."""
 
 from swarm.clock import NS_PER_S
-from vehicle_agent.placement import Spawning
+from vehicle_agent.start_cells import Spawning
 
 
 class Held:
