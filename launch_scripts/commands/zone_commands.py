@@ -84,7 +84,7 @@ def add(
             corners = corners_of(places, frame, "--polygon")
             if not inside:
                 return [msgspec.structs.replace(order, polygon=corners)]
-            from shared_map.importers.zones.drawings import all_but
+            from shared_map.importers.zones.zone_features import all_but
 
             return _zones(fields, all_but(corners, frame.grid, MOST_CORNERS))
 
@@ -98,7 +98,7 @@ def add(
     checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
 
     def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
-        from shared_map.importers.zones.drawings import outlines_of
+        from shared_map.importers.zones.zone_features import outlines_of
 
         zone = ZoneConfig(kind="keep_in" if inside else "forbidden", file=str(file), layer=layer, crs=crs)
         return _zones(fields, outlines_of(zone, frame.grid, MOST_CORNERS))

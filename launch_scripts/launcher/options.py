@@ -27,7 +27,7 @@ from launch_scripts.process_table import (
     processes_of,
 )
 from launch_scripts.web import LOOPBACK
-from shared_map.importers.sources import FILE_KINDS, is_terrain
+from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, converted, nearest
 from swarm.config.ground import TerrainConfig

@@ -1,7 +1,7 @@
 """Files become ground: elevation, photo and classes of the ground on one square metric grid, and zones on it.
 
-`sources` is the door: a table tells which reader takes a file by its ending, and a raster of any other name is
-known by how it begins. Guarantees of each reader:
+`terrain_sources` is the door: a table tells which reader takes a file by its ending, and a raster of any other name
+is known by how it begins. Guarantees of each reader:
 
 1. No file takes more memory or time than its kind allows: sizes are looked at before anything is read.
 2. No file reaches another one, or the network, but those that lie beside it and belong to it.
@@ -10,8 +10,8 @@ known by how it begins. Guarantees of each reader:
 5. Changes to the data are listed in `Source.notes`.
 
 `raster_files` opens and guards all rasters; those which GDAL does not read, or not as they are, become datasets
-in memory: `xyz_grids` and the archives of `array_grids`, which has maps without heights, too. `rasters` tells what
-a raster holds; `georeference` says where it lies, and `onto_grid` brings it onto the grid. `level_ground` finds
-water and voids in a file's own cells, before anything is resampled. Land cover and photos are in `cover`, vector
-zones in `zones`; codes, colours and classes of ways are data beside their readers.
+in memory: `xyz_grids` and the archives of `array_grids`, which has maps without heights, too. `height_rasters`
+tells what a raster holds; `georeference` says where it lies, and `onto_grid` brings it onto the grid.
+`water_and_voids` finds water and voids in a file's own cells, before anything is resampled. Land cover and photos
+are in `cover`, vector zones in `zones`; codes, colours and classes of ways are data beside their readers.
 """

@@ -1,7 +1,8 @@
 """Patches of equal height in a height model: connected cells, each as high as the next.
 
 Rows are cut into runs of equal cells, and runs that touch are one patch: a sea is some thousand runs, and a steep
-slope has none. Models are looked at in a sample of at most `level_ground.MOST_SAMPLED` cells, so all are at hand.
+slope has none. Models are looked at in a sample of at most `water_and_voids.MOST_SAMPLED` cells, so all are at
+hand.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST
 
 if TYPE_CHECKING:
-    from shared_map.importers.sources import Source
+    from shared_map.importers.terrain_sources import Source
 
 FORMAT = 7
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
@@ -83,7 +83,7 @@ class Terrain:
 
 def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_class: str = GROUND) -> Terrain:
     """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
-    from shared_map.importers.sources import load_source
+    from shared_map.importers.terrain_sources import load_source
 
     try:
         source = load_source(scenario.terrain, scenario.seed, progress)

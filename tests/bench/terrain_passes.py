@@ -48,7 +48,7 @@ def one_pass(name: str, folder: str) -> dict[str, float]:
     import rasterio  # noqa: F401
     import scipy.ndimage  # noqa: F401
 
-    import shared_map.importers.sources  # noqa: F401
+    import shared_map.importers.terrain_sources  # noqa: F401
 
     imported, cpu_s = time.perf_counter(), time.process_time()
     if name == "plain":

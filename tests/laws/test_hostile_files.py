@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from shared_map.importers.cover.classify import read_labels
-from shared_map.importers.sources import load_source
+from shared_map.importers.terrain_sources import load_source
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import parse_toml
 from swarm.config.load import load_scenario
@@ -30,7 +30,7 @@ from swarm.grid import GridSpec
 COMMANDS = """
 import json, os, re, sys
 from launch_scripts.cli import main
-import shared_map.importers.sources
+import shared_map.importers.terrain_sources
 for line in sys.stdin:
     command, output = json.loads(line)
     child = os.fork()

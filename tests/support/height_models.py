@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from shared_map.array_files import Floats
-from shared_map.importers.sources import Source, load_source
+from shared_map.importers.terrain_sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 

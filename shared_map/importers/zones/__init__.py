@@ -1,6 +1,6 @@
 """Zones that files draw: vector files, whose features are burnt into cells, and rasters of pace.
 
-`zone_files` is the door. `vector_files` opens a file and reads its features as they are stored. `vector_shapes`
-repairs them, brings them into cells, and burns them. `drawings` decides which features count and what they are
-worth, by the classes of ways of `way_classes` with its table `ways.toml`. Only these need the extra `vectors`.
+`zone_files` is the door. `vector_files` opens a file and reads its features as they are stored. `burn_shapes`
+repairs them, brings them into cells, and burns them. `zone_features` decides which features count and what they
+are worth, by the classes of ways of `way_classes` with its table `ways.toml`. Only these need the extra `vectors`.
 """

@@ -71,8 +71,8 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     what = f"{where} {path}"
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
-    from shared_map.importers.zones.drawings import closed_shapes, draw_zone
-    from shared_map.importers.zones.vector_shapes import burn
+    from shared_map.importers.zones.burn_shapes import burn
+    from shared_map.importers.zones.zone_features import closed_shapes, draw_zone
 
     drawn = draw_zone(zone, grid, what)
     closed, closes = burn(closed_shapes(drawn, grid), grid, what, everywhere=True)

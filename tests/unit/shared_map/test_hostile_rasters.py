@@ -9,7 +9,7 @@ import rasterio
 from rasterio.transform import from_origin
 from support.height_models import load, written
 
-from shared_map.importers.level_ground import level_ground, undeclared_voids
+from shared_map.importers.water_and_voids import level_ground, undeclared_voids
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -66,7 +66,7 @@ def test_a_file_which_begins_in_the_south_or_east_is_turned(tmp_path: Path, righ
 
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
-    from shared_map.importers import level_ground as module
+    from shared_map.importers import water_and_voids as module
 
     monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
     heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50

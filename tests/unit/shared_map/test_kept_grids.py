@@ -18,7 +18,7 @@ from support.effort import few
 from support.height_models import written
 from support.zone_shapes import painted
 
-from shared_map.importers.sources import Source, load_source
+from shared_map.importers.terrain_sources import Source, load_source
 from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

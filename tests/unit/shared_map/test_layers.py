@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.height_models import written
 
-from shared_map.importers.sources import load_source
+from shared_map.importers.terrain_sources import load_source
 from shared_map.terrain.layers import (
     CLASS_FACTOR,
     TerrainClass,

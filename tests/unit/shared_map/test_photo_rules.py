@@ -13,7 +13,7 @@ from shared_map.importers.cover.photo_rules import (
     ground_readings,
 )
 from shared_map.importers.cover.photos import Photo
-from shared_map.importers.sources import Source, with_photo
+from shared_map.importers.terrain_sources import Source, with_photo
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.height_models import written
 
-from shared_map.importers.sources import Source, load_source
+from shared_map.importers.terrain_sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario

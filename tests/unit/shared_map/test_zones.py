@@ -12,7 +12,7 @@ from support.map_strategies import set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.cost_map import CostMap
-from shared_map.importers.zones.drawings import all_but
+from shared_map.importers.zones.zone_features import all_but
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
 from shared_map.replication.replica import MapReplica

@@ -112,7 +112,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.importers.rasters import read_raster
+    from shared_map.importers.height_rasters import read_raster
     from shared_map.terrain.synthetic.landscape import cover
 
     resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
@@ -144,7 +144,7 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         raise TerrainError(f"terrain {path}: {found} is unknown; give {FILE_KINDS}; {others}")
     if suffix in _LEVEL:
         return _map(path, config)
-    from shared_map.importers.rasters import read_raster
+    from shared_map.importers.height_rasters import read_raster
 
     return read_raster(path, config, progress)
 
@@ -182,7 +182,7 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.level_ground import fill_voids, voids_of
+    from shared_map.importers.water_and_voids import fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:

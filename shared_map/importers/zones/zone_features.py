@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 
 from shared_map.importers.zones import way_classes
+from shared_map.importers.zones.burn_shapes import POLYGON, Drawn, Placing, Shapes
 from shared_map.importers.zones.shape_texts import INCLUSION
 from shared_map.importers.zones.vector_files import Features, Layer, open_layers, read_features, unusable
-from shared_map.importers.zones.vector_shapes import POLYGON, Drawn, Placing, Shapes
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from shared_map.importers.zones.zone_files import LEAST, MOST, FileFacts
 from swarm.config.ground import ZoneConfig
