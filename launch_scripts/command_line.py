@@ -177,7 +177,7 @@ class Family(TyperGroup):
 
 def complete_scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
     """Built-in scenarios, and .toml files below the folder that the word begins with."""
-    from launch_scripts.launcher.options import SCENARIOS
+    from launch_scripts.launcher.run_options import SCENARIOS
 
     built_in = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
     return [name for name in [*built_in, *_files_of(incomplete)] if name.startswith(incomplete)]

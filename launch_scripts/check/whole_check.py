@@ -9,7 +9,7 @@ from typing import Any
 
 from launch_scripts.check import Finding, counted, failure, machine_check, scenario_check, warning
 from launch_scripts.launcher.console import progress
-from launch_scripts.launcher.options import with_port
+from launch_scripts.launcher.run_options import with_port
 from launch_scripts.ports import check_ports
 from launch_scripts.process_table import ROLES
 from shared_map.array_files import Floats

@@ -33,7 +33,7 @@ from launch_scripts.deploy.machines_needed import (
     too_much,
 )
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
-from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
+from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name

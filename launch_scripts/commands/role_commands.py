@@ -129,7 +129,7 @@ def run_role(
 
     joins  group, number and place of vehicles that the scenario does not have, for an agent that is added
     """
-    from launch_scripts.launcher import options
+    from launch_scripts.launcher import run_options
     from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.log_file import Speaker, log_to
@@ -139,8 +139,8 @@ def run_role(
     from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"
-    scenario = options.with_network(
-        options.find_scenario(part.scenario),
+    scenario = run_options.with_network(
+        run_options.find_scenario(part.scenario),
         connect=None if is_router else part.connect,
         listen=listen,
         namespace=part.namespace,
@@ -154,7 +154,7 @@ def run_role(
         check_name("--id", id)
     elif id not in (ids := [spec.id for spec in processes_of(scenario, (role,))]):
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
-    scenario = options.as_process(scenario, role, id if joins is None else f"{joins[0]}.{id}")
+    scenario = run_options.as_process(scenario, role, id if joins is None else f"{joins[0]}.{id}")
     log_to(None, part.log_format, Speaker(role, id, part.run_id or ""))
     health = _health_of(f"{role}-{id}", part)
     health.starts("its router")
@@ -168,14 +168,14 @@ def run_role(
             )
         found = [info for info in found if info.run_id]
         check_vacant(found, role, id)
-    run_id = part.run_id or next((info.run_id for info in found), None) or options.common_run_id(scenario)
-    run_dir = options.make_run_dir(part.runs, run_id)
+    run_id = part.run_id or next((info.run_id for info in found), None) or run_options.common_run_id(scenario)
+    run_dir = run_options.make_run_dir(part.runs, run_id)
     log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
     if not is_router:
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
-    generation = options.next_incarnation(run_dir, role, id)
+    generation = run_options.next_incarnation(run_dir, role, id)
     log.info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(
         scenario,

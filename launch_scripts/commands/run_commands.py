@@ -48,14 +48,14 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
     named = {word.partition(".")[0] for word in part.only or ()}
     start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
 
-    from launch_scripts.launcher import options
+    from launch_scripts.launcher import run_options
     from launch_scripts.launcher.up import run_swarm
     from launch_scripts.process_table import ROLES
 
-    chosen = options.find_scenario(scenario)
+    chosen = run_options.find_scenario(scenario)
     if run.port is not None:
-        chosen = options.with_port(chosen, run.port)
-    chosen = options.with_network(
+        chosen = run_options.with_port(chosen, run.port)
+    chosen = run_options.with_network(
         chosen,
         connect=meeting.connect,
         also_listen=meeting.listen,
@@ -70,10 +70,10 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
     )
     joins = meeting.connect is not None or (bool(named) and "router" not in named)
     return run_swarm(
-        options.UpOptions(
+        run_options.UpOptions(
             chosen,
             run.runs,
-            options.chosen_processes(chosen, part.only or ROLES, part.rank, joins=joins),
+            run_options.chosen_processes(chosen, part.only or ROLES, part.rank, joins=joins),
             joins=joins,
             run_id=part.run_id,
             as_json=run.as_json,

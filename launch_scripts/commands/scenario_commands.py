@@ -165,7 +165,7 @@ def check(
     """
     from launch_scripts.check import answer
     from launch_scripts.check.whole_check import check_scenario
-    from launch_scripts.launcher.options import scenario_path
+    from launch_scripts.launcher.run_options import scenario_path
 
     path = scenario_path(scenario)
     found, facts, summary = check_scenario(path, runs, port)

@@ -104,7 +104,7 @@ class Tls:
     tls_key: str | None = None
 
     def tls(self) -> TlsConfig | None:
-        from launch_scripts.launcher.options import tls_of
+        from launch_scripts.launcher.run_options import tls_of
 
         return tls_of(self.tls_ca, self.tls_cert, self.tls_key, self.tls_dir)
 
@@ -214,7 +214,7 @@ class Where(Tls):
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
         wrong option."""
-        from launch_scripts.launcher.options import as_process, with_network
+        from launch_scripts.launcher.run_options import as_process, with_network
         from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
 

@@ -82,7 +82,7 @@ def _simulate_once(
     """Runs a scenario without faults, prints its report and leaves a run's folder in `runs`."""
     from launch_scripts.check.scenario_check import check_places
     from launch_scripts.launcher.console import Terminal, progress
-    from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
+    from launch_scripts.launcher.run_options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.sample_worlds import WORLDS
@@ -131,7 +131,7 @@ def _simulate_once(
 
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json: bool) -> bool:
     """Runs many seeds with faults, and prints what they break. True if every law held in all of them."""
-    from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.launcher.run_options import find_scenario
     from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.trials import MIX, SECONDS, Trial, parse_seeds, replay_of, run_trial, world_of
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, build_terrain

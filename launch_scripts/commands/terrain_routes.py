@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.observe.palette import said_length
 from launch_scripts.report.exporter import (
     COSTS,

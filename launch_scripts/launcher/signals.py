@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
-from launch_scripts.launcher.options import UpOptions
+from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import BusError
 from swarm.runtime.health import Health, supervisor_of

@@ -19,7 +19,8 @@ from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_membe
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
-from launch_scripts.launcher.options import (
+from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
+from launch_scripts.launcher.run_options import (
     UpOptions,
     as_process,
     common_run_id,
@@ -27,7 +28,6 @@ from launch_scripts.launcher.options import (
     new_run_id,
     next_incarnation,
 )
-from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.signals import MachineSignals, StopAsked
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal_tables import live_table, plain_line

@@ -22,7 +22,7 @@ from chaos.attacker import Attacker
 from chaos.fault_schedule import FAULTS, Fault, faults
 from chaos.hostile import Hostile
 from chaos.results import LAUNCHER, Ended, Outcome, Recovery, Results, Sample, name_of
-from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
+from launch_scripts.launcher.run_options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.world.referee import Referee

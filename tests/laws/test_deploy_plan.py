@@ -12,7 +12,7 @@ from support.effort import few
 
 from launch_scripts.deploy.hosts import HOST_ROLES, HostConfig, HostsConfig
 from launch_scripts.deploy.machine_plan import LAUNCHER_CORES, Plan, make_plan
-from launch_scripts.launcher.options import UpOptions, chosen_processes
+from launch_scripts.launcher.run_options import UpOptions, chosen_processes
 from launch_scripts.process_table import processes_of
 from swarm.bus.zenoh_config import access_control
 from swarm.config.agents import plan_agents

@@ -13,7 +13,7 @@ import pytest
 from support.live_swarm import LiveSwarm, swarm
 from support.processes import eventually, session_of
 
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 
 pytestmark = pytest.mark.network
 
@@ -50,7 +50,7 @@ def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_wit
 
 
 def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run_whoever_comes_first() -> None:
-    from launch_scripts.launcher.options import common_run_id, with_port
+    from launch_scripts.launcher.run_options import common_run_id, with_port
 
     scenario = find_scenario("synthetic")
     longer = msgspec.structs.replace(scenario, seconds=scenario.seconds + 60)

@@ -15,7 +15,7 @@ from support.live_swarm import Hands, swarm
 from support.makers import route_reply
 from support.processes import eventually
 
-from launch_scripts.launcher.options import as_process, tls_of
+from launch_scripts.launcher.run_options import as_process, tls_of
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus

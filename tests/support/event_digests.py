@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import WORLDS, world
 from launch_scripts.simulation.simulate import Simulation

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from launch_scripts.launcher.options import as_process
+from launch_scripts.launcher.run_options import as_process
 from launch_scripts.process_table import LAUNCHER
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus

@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from launch_scripts.deploy.kits import parts_of, plugin_files
-from launch_scripts.launcher.options import SCENARIOS, scenario_path
+from launch_scripts.launcher.run_options import SCENARIOS, scenario_path
 from launch_scripts.simulation.sample_worlds import WORLDS
 from launch_scripts.simulation.trials import MIX, SECONDS, Trial, code_version, parse_seeds, world_of
 from swarm.config.explain import choice, converted

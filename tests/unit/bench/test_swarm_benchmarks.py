@@ -15,7 +15,7 @@ from support import makers
 from support.benchmarks import bench
 from support.makers import fleet_of
 
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from swarm.config.agents import plan_agents
 from swarm.errors import SwarmError
 from swarm.runtime.stats import Counters

@@ -16,7 +16,7 @@ from support.makers import route_reply, run_info
 
 from launch_scripts import ports
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
-from launch_scripts.launcher import options
+from launch_scripts.launcher import run_options
 from launch_scripts.observe.run_observer import frame_of_members
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.load import load_scenario
@@ -44,17 +44,17 @@ def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     for file in files:
         file.write_text("")
     (ca, _, certificate, key) = map(str, files)
-    assert options.tls_of(None, None, None, str(tmp_path)) == TlsConfig(ca=ca, certificate=certificate, key=key)
+    assert run_options.tls_of(None, None, None, str(tmp_path)) == TlsConfig(ca=ca, certificate=certificate, key=key)
     (tmp_path / "planner.t0.key").write_text("")  # of several, each process finds its own
-    own = options.tls_of(None, None, None, str(tmp_path))
+    own = run_options.tls_of(None, None, None, str(tmp_path))
     assert own == TlsConfig(ca=ca, certificate=str(tmp_path), key=str(tmp_path))
 
 
 def test_a_port_gives_the_live_view_the_next_and_0_picks_free_ones() -> None:
-    scenario = options.with_port(Scenario(), 8000)
+    scenario = run_options.with_port(Scenario(), 8000)
     assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)
     assert scenario.monitor.web_port == 8001
-    ports.check_ports(options.with_port(Scenario(), 0), ("router", "monitor"))
+    ports.check_ports(run_options.with_port(Scenario(), 0), ("router", "monitor"))
 
 
 def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:

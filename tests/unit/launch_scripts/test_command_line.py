@@ -16,7 +16,7 @@ from typer._completion_classes import BashComplete  # what a shell asks: there i
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
 
 

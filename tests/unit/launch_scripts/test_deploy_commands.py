@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import THIS_MACHINE, check_signed, hosts_of
-from launch_scripts.launcher.options import as_process, tls_of
+from launch_scripts.launcher.run_options import as_process, tls_of
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError

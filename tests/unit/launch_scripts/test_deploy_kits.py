@@ -20,7 +20,7 @@ from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
 from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, make_plan
 from launch_scripts.deploy.service_files import UNIT, systemd_files
-from launch_scripts.launcher.options import as_process, chosen_processes
+from launch_scripts.launcher.run_options import as_process, chosen_processes
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.revocations import revoke
 from swarm.errors import ConfigError, StoreError

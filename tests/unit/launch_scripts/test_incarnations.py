@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from launch_scripts.launcher import options
-from launch_scripts.launcher.options import next_incarnation
+from launch_scripts.launcher import run_options
+from launch_scripts.launcher.run_options import next_incarnation
 from swarm.errors import StoreError
 
 
@@ -16,7 +16,7 @@ def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_an
     hour_ns, now_ns = 3600 * 10**9, 1_800_000_000 * 10**9
     found = []
     for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns):
-        monkeypatch.setattr(options.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
+        monkeypatch.setattr(run_options.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
         found.append(next_incarnation(tmp_path, "agent", "a0"))
     assert found == sorted(set(found))
     assert next_incarnation(tmp_path, "agent", "a1") == now_ns, "each process has lives of its own"
@@ -39,7 +39,7 @@ def test_a_file_that_was_changed_is_written_again_from_the_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_ns = 1_800_000_000 * 10**9
-    monkeypatch.setattr(options.time, "time_ns", lambda: now_ns)
+    monkeypatch.setattr(run_options.time, "time_ns", lambda: now_ns)
     path = tmp_path / "lives" / "agent-a0"
     path.parent.mkdir()
     path.write_text(f"{now_ns:020}")  # from before there were digests

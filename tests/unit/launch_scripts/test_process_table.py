@@ -3,7 +3,7 @@
 import pytest
 
 from launch_scripts.launcher.local_swarm import Backoff
-from launch_scripts.launcher.options import chosen_processes
+from launch_scripts.launcher.run_options import chosen_processes
 from launch_scripts.process_table import ROLES, STOP_ORDER, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 from support import fake_run
 
-from launch_scripts.launcher.options import SCENARIOS, find_scenario
+from launch_scripts.launcher.run_options import SCENARIOS, find_scenario
 from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.history import Driven
 from launch_scripts.observe.latest_messages import VehicleColumns

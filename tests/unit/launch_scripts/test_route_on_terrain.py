@@ -24,7 +24,7 @@ from launch_scripts.commands.terrain_routes import (
     metres_along,
     write_route,
 )
-from launch_scripts.launcher.options import find_scenario
+from launch_scripts.launcher.run_options import find_scenario
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, ZoneConfig

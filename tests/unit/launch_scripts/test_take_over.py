@@ -16,7 +16,7 @@ from support.effort import few
 
 from launch_scripts.launcher import takeover
 from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.launcher.options import UpOptions
+from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.observe.latest_messages import LatestState, RunPlan

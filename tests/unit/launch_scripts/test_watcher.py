@@ -12,7 +12,7 @@ from support.makers import planner_status, stats
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
-from launch_scripts.launcher.options import UpOptions
+from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
