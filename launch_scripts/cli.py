@@ -19,8 +19,8 @@ from launch_scripts import command_line
 from launch_scripts.command_line import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
 
 LEAVES = (
-    "run_commands:app", "runs_commands:app", "scenario_commands:app", "ask_commands:app", "order_commands:short",
-    "simulation_commands:app", "role_commands:app",
+    "up_commands:app", "ps_down_logs_commands:app", "scenario_commands:app", "ask_commands:app",
+    "order_commands:short", "simulation_commands:app", "role_commands:app",
 )  # fmt: skip
 """Apps of commands without a family, in `launch_scripts.commands`."""
 FAMILIES = {

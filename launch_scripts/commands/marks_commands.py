@@ -4,42 +4,41 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 
 from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.launcher.terminal_tables import columns
-from launch_scripts.observe.run_observer import frame_of_run
+from launch_scripts.observe.run_observer import ask_learned
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
-from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.learned_factors import learned_kinds
-from shared_map.replication.marks import supersedes
-from shared_map.replication.tiles import beyond_tile
+from shared_map.learning.learned_factors import learned_kinds, name_of
+from shared_map.learning.measurements import measurements_in
+from shared_map.replication.marks import statements
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import beyond_tile, grid_cells, tile_corners
 from shared_map.terrain.map_frame import MapFrame
-from swarm.errors import BusError, StoreError
+from swarm.errors import StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.runtime.operator import replies_to
-from swarm.wire.messages.map_data import MarkSet, MarksRequest
-from swarm.wire.topics import MARKS
-
-if TYPE_CHECKING:
-    from swarm.bus.bus import Bus
+from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 
 app = family_app("Look at shared maps and the keeper's store.")
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
-_TIMEOUT_S = 2.0
-"""A process without a reply for this time counts as ended (`network.lease_s`), and a keeper replies from memory."""
+FORMAT = "swarm-map/1"
+NOTHING_SAID_BAND = 255
+"""Above every MarkKind: the no-data value for a GIS."""
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -63,7 +62,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
     """
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
-    _, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+    _, kind, _ = to_cells(grid, sets, time.time_ns())
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
     frame = MapFrame(grid)
@@ -80,7 +79,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
         "cols": grid.cols,
         "sets": len(sets),
         "marks": sum(counts["marks"] for counts in authors.values()),
-        "cells_with_marks": int((kind != stored_marks.NOTHING_SAID_BAND).sum()),
+        "cells_with_marks": int((kind != NOTHING_SAID_BAND).sum()),
         "cells_lethal": int((kind == 1).sum()),
         "authors": authors,
         "authors_that_learned": sorted(each.author for each in words if each.kinds),
@@ -126,7 +125,7 @@ def export(store: Store, out: Path) -> None:
     if ending == ".json":
         with KeeperStore(store, read_only=True) as kept:
             classes = kept.classes
-        write_file(out, stored_marks.to_json(terrain, grid, sets, classes).encode())
+        write_file(out, to_json(terrain, grid, sets, classes).encode())
     else:  # pixels and polygons show the winners among the marks for all vehicles
         own = sum(len(each.kinds) for each in marks if each.tile > grid.tiles)
         more = f"; {own} marks for one class alone are left out, .json has them" if own else ""
@@ -134,7 +133,7 @@ def export(store: Store, out: Path) -> None:
         if ending in TIFF:
             _write_tiff(out, terrain, grid, sets)
         else:
-            pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+            pace, kind, _ = to_cells(grid, sets, time.time_ns())
             write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     print(f"{out}: {sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets{more}")
 
@@ -164,24 +163,6 @@ def factors(
     print_learned(words, as_json=as_json)
 
 
-def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
-    """The newest word of each author. Raises BusError if no process replies.
-
-    where  names the swarm in errors
-    """
-    beyond = beyond_tile(frame_of_run(bus, where).grid)
-    replies, failure = replies_to(bus, MARKS, MarksRequest(tiles=[beyond]), _TIMEOUT_S)
-    found: dict[str, MarkSet] = {}
-    for word in replies:
-        if isinstance(word, MarkSet) and word.tile == beyond:
-            held = found.get(word.author)
-            if held is None or supersedes(word, held):
-                found[word.author] = word
-    if failure is not None and not found:
-        raise BusError(f"no process {where} states what was learned: {failure}")
-    return [found[author] for author in sorted(found)]
-
-
 def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
     """Prints the learned factor of each kind of ground."""
     kinds = learned_kinds(words)
@@ -201,10 +182,78 @@ def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
 
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
-    pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
-    said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+    pace, kind, _ = to_cells(grid, sets, time.time_ns())
+    said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
     bands = [
         "pace of marks, s/m; inf lethal; nan as the prior map says",
         "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
     ]
     write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
+
+
+def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequence[str] = ()) -> str:
+    """Returns every set, readable: marks as [row, col, kind, pace or null, stamp_ns] and the time of expiry, if
+    any; learned factors as [number, terrain class, cells, mean and variance of 65536 ln(driven / prior pace)]."""
+    listed = [
+        {
+            "author": each.author,
+            "group": each.group,
+            "tile": each.tile,
+            "epoch": each.epoch,
+            "seq": each.seq,
+            **(_learned(each) if each.tile == beyond_tile(grid) else {"marks": _marks(each, grid)}),
+        }
+        for each in sorted(sets, key=lambda each: (each.tile, each.author))
+    ]
+    lines = ",\n ".join(json.dumps(each) for each in listed)  # a line a set; a line a mark takes thrice that
+    head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid), "classes": list(classes)})
+    return f'{head[:-1]},\n"sets": [\n {lines}\n]}}\n'
+
+
+def _learned(each: MarkSet) -> dict[str, Any]:
+    measured = measurements_in(each) or {}
+    newest_ns = max(statements(each).stamps_ns.tolist(), default=0)
+    return {"learned": [[key, name_of(key), *measured[key]] for key in sorted(measured)], "stamp_ns": newest_ns}
+
+
+def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
+    stated = statements(each)
+    rows, cols = np.divmod(grid_cells(grid, tile_corners(grid, each.tile), stated.cells), grid.cols)
+    untils = [FOREVER] * len(stated.cells) if stated.untils_ns is None else stated.untils_ns.tolist()
+    marks: list[list[Any]] = []
+    for row, col, kind, pace, stamp_ns, until_ns in zip(
+        rows.tolist(),
+        cols.tolist(),
+        stated.kinds.tolist(),
+        stated.paces.tolist(),
+        stated.stamps_ns.tolist(),
+        untils,
+        strict=True,
+    ):
+        name = MarkKind(kind).name.lower()
+        mark: list[Any] = [row, col, name, pace if kind == MarkKind.PACE else None, stamp_ns]
+        marks.append(mark if until_ns == FOREVER else [*mark, until_ns])
+    return marks
+
+
+def to_cells(
+    grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+    """(pace, kind, stamp) of the winning marks for all vehicles, (rows, cols) each. The pace is in s/m: inf is
+    lethal, nan is as the prior has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything. The
+    timestamp is the time of the mark: UNIX time in ns, 0 without a mark."""
+    replica = MapReplica(grid)
+    replica.merge(list(sets))
+    replica.tick(now_ns)
+    pace = np.full(grid.cells, np.nan, np.float32)
+    kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
+    stamps_ns = np.zeros(grid.cells, np.int64)
+    for tile in replica.held.tiles:
+        if tile >= grid.tiles:  # learned factors, and marks for one class alone
+            continue
+        won = replica.winners(tile)
+        cells = grid_cells(grid, tile_corners(grid, tile), won.cells)
+        kind[cells], stamps_ns[cells] = won.kinds, won.stamps_ns
+        pace[cells] = np.choose(won.kinds, [won.paces, np.float32(np.inf), np.float32(np.nan)])
+    shape = (grid.rows, grid.cols)
+    return pace.reshape(shape), kind.reshape(shape), stamps_ns.reshape(shape)

@@ -14,14 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import msgspec
 import typer
 
-from launch_scripts.command_line import (
-    CERTIFICATES,
-    NETWORK,
-    PART,
-    complete_runs,
-    complete_scenarios,
-    from_environment,
-)
+from launch_scripts.command_line import CERTIFICATES, NETWORK, complete_runs, complete_scenarios, from_environment
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import BusError, ConfigError, SwarmError
 from swarm.liveness import HIGHEST_RANK
@@ -107,69 +100,6 @@ class Tls:
         from launch_scripts.launcher.run_options import tls_of
 
         return tls_of(self.tls_ca, self.tls_cert, self.tls_key, self.tls_dir)
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Start and display of a run: `swarm demo` and `swarm up`.
-
-    seconds        How long the run lasts once the swarm is up.
-    seed           Seed of everything random.
-    no_live        Serve no live view. The run is recorded all the same.
-    record_inputs  Record all input of every process, so that `swarm runs replay` can repeat the run.
-    metrics_port   Serve metrics to Prometheus, and health to probes, on this port; 0 picks one.
-    plain          Plain lines instead of the live table.
-    detach         Run in the background: return once all processes run and a route was served. `swarm down` ends
-                   it.
-    """
-
-    panel: ClassVar[str | None] = None
-    seconds: Seconds = None
-    seed: Seed = None
-    runs: Runs = Path("runs")
-    port: PortOption = None
-    no_live: bool = False
-    record_inputs: bool = False
-    metrics_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
-    signals_address: SignalsAddress = "127.0.0.1"
-    log_format: LogFormatOption = "text"
-    plain: bool = False
-    detach: Annotated[bool, typer.Option("--detach", "-d")] = False
-    as_json: AsJson = False
-
-
-@dataclass(frozen=True)
-class Meeting(Tls):
-    """Endpoints where the processes of a launcher meet others.
-
-    connect  Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.
-    listen   Further endpoint of the router, for other machines, such as tls/0.0.0.0:7448.
-    """
-
-    panel: ClassVar[str | None] = NETWORK
-    connect: str | None = None
-    listen: str | None = None
-    namespace: Namespace = None
-
-
-@dataclass(frozen=True)
-class SomeProcesses:
-    """Part of a swarm that a launcher starts, and its run.
-
-    only       Start only this role or process: planner, planner.t0.r1; may be given several times.
-    rank       Start planners and targets processes of this rank only; 0 leads, 1 is the first standby.
-    run_id     Take part in this run; by default a new one, or the one in the namespace.
-    take_over  Take over from the launcher that runs this part here, as for an upgrade.
-    """
-
-    panel: ClassVar[str | None] = PART
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ROLE[.ID]"),
-    ] = None
-    rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
-    run_id: str | None = None
-    take_over: bool = False
 
 
 # --- the running swarm that a command asks ----------------------------------------------------------------------

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from launch_scripts.observe.latest_messages import LatestState, plan_of_members, run_of_most
+from shared_map.replication.marks import supersedes
+from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.client.terrain_frame import Frame
@@ -25,6 +27,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.map_data import MarkSet, MarksRequest
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import (
     FLEET,
@@ -67,6 +70,8 @@ _EVENTS_AT_ONCE = 5000
 """Taken in at most when the time to listen is over: the caller has something to show."""
 _EARLY = 100_000
 """Messages kept at most until a run is known."""
+_LEARNED_TIMEOUT_S = 2.0
+"""A process without a reply for this time counts as ended (`network.lease_s`), and a keeper replies from memory."""
 
 
 class Known(Protocol):
@@ -307,6 +312,24 @@ def frame_of_run(bus: Bus, where: object) -> MapFrame:
     if frame is None:
         raise BusError(f"no process {where} names the terrain of the swarm")
     return frame
+
+
+def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
+    """The newest word of each author. Raises BusError if no process replies.
+
+    where  names the swarm in errors
+    """
+    beyond = beyond_tile(frame_of_run(bus, where).grid)
+    replies, failure = replies_to(bus, MARKS, MarksRequest(tiles=[beyond]), _LEARNED_TIMEOUT_S)
+    found: dict[str, MarkSet] = {}
+    for word in replies:
+        if isinstance(word, MarkSet) and word.tile == beyond:
+            held = found.get(word.author)
+            if held is None or supersedes(word, held):
+                found[word.author] = word
+    if failure is not None and not found:
+        raise BusError(f"no process {where} states what was learned: {failure}")
+    return [found[author] for author in sorted(found)]
 
 
 def frame_of_members(members: Sequence[RunInfo]) -> MapFrame | None:

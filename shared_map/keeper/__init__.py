@@ -9,7 +9,6 @@ those that are gone. One runs in a swarm, or several, which hold the same.
 - Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in
   books that all keepers merge (`order_service`). An answer promises that the order is on the disk.
 - A machine without the files of a terrain gets them from a keeper (`base_map`).
-- A store can be written as text without loss, and read again (`export`).
 
 `service` is the shell that joins these, `main` the process.
 """
