@@ -1,14 +1,20 @@
 """Checks of a scenario before it runs: immediately (files, certificates, plug-ins, endpoints), and once its terrain
-is built (whether its locations are on passable ground, and connected)."""
+is built (whether its locations are on passable ground, and connected). `check_scenario` makes all of them."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from launch_scripts.check import Finding, failure, warning
+from launch_scripts.check import Finding, failure, machine_check, warning
+from launch_scripts.check import counted as counted_findings
+from launch_scripts.launcher.console import progress
+from launch_scripts.launcher.run_options import with_port
+from launch_scripts.ports import check_ports
 from launch_scripts.process_table import ROLES, certificate_names
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats
@@ -16,17 +22,17 @@ from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.row_bands import counted
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.explain import nearest
-from swarm.config.input_files import FileKind, check_file, quoted
-from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
+from swarm.config.input_files import FileKind, check_file, quoted, read_text, size
+from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, read_scenario, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.config.vehicle_classes import GROUND, flies
-from swarm.errors import ConfigError, SwarmError, TerrainError
+from swarm.errors import BusError, ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.places import Given, cell_of
 from swarm.plugins.find import find_plugin
@@ -304,3 +310,103 @@ def _near(closed: Bools, place: tuple[int, int]) -> str:
     rows, cols = np.divmod(free, closed.shape[1])
     best = int(np.argmin((rows - place[0]) ** 2 + (cols - place[1]) ** 2))
     return f"; the nearest cell that will do is [{rows[best]}, {cols[best]}]"
+
+
+# --- `swarm check`: all of it ----------------------------------------------------------------------------------
+
+
+def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Finding], dict[str, Any], str]:
+    """Returns the findings, failures first, and the facts of a scenario whose ground was built, also in words."""
+    read, faults = read_scenario(read_text(path, FileKind.SCENARIO), str(path), path.parent)
+    found = [failure("", fault) for fault in faults]
+    facts: dict[str, Any] = {}
+    if read is not None:
+        if port is not None:
+            read = with_port(read, port)
+        found += [
+            finding._replace(about=f"{path}: {finding.about}" if finding.about else str(path))
+            for finding in (_findings(read, runs, facts) if not faults else files_named(read))
+        ]
+    found.sort(key=lambda finding: finding.level != "failure")  # failures stand before warnings
+    if not facts:
+        return found, facts, ""
+    summary = (
+        f"{path} can run, {counted_findings(found, 'warning')}: vehicles {facts['vehicles']:,},"
+        f" targets {facts['targets']:,}, processes {facts['needs']['processes']}, {facts['seconds']:g} s;"
+        f" {facts['rows']} x {facts['cols']} cells of {facts['resolution_m']:g} m,"
+        f" {facts['passable_share']:.0%} passable; about {facts['needs']['cores']:.1f} of"
+        f" {facts['machine']['cores']} cores and {size(facts['needs']['memory_bytes'])}"
+    )
+    return found, facts, summary
+
+
+def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
+    """facts  collects facts on the way"""
+    yield from network(scenario)
+    yield from meets(scenario)
+    yield from plugins(scenario)
+    try:
+        check_ports(scenario, ROLES)
+    except SwarmError as error:  # a port which is taken may be free when the run starts
+        yield (warning if isinstance(error, BusError) else failure)("", str(error))
+    broken = [*files_named(scenario), *places_counted(scenario)]
+    yield from broken
+    if broken:
+        return
+    try:
+        with progress() as tell:
+            terrain = build_terrain(scenario, tell)
+        truth = build_truth(scenario, terrain)
+    except SwarmError as error:
+        yield failure("", str(error))
+        return
+    yield from places(scenario, terrain, truth)
+    yield from shards(scenario, terrain.grid)
+    if any(each.name not in each.kind.built_in for each in plugins_of(scenario)):
+        yield from not_made(scenario, terrain.grid, truth)
+    yield from one_way_ground(scenario, terrain, truth)
+    wanted, here = machine_check.needs_of(scenario, terrain.grid.cells), machine_check.this_machine(runs)
+    yield from machine_check.against(scenario, wanted, here, runs)
+    facts |= {
+        "targets": len(scenario.target_ids),
+        "vehicles": scenario.vehicle_count,
+        "seconds": scenario.seconds,
+        "rows": terrain.grid.rows,
+        "cols": terrain.grid.cols,
+        "resolution_m": terrain.grid.resolution_m,
+        "passable_share": round(1 - float(terrain.lethal.mean()), 4),
+        "needs": wanted._asdict(),
+        "machine": here._asdict(),
+    }
+
+
+def not_made(scenario: Scenario, grid: GridSpec, truth: Floats) -> Iterator[Finding]:
+    """Yields plug-ins of a scenario that a run could not make, where they can be imported. Those of cost layers are
+    made with the terrain."""
+    # They load the planner, which only a scenario with plug-ins of its own needs here.
+    from launch_scripts.simulation.world.walks import Budget, TrueTerrain, WalkWorld
+    from planner_service.strategy import StrategyWorld
+    from vehicle_agent.assignment import AssignmentWorld
+    from vehicle_agent.driving.dynamics import DynamicsWorld
+    from vehicle_agent.sensing.sensor import SensorWorld
+
+    seed = scenario.seed
+    worlds = {
+        "sensor": SensorWorld(grid, truth, 35.0, "a0", seed),
+        "walk": WalkWorld("t0", TrueTerrain(grid, truth), random.Random(seed), Budget()),
+        "assignment": AssignmentWorld("a0", "all", ("t0",), seed),
+        "strategy": StrategyWorld("t0", grid, scenario.planner),
+        "dynamics": DynamicsWorld("a0", grid, seed),
+    }
+    for named in plugins_of(scenario):
+        if named.kind.name not in worlds:
+            continue
+        try:
+            plugin = find_plugin(named, scenario.plugin_folder)
+        except SwarmError:
+            continue  # reported with the plug-ins that cannot be imported
+        if plugin.factory is not None:
+            try:
+                plugin.make(worlds[named.kind.name])
+            except SwarmError as error:
+                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))

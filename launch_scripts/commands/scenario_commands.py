@@ -164,7 +164,7 @@ def check(
     swarm check my.toml --json | jq .findings
     """
     from launch_scripts.check import answer
-    from launch_scripts.check.whole_check import check_scenario
+    from launch_scripts.check.scenario_check import check_scenario
     from launch_scripts.launcher.run_options import scenario_path
 
     path = scenario_path(scenario)

@@ -11,7 +11,7 @@ from pathlib import Path
 from launch_scripts.check.scenario_check import files_of
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.process_table import TABLE
-from shared_map.keeper.base_map import NEEDED, Fetching, fetch_base_map
+from shared_map.keeper.base_map_fetch import NEEDED, Fetching, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
 from shared_map.terrain.terrain import build_truth, terrain_digest

@@ -9,7 +9,7 @@ from itertools import islice
 
 import msgspec
 
-from shared_map.keeper.base_map import BaseMapServer
+from shared_map.keeper.base_map_server import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders

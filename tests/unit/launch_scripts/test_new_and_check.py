@@ -15,8 +15,7 @@ from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import places, shards, traps
-from launch_scripts.check.whole_check import not_made
+from launch_scripts.check.scenario_check import not_made, places, shards, traps
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds

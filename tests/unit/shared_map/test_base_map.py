@@ -13,16 +13,8 @@ from support.height_models import written
 from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher import fetched_terrain
-from shared_map.keeper.base_map import (
-    LAYERS,
-    NEEDED,
-    BaseMapCopy,
-    BaseMapServer,
-    Fetching,
-    describe,
-    fetch_base_map,
-    pack,
-)
+from shared_map.keeper.base_map_fetch import NEEDED, BaseMapCopy, Fetching, fetch_base_map
+from shared_map.keeper.base_map_server import LAYERS, BaseMapServer, describe, pack
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
