@@ -16,6 +16,7 @@ import shutil
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from swarm.config.input_files import FileKind, read_text
 from swarm.config.load import BUILT_IN_TERRAINS
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
-from swarm.errors import StoreError, TerrainError
+from swarm.errors import StoreError, SwarmError, TerrainError
 from swarm.files import write_file, writing
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
@@ -48,6 +49,8 @@ _SUMS = "sums.json"
 _ABANDONED_S = 3600.0
 """A folder that is still being written is younger: to write `MOST_BYTES` takes minutes on a slow disk."""
 _META = "terrain.json"
+_NEWEST = 50
+"""The folders of runs in which a prepared terrain is looked for."""
 
 
 def scenario_key(scenario: Scenario) -> str:
@@ -170,6 +173,34 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
         classes=read_array(folder, "classes", meta.grid.shape, np.uint8),
         **read_ground(folder / _META, meta, elevation_m),
     )
+
+
+def find_prepared(digest: str, folder: Path | None, runs: Path) -> Terrain | None:
+    """The terrain with this digest: in a folder, or in that of any run of this machine, for terrains of one digest
+    are equal. None if none is here.
+
+    folder  None: the newest folders in `runs` are looked at
+
+    Raises TerrainError if the folder that was named has none, or another.
+    """
+    if folder is not None:
+        terrain = load_prepared(folder)
+        if terrain is None:
+            raise TerrainError(
+                f"no prepared terrain in {folder}: expected the folder of a run, which holds {_META}"
+            )
+        if terrain.digest != digest:
+            raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
+        return terrain
+    metas: list[Path] = []
+    with suppress(OSError):
+        metas = sorted(runs.glob(f"*/{_META}"), key=lambda each: each.stat().st_mtime_ns, reverse=True)
+    for meta in metas[:_NEWEST]:
+        with suppress(SwarmError):  # another run's damage is no business of ours
+            known = read_meta(meta, "")
+            if known is not None and known.digest == digest and (found := load_prepared(meta.parent)):
+                return found
+    return None
 
 
 def load_beside(folder: Path, name: str, key: str = "") -> NDArray[Any] | None:

@@ -7,8 +7,6 @@ else is unknown.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +15,8 @@ from launch_scripts.gateways.ros2.map_messages import Occupancy, occupancy_of
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
-from shared_map.terrain.store import load_prepared, read_meta
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
-from swarm.errors import SwarmError, TerrainError
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkSet
 
@@ -29,9 +25,6 @@ QUICK_S_PER_M = 0.1
 _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
 """The whole map is due this time after it was put last if anything has changed, and as many times longer as it has
 more cells than a million."""
-_META = "terrain.json"
-_NEWEST = 50
-"""The folders of runs that are looked at."""
 _Cells = NDArray[np.int64]
 
 
@@ -103,31 +96,3 @@ def _unknown(grid: GridSpec) -> Terrain:
     """The terrain of which nothing is known: each pace is NaN, until a mark says one."""
     pace, none = np.full((grid.rows, grid.cols), np.nan, np.float32), np.empty((0, 0), np.uint8)
     return Terrain(grid, none.astype(np.float32), none, pace, none, "", pace)
-
-
-def find_terrain(digest: str, folder: Path | None, runs: Path) -> Terrain | None:
-    """The terrain with this digest: in a folder, or in that of any run of this machine, for terrains of one digest
-    are equal. None if none is here.
-
-    folder  None: the newest folders in `runs` are looked at
-
-    Raises TerrainError if the folder that was named has none, or another.
-    """
-    if folder is not None:
-        terrain = load_prepared(folder)
-        if terrain is None:
-            raise TerrainError(
-                f"no prepared terrain in {folder}: expected the folder of a run, which holds {_META}"
-            )
-        if terrain.digest != digest:
-            raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
-        return terrain
-    metas: list[Path] = []
-    with suppress(OSError):
-        metas = sorted(runs.glob(f"*/{_META}"), key=lambda each: each.stat().st_mtime_ns, reverse=True)
-    for meta in metas[:_NEWEST]:
-        with suppress(SwarmError):  # another run's damage is no business of ours
-            known = read_meta(meta, "")
-            if known is not None and known.digest == digest and (found := load_prepared(meta.parent)):
-                return found
-    return None

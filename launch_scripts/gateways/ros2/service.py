@@ -14,13 +14,14 @@ from pathlib import Path
 
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
-from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
+from launch_scripts.gateways.ros2.map_feed import MapFeed
 from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
+from shared_map.terrain.store import find_prepared
 from swarm.client import Frame, Observer, Swarm, SwarmError
 from swarm.errors import BusError, ConfigError
 
@@ -84,7 +85,7 @@ class _Run:
         map = RosMap(grid, settings.frames.map)
         forwards = {row.name for row in settings.rows()}
         folder = Path(settings.swarm.terrain) if settings.swarm.terrain else None
-        terrain = find_terrain(swarm.run.terrain, folder, runs)
+        terrain = find_prepared(swarm.run.terrain, folder, runs)
         if terrain is None and "map" in forwards:
             say(
                 f"the terrain of the run is not on this machine (no run in {runs} has it): /map holds marks alone; "
