@@ -15,8 +15,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from launch_scripts import command_line
-from launch_scripts.command_line import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
+from launch_scripts import typer_commands
+from launch_scripts.typer_commands import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
 
 LEAVES = (
     "up_commands:app", "ps_down_logs_commands:app", "scenario_commands:app", "ask_commands:app",
@@ -109,7 +109,7 @@ def _root(
 help_app = typer.Typer()
 
 
-@command_line.command(help_app, ADMIN, "help")
+@typer_commands.command(help_app, ADMIN, "help")
 def help_(
     words: Annotated[list[str] | None, typer.Argument(metavar="[COMMAND...]")] = None,
     every: Annotated[bool, typer.Option("--all")] = False,

@@ -8,7 +8,7 @@ from typing import Literal
 
 import msgspec
 
-from swarm.config.agents import places_of, plan_agents
+from swarm.config.agent_plan import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
 from swarm.errors import ConfigError
 from swarm.liveness import ranked_id

@@ -30,7 +30,7 @@ from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
 from swarm.bus.bus import Asked, Event, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
-from swarm.config.agents import (
+from swarm.config.agent_plan import (
     PLACE_TREES_BYTES,
     agent_of,
     place_job,

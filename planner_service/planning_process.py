@@ -13,7 +13,7 @@ from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import ClassMaps, class_terrains
 from swarm.bus.bus import Asked, Bus, Event, Post, Worker
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.liveness import job_of
 from swarm.runtime.election import Candidacy

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.step_climb import may_be_pulled
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AgentPlan
+from swarm.config.agent_plan import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish

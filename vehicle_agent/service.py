@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import place_job
+from swarm.config.agent_plan import place_job
 from swarm.liveness import Roster, job_of
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role_setup import RoleSetup

@@ -21,9 +21,9 @@ import typer
 from docs.generate import scenario_page, wire_page
 from docs.generate.templates import filled
 from launch_scripts import cli
-from launch_scripts.command_line import Family
 from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.gateways.ros2.topic_table import INCOMING, TABLE
+from launch_scripts.typer_commands import Family
 from shared_map.importers.cover.cover_codes import TABLES
 from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from launch_scripts.check import Finding, Level, failure, warning
 from launch_scripts.observe.run_folder import version_of
 from launch_scripts.process_table import processes_of
-from swarm.config.agents import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
+from swarm.config.agent_plan import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import StoreError, SwarmError

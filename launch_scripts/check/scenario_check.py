@@ -25,7 +25,7 @@ from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_file, quoted, read_text, size
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, read_scenario, with_files

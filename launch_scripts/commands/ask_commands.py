@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line import ASK, command
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     AsJson,
@@ -19,6 +18,7 @@ from launch_scripts.commands.shared_options import (
     VehicleClass,
     Where,
 )
+from launch_scripts.typer_commands import ASK, command
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.check.scenario_check import check_start
-from launch_scripts.command_line import command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.hosts import load_hosts
@@ -36,6 +35,7 @@ from launch_scripts.deploy.service_files import compose_files, systemd_files, ze
 from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
+from launch_scripts.typer_commands import command, complete_scenarios, family_app
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config import revocations
 from swarm.config.input_files import quoted

@@ -15,12 +15,12 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import ask_learned
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
+from launch_scripts.typer_commands import command, family_app
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.learned_factors import learned_kinds, name_of
 from shared_map.learning.measurements import measurements_in

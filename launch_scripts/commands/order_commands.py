@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import ORDER, command, family_app
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.plain_text import unanswered
+from launch_scripts.typer_commands import ORDER, command, family_app
 from swarm.config.explain import choice, explain
 from swarm.errors import ConfigError
 

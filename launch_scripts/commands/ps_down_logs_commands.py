@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.command_line import RUN, command, complete_runs
 from launch_scripts.commands.shared_options import AsJson, RunOption, network_of, say_newest
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
+from launch_scripts.typer_commands import RUN, command, complete_runs
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable
 

@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.command_line import command, complete_runs, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs
 from launch_scripts.launcher.console import REPORTED, progress
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
+from launch_scripts.typer_commands import command, complete_runs, family_app
 from swarm.config.explain import choice
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import ADMIN, command, complete_scenarios
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     LogFormatOption,
@@ -22,6 +21,7 @@ from launch_scripts.commands.shared_options import (
     SignalsAddress,
     Tls,
 )
+from launch_scripts.typer_commands import ADMIN, command, complete_scenarios
 from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
 
@@ -135,7 +135,7 @@ def run_role(
     from launch_scripts.launcher.log_file import Speaker, log_to
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import TABLE, check_name, processes_of
-    from swarm.config.agents import added_agent
+    from swarm.config.agent_plan import added_agent
     from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"

@@ -9,7 +9,6 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.command_line import PREPARE, command
 from launch_scripts.commands.shared_options import (
     AsJson,
     PortOption,
@@ -18,6 +17,7 @@ from launch_scripts.commands.shared_options import (
     ScenarioArgument,
     Seconds,
 )
+from launch_scripts.typer_commands import PREPARE, command
 from swarm.errors import ConfigError
 from swarm.files import write_file
 

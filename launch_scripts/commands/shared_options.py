@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import msgspec
 import typer
 
-from launch_scripts.command_line import CERTIFICATES, NETWORK, complete_runs, complete_scenarios, from_environment
+from launch_scripts.typer_commands import CERTIFICATES, NETWORK, complete_runs, complete_scenarios, from_environment
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import BusError, ConfigError, SwarmError
 from swarm.liveness import HIGHEST_RANK

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.command_line import RUN, command, complete_scenarios, family_app
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
 from launch_scripts.stop_requests import stop_requests
+from launch_scripts.typer_commands import RUN, command, complete_scenarios, family_app
 from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError
 from swarm.files import writing

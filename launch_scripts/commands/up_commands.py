@@ -10,7 +10,6 @@ from typing import Annotated, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.command_line import NETWORK, PART, RUN, command
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     AsJson,
@@ -24,6 +23,7 @@ from launch_scripts.commands.shared_options import (
     SignalsAddress,
     Tls,
 )
+from launch_scripts.typer_commands import NETWORK, PART, RUN, command
 from swarm.liveness import HIGHEST_RANK
 
 app = typer.Typer()

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.command_line import command, family_app
 from launch_scripts.commands.order_commands import checked, print_obeyed
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
+from launch_scripts.typer_commands import command, family_app
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
 from swarm.errors import ConfigError, TerrainError

@@ -23,7 +23,7 @@ from launch_scripts.process_table import (
     certificate_names,
     processes_of,
 )
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
 from swarm.liveness import job_of

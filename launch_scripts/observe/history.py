@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_of, gaps_of, gaps_to, of_excess
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of, plan_agents
+from swarm.config.agent_plan import agent_of, plan_agents
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, UNPROVEN_OF, Histogram, merged

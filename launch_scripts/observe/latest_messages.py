@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.summed_counts import Counts, sum_of
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of, crew_of
+from swarm.config.agent_plan import agent_of, crew_of
 from swarm.config.scenario import Scenario
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank

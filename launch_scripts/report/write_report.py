@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import image_bytes
-from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, ended
+from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain

@@ -30,7 +30,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.vehicle_classes import flies
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode

@@ -24,7 +24,7 @@ from swarm.bus.bus import Bus, Event, Post, Worker
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AddedAgent
+from swarm.config.agent_plan import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.recording.recording import Recording

@@ -7,7 +7,7 @@
   several settings.
 - `explain` turns msgspec's errors into sentences: file, key, the value found, the values allowed, and a near name.
 - `write` is the way back to TOML, which `load` reads as the same scenario.
-- `plugin_names` knows which settings name a plug-in, and `agents` which processes a scenario needs.
+- `plugin_names` knows which settings name a plug-in, and `agent_plan` which processes a scenario needs.
 
 All errors are `ConfigError`, one sentence each. `read_scenario` finds as many as it can at once.
 """

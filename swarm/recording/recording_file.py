@@ -36,7 +36,7 @@ from swarm.bus.bus import (
     Replied,
     WorkDone,
 )
-from swarm.config.agents import AddedAgent
+from swarm.config.agent_plan import AddedAgent
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.liveness import Peer

@@ -15,7 +15,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.liveness import Roster, job_of
 from swarm.runtime.inbox import Inbox

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from swarm.config.agents import AddedAgent, crew_of
+from swarm.config.agent_plan import AddedAgent, crew_of
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import class_numbers
 from swarm.grid import REGION_CELLS, GridSpec

@@ -7,7 +7,7 @@ import sys
 import typer
 
 from bench.harness import BENCHMARKS, load
-from launch_scripts.command_line import run_command
+from launch_scripts.typer_commands import run_command
 
 if __name__ == "__main__":
     # Imports are lazy: kernels, Zenoh and rasterio take seconds to import.

@@ -29,7 +29,7 @@ from launch_scripts.simulation.world.referee import Referee
 from shared_map.terrain.terrain import build_terrain, build_truth
 from shared_map.vehicle_class_grounds import class_truths
 from swarm.bus.endpoints import listening
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.errors import BusError, ConfigError, ProtocolError, StoreError

@@ -15,7 +15,7 @@ from launch_scripts.deploy.machine_plan import LAUNCHER_CORES, Plan, make_plan
 from launch_scripts.launcher.run_options import UpOptions, chosen_processes
 from launch_scripts.process_table import processes_of
 from swarm.bus.zenoh_config import access_control
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import GroupConfig, PlannerConfig, Scenario, StandbyConfig, TargetConfig, VehicleConfig
 from swarm.errors import ConfigError
 

@@ -31,7 +31,7 @@ from shared_map.keeper.service import KeeperService
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth, terrain_of_pace
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ProtocolError

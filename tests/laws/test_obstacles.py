@@ -12,7 +12,7 @@ from support.effort import few
 from support.shard_tables import grants_of
 
 from swarm.clock import NS_PER_S
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings

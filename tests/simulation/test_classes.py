@@ -15,7 +15,7 @@ from launch_scripts.simulation.simulated_process import Node
 from shared_map.array_files import Bools
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
-from swarm.config.agents import added_agent
+from swarm.config.agent_plan import added_agent
 from swarm.config.load import parse_scenario
 from swarm.config.vehicle_classes import ClassConfig, class_numbers
 from swarm.errors import ConfigError

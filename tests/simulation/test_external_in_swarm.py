@@ -9,7 +9,7 @@ from support.simulated import ExternalVehicle, OrderedSimulation, cells
 from launch_scripts.simulation.sample_worlds import crowd, seeded
 from launch_scripts.simulation.simulated_process import Node
 from swarm.bus.bus import Event, Replied
-from swarm.config.agents import added_agent
+from swarm.config.agent_plan import added_agent
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, Removed, RemoveVehicles

@@ -21,7 +21,7 @@ from launch_scripts.simulation.sample_worlds import SMALL, crowd, seeded
 from launch_scripts.simulation.simulated_process import Node
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
-from swarm.config.agents import added_agent
+from swarm.config.agent_plan import added_agent
 from swarm.config.scenario import RoverConfig
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, RemoveVehicles

@@ -24,7 +24,7 @@ from launch_scripts.simulation.simulated_process import EPOCH_NS
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
-from swarm.config.agents import added_agent
+from swarm.config.agent_plan import added_agent
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig
 from swarm.runtime.role_setup import RoleSetup

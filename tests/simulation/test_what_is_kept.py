@@ -13,7 +13,7 @@ from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import SMALL, WIDE, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.terrain.terrain import Terrain
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
 from swarm.wire.messages.traffic import Entry, Held, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle

@@ -22,7 +22,7 @@ from shared_map.learning.measurements import KEYS, MOST, MOST_CELLS, ONE, Measur
 from shared_map.replication.marks import packed
 from shared_map.replication.tiles import beyond_tile, region_of
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES
 from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec

@@ -19,7 +19,7 @@ from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AddedAgent, agent_of, plan_agents
+from swarm.config.agent_plan import AddedAgent, agent_of, plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.liveness import ranked_id

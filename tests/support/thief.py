@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.right_of_way.holdings import Tell, part_of
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Left, Number, Stored, Table, Word
 from vehicle_agent.traffic.cell_orders import Orders

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.wire.messages.traffic import Before, Entry, Fence, Held, Number, Stamp, Table
 
 _NO_ENTRIES: Sequence[Number] = []

@@ -14,7 +14,7 @@ from itertools import chain
 
 from msgspec.structs import replace
 
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 from swarm.right_of_way.generations import is_said
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT

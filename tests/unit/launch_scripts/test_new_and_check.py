@@ -19,7 +19,7 @@ from launch_scripts.check.scenario_check import not_made, places, shards, traps
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.agents import PLACE_TREES_BYTES, plan_agents
+from swarm.config.agent_plan import PLACE_TREES_BYTES, plan_agents
 from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario

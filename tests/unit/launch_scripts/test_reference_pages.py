@@ -13,7 +13,7 @@ import pytest
 from docs.generate import scenario_page, wire_page
 from docs.generate.__main__ import PROCESS, SWARM, command_line
 from launch_scripts import cli
-from launch_scripts.command_line import Family
+from launch_scripts.typer_commands import Family
 from swarm.config.scenario import Scenario
 from swarm.wire.topics import TOPICS
 

@@ -17,8 +17,8 @@ from launch_scripts.launcher.run_options import SCENARIOS, find_scenario
 from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.history import Driven
 from launch_scripts.observe.latest_messages import VehicleColumns
-from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
+from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
 from launch_scripts.report.write_report import TABLES, make_report, write_report

@@ -22,7 +22,7 @@ from support.fake_run import BEGAN_NS, little_scenario, played
 from support.map_strategies import set_of
 
 from launch_scripts.observe.history import BegunRoute, tracks_of
-from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.report.exporter import in_degrees, write_layers
 from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks

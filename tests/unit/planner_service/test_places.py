@@ -18,7 +18,7 @@ from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
-from swarm.config.agents import place_job, places_of
+from swarm.config.agent_plan import place_job, places_of
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.wire.messages.map_data import MarkKind

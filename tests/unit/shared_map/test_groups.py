@@ -8,7 +8,7 @@ from support.agent_world import AgentWorld, pace_of
 
 from shared_map.replication.interest import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
-from swarm.config.agents import readable_groups
+from swarm.config.agent_plan import readable_groups
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec

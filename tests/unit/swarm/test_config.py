@@ -6,7 +6,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from swarm.config.agents import crew_of, plan_agents
+from swarm.config.agent_plan import crew_of, plan_agents
 from swarm.config.explain import meanings
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import Scenario

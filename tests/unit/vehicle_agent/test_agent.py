@@ -14,7 +14,7 @@ from support.shard_tables import grants_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.agents import plan_agents
+from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec

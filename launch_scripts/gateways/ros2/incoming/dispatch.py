@@ -18,7 +18,7 @@ from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
 from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, VEHICLE_GOAL, ZONE
 from swarm.client import Swarm
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
+from swarm.config.agent_plan import agent_of
 
 log = logging.getLogger(__name__)
 
