@@ -34,7 +34,7 @@ from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
 from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.detours import Detours
-from vehicle_agent.traffic.steering import FAR_CELLS, Steering
+from vehicle_agent.traffic.next_cells import FAR_CELLS, Steering
 
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0

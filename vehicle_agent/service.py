@@ -58,7 +58,7 @@ from swarm.wire.topics import (
     Topic,
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
-from vehicle_agent.assemble import AgentParts
+from vehicle_agent.agent_parts import AgentParts
 from vehicle_agent.driving.driven_vehicle import PLACES, Follow, Places, goal_of
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts

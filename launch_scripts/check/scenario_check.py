@@ -19,8 +19,8 @@ from launch_scripts.process_table import ROLES, certificate_names
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
-from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.pace_layers import inflate, inflation_halves
 from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds

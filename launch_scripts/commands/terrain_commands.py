@@ -20,7 +20,7 @@ from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 from swarm.config.cost_rules import cost_of_preset

@@ -30,8 +30,8 @@ from launch_scripts.report.exporter import (
 )
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
-from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.map_frame import MapFrame, middles_of
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario

@@ -182,7 +182,7 @@ def _say(tell: Connection, what: object) -> None:
 
 
 def _end_with_launcher() -> None:
-    from launch_scripts.launcher.child_process import wait_for_launcher
+    from launch_scripts.launcher.child_main import wait_for_launcher
 
     wait_for_launcher()
     os._exit(0)

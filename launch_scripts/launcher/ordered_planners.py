@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 
 import msgspec
 
-from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError

@@ -31,7 +31,7 @@ try:
     entries = [
         row.entry.partition(":")[0] for row in TABLE.values() if loads == ROLES_AND_KERNELS or not row.kernels
     ]
-    for name in ("launch_scripts.launcher.child_process", *entries, *_AT_RUN_TIME):
+    for name in ("launch_scripts.launcher.child_main", *entries, *_AT_RUN_TIME):
         importlib.import_module(name)
     if loads == ROLES_AND_KERNELS:
         importlib.import_module("planner_service.kernel_build").load_what_is_there()

@@ -17,7 +17,7 @@ from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
-from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
+from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.run_options import (

@@ -7,7 +7,7 @@
 - `movers_view` moves: targets, obstacles, beliefs, alarms; `vehicles_view` vehicles with their trails and routes.
   `styles` is the one table of colours and of how much is drawn for how many vehicles.
 - `live_layout` has the layers, their legends, and the panels beside: plots, a summary, a log.
-- `view_outputs` has the pen, which logs differences only, and its destinations: a file `run.rrd`, and a page
+- `rerun_outputs` has the pen, which logs differences only, and its destinations: a file `run.rrd`, and a page
   whose port has the stream for native viewers, too. If the file ends for want of space, another is begun
   once there is some.
 """

@@ -22,7 +22,7 @@ from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import palette
 from launch_scripts.observe.palette import hillshade, rgb
 from shared_map.array_files import Bools
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.pyramid import any_in_blocks
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec, Window

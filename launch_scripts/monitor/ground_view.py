@@ -36,9 +36,9 @@ from launch_scripts.monitor.live_layout import (
     Scale,
     legend_picture,
 )
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.monitor.styles import Look
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones

@@ -13,10 +13,10 @@ import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor import styles
+from launch_scripts.monitor.rerun_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
 from launch_scripts.monitor.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.view_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_state import RunState

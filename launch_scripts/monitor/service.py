@@ -21,8 +21,8 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers_view import MoversView
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver

@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.monitor.rerun_outputs import Colour
 from launch_scripts.monitor.terrain_mesh import Bytes
-from launch_scripts.monitor.view_outputs import Colour
 from launch_scripts.observe import palette
 from swarm.wire.messages.vehicles import VehicleState
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips, even, ragged
 from launch_scripts.monitor.styles import Level, Looks, dimmed
 from launch_scripts.monitor.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen, RateLimit, Strips, even, ragged
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import percent
 from swarm.clock import NS_PER_S

@@ -12,7 +12,7 @@ import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_raster
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_file
@@ -38,8 +38,8 @@ class Source:
 
     elevation_m  float32 (rows, cols), m; NaN is a void
     classes      uint8 (rows, cols), TerrainClass
-    readings     uint8 (rows, cols), possible classes of an unknown cell, bits of `layers.READABLE`; 0 where none is
-                 known; None without readings
+    readings     uint8 (rows, cols), possible classes of an unknown cell, bits of `pace_layers.READABLE`; 0 where
+                 none is known; None without readings
     photo        the colour photo, uint8 (rows, cols, 3); black where it shows nothing
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
     level        bool (rows, cols), flat cells of the file, before any resampling; None if not examined

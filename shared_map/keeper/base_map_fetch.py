@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.keeper.base_map_server import LAYERS, piece_digest, region_window
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain, finished
 from swarm.bus.bus import Bus

@@ -27,8 +27,8 @@ from shared_map.replication.marks import (
 )
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_cells, tile_corners
-from shared_map.terrain.layers import polygon_mask
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.pace_layers import polygon_mask
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError

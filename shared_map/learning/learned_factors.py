@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats
 from shared_map.learning.measurements import KEYS, MOST_CELLS, ONE, Measurement, measurements_in, rounded
-from shared_map.terrain.layers import TerrainClass, slope_deg
+from shared_map.terrain.pace_layers import TerrainClass, slope_deg
 from swarm.runtime.stats import LEARNED, Counters
 from swarm.wire.messages.map_data import MarkSet, owner_of
 

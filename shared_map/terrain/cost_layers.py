@@ -1,4 +1,4 @@
-"""Layers of cost by plug-ins: between what slope and ground give and the zones that are painted (see `layers`)."""
+"""Layers of cost by plug-ins: between slope and ground, and the zones that are painted (see `pace_layers`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NoReturn, Protocol
 import numpy as np
 
 from shared_map.array_files import Bytes, Floats
-from shared_map.terrain.layers import LETHAL
+from shared_map.terrain.pace_layers import LETHAL
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
@@ -23,7 +23,7 @@ class CostWorld:
     """Arguments with which a cost layer is made. Arrays are (rows, cols) and read-only.
 
     elevation_m  float32  NaN where there is a void
-    classes      uint8    `shared_map.terrain.layers.TerrainClass`
+    classes      uint8    `shared_map.terrain.pace_layers.TerrainClass`
     photo        uint8    (rows, cols, 3); None if the terrain has none
     seed         of the run
     """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats, give_back_memory, open_array, save_array, source_digest
-from shared_map.terrain.layers import largest_part
+from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.step_climb import ENTRIES, Climb, Wind
 from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain, build_truth

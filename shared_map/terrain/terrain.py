@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats
 from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
-from shared_map.terrain.hidden import true_ground
-from shared_map.terrain.layers import (
+from shared_map.terrain.pace_layers import (
     TerrainClass,
     class_factors,
     grade_of_padded,
@@ -29,6 +28,7 @@ from shared_map.terrain.layers import (
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import Climb, climb_of
+from shared_map.terrain.true_ground import true_ground
 from shared_map.terrain.zones import ZoneFacts, paint_zones
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from shared_map.terrain.layers import TerrainClass, largest_part, slope_deg
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.pace_layers import TerrainClass, largest_part, slope_deg
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec
 from swarm.places import bounds_of, extent_of

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.raster_files import mask_of
-from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.pace_layers import LETHAL, TerrainClass, polygon_mask
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
@@ -106,7 +106,7 @@ def paint_zones(
     classes: Bytes | None = None,
     key: str = "cost.zones",
 ) -> list[ZoneFacts]:
-    """Paints zones onto a pace, in place: step 3 of the merge rule in `layers`.
+    """Paints zones onto a pace, in place: step 3 of the merge rule in `pace_layers`.
 
     classes  of the cells: those of roads and water from files are entered, if given
     key      where the zones stand in a scenario, for errors

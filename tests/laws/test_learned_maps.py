@@ -12,7 +12,7 @@ from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import factors_of, keys_of
 from shared_map.learning.measurements import MOST, ONE, Measurement
 from shared_map.replication.replica import MapReplica
-from shared_map.terrain.layers import inflate, inflation_halves
+from shared_map.terrain.pace_layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSet

@@ -19,9 +19,9 @@ from support.wire_strategies import types_of_the_wire
 
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.ground_view import Scene
+from launch_scripts.monitor.rerun_outputs import Pen
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.planning_process import Planning
 from planner_service.service import PlannerService

@@ -24,7 +24,7 @@ from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.obstacles import REACTION_S, Capsule, Obstacles
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.next_cells import Steering
 
 GRID = GridSpec(9, 11, 5.0, west_m=100.0, north_m=900.0)
 MARGIN_M = 0.5

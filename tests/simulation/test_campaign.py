@@ -14,7 +14,7 @@ from launch_scripts.simulation.sample_worlds import MIXED, SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trials import MIX, SECONDS, Result, Trial, replay_of, run_trial, world_of
 from swarm.config.scenario import Scenario
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.next_cells import Steering
 
 
 def result_of(seed: int, name: str = "small", given: Scenario | None = None) -> Result:

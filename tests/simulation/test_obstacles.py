@@ -11,7 +11,7 @@ from launch_scripts.simulation.sample_worlds import CROWDS, SMALL, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.world.service import TargetsService
 from swarm.config.scenario import RoverConfig
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.next_cells import Steering
 
 ROVERS = (
     RoverConfig(name="quick", count=3, speed_m_per_s=3.0),

@@ -14,9 +14,9 @@ from support.simulated import OrderedSimulation
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
 from launch_scripts.launcher.terminal_tables import live_table
 from launch_scripts.monitor.ground_view import Scene
+from launch_scripts.monitor.rerun_outputs import Pen
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.run_state import RunState

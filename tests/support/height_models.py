@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from shared_map.array_files import Floats
 from shared_map.importers.terrain_sources import Source, load_source
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 
 SIDE = 200

@@ -12,9 +12,9 @@ from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.ground_view import Scene
 from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
+from launch_scripts.monitor.rerun_outputs import Pen, Sinks
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen, Sinks
 from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus

@@ -19,7 +19,7 @@ from vehicle_agent.agent_maps import meet
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.cell_orders import cells_beside
-from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.next_cells import Steering
 
 _TURN_NS = 4 * NS_PER_S
 """A vehicle's wish does not age for this time: then its age grows by a step, in which leaders compare ages.

@@ -24,8 +24,8 @@ from launch_scripts.simulation.world.walks import (
     walk_of,
 )
 from shared_map.array_files import Bools, Floats, private_copy
-from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.pace_layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_truths
 from swarm.clock import NS_PER_S

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, CellsOf
-from shared_map.terrain.layers import largest_part
+from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.step_climb import Climb
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig

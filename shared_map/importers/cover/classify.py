@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover import photo_rules as rules
-from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
+from shared_map.terrain.pace_layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
 from swarm.config.explain import converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
@@ -43,7 +43,7 @@ class ByRules(NamedTuple):
 
     classes   uint8 (rows, cols), TerrainClass; UNKNOWN also where a photo that is exposed a little differently
               would show another class
-    readings  uint8 (rows, cols), which classes those are, bits of `layers.READABLE`; 0 where it is known
+    readings  uint8 (rows, cols), which classes those are, bits of `pace_layers.READABLE`; 0 where it is known
     """
 
     classes: Bytes

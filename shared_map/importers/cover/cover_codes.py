@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.setting_types import CoverGround
 from swarm.errors import TerrainError

@@ -27,7 +27,7 @@ from shared_map.importers.cover.cover_codes import (
 from shared_map.importers.onto_grid import place_on
 from shared_map.importers.raster_files import opened, sampled
 from shared_map.importers.terrain_sources import Source
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.terrain.layers import READABLE, TerrainClass, grade_of_padded, spread
+from shared_map.terrain.pace_layers import READABLE, TerrainClass, grade_of_padded, spread
 from shared_map.terrain.row_bands import counted, looked_up, padded_rows
 
 HALO = 2

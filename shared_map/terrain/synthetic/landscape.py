@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared_map.array_files import Bytes, Floats
-from shared_map.terrain.layers import TerrainClass, grade, gradient_of_padded
+from shared_map.terrain.pace_layers import TerrainClass, grade, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.synthetic.noise import fractal_noise, mountain_noise
 from shared_map.terrain.synthetic.rivers_and_roads import carve

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
-from shared_map.terrain.layers import largest_part
+from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.synthetic.noise import fractal_noise
 from swarm.errors import TerrainError

@@ -38,8 +38,8 @@ from launch_scripts.monitor.live_layout import (
     COST,
     PHOTO,
 )
+from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.view_outputs import Pen, in_markdown, shown
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.run_recorder import Recorder

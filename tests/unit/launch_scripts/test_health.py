@@ -21,10 +21,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.processes import eventually
 
-from launch_scripts.launcher import hang_watch, local_swarm
+from launch_scripts.launcher import hang_watch, local_processes
 from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, Sight, Stillness
-from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, Running
+from launch_scripts.launcher.local_processes import Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_probe import ask, fast
@@ -379,10 +379,10 @@ def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts
     phase: Phase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s, sent = 1000.0, []
-    monkeypatch.setattr(local_swarm.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(local_processes.time, "monotonic", lambda: now_s)
     monkeypatch.setattr(Running, "send", lambda running, number: sent.append((now_s - 1000.0, number)))
-    monkeypatch.setattr(local_swarm, "sight_of", lambda pid: Sight(0.0, False))
-    monkeypatch.setattr(local_swarm.IdleTime, "any_until", lambda idle, now_s: True)
+    monkeypatch.setattr(local_processes, "sight_of", lambda pid: Sight(0.0, False))
+    monkeypatch.setattr(local_processes.IdleTime, "any_until", lambda idle, now_s: True)
     swarm = LocalSwarm([ProcessSpec("agent", "a0", "m:f")], lambda spec: None, Path())  # type: ignore[arg-type, return-value]
     [running] = swarm.running
     running.process, running.health = mock.Mock(pid=1), bytearray(BOARD_BYTES)

@@ -14,9 +14,9 @@ import pytest
 from support.processes import eventually, session_of
 
 from launch_scripts.launcher import forkserver
-from launch_scripts.launcher.child_process import ExitReason
+from launch_scripts.launcher.child_main import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _build
-from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
+from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import TABLE, ProcessSpec
 from planner_service import kernel_build
@@ -138,7 +138,7 @@ def test_why_a_process_ended_is_said_and_only_one_that_refuses_is_not_started_ag
 def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 0.5)
+    monkeypatch.setattr("launch_scripts.launcher.local_processes.STOP_GRACE_S", 0.5)
     swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
     swarm.start()
     for line in ("+agent-a0", "+router-0"):
@@ -161,9 +161,9 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
         if (
             "-keeper-0" in (tmp_path / "order.txt").read_text()
         ):  # all but the router have ended: little time is left
-            monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 1.0)
+            monkeypatch.setattr("launch_scripts.launcher.local_processes.STOP_GRACE_S", 1.0)
 
-    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 60.0)
+    monkeypatch.setattr("launch_scripts.launcher.local_processes.STOP_GRACE_S", 60.0)
     began_s = time.monotonic()
     assert swarm.stop(meanwhile) == []
     assert time.monotonic() - began_s < 30.0
@@ -176,7 +176,7 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
 def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed_is_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch_scripts.launcher.local_swarm.FORCED_GRACE_S", 0.5)
+    monkeypatch.setattr("launch_scripts.launcher.local_processes.FORCED_GRACE_S", 0.5)
     rows = [("agent", "a0", "stubborn"), ("keeper", "0", "quiet"), ("router", "0", "quiet")]
     swarm = swarm_of(swarms, tmp_path, *rows)
     swarm.start()
@@ -256,7 +256,7 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
 _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
-from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.launcher.forkserver import ROLES_ONLY, WarmUp
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario

@@ -24,7 +24,7 @@ from launch_scripts.commands import shared_options
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher import forkserver
 from launch_scripts.launcher.forkserver import WarmUp
-from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_names
 from swarm.config.load import load_scenario

@@ -29,8 +29,8 @@ from support.target_reports import fleet
 
 from launch_scripts import parent_death
 from launch_scripts.monitor.live_layout import make_blueprint
+from launch_scripts.monitor.rerun_outputs import RecordingWatch, Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
@@ -331,7 +331,7 @@ import numpy
 import rerun as rr
 from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.rerun_outputs import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 

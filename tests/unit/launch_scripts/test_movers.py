@@ -19,6 +19,7 @@ from launch_scripts.monitor.movers_view import (
     searched_points,
     target_labels,
 )
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
 from launch_scripts.monitor.styles import (
     HUES,
     LOST_COLOUR,
@@ -32,7 +33,6 @@ from launch_scripts.monitor.vehicles_view import (
     cells_at,
     vehicle_details,
 )
-from launch_scripts.monitor.view_outputs import Pen, RateLimit, Strips
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of

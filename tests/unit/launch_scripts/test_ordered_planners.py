@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from launch_scripts.check.machine_check import Machine, why_no_room
-from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.config.load import parse_scenario

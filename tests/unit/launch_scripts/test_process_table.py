@@ -2,7 +2,7 @@
 
 import pytest
 
-from launch_scripts.launcher.local_swarm import Backoff
+from launch_scripts.launcher.local_processes import Backoff
 from launch_scripts.launcher.run_options import chosen_processes
 from launch_scripts.process_table import ROLES, STOP_ORDER, processes_of
 from swarm.config.load import parse_scenario

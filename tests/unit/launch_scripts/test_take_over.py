@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.launcher import takeover
-from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing

@@ -14,7 +14,7 @@ from shared_map.array_files import Bytes, Floats
 from shared_map.importers.cover.classify import Labels, class_readings, confusion, held_out, learnt, read_labels
 from shared_map.importers.cover.photo_rules import box_sum
 from shared_map.importers.terrain_sources import Source, load_source
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from shared_map.terrain.synthetic.noise import fractal_noise
 from swarm.config.ground import TerrainConfig

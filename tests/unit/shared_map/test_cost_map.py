@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared_map.cost_map import MAX_WINDOWS, CostMap, cluster, merged
-from shared_map.terrain.layers import inflate, inflation_halves, spread
+from shared_map.terrain.pace_layers import inflate, inflation_halves, spread
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.errors import OutsideGridError
 from swarm.grid import Window

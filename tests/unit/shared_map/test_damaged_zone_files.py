@@ -20,7 +20,7 @@ from support.zone_shapes import UTM, feature, geojson, in_crs, middles, painted,
 
 from launch_scripts.check.scenario_check import files_named
 from shared_map.importers.zones.zone_features import outlines_of
-from shared_map.terrain.layers import polygon_mask
+from shared_map.terrain.pace_layers import polygon_mask
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError

@@ -8,7 +8,7 @@ import pytest
 from support.height_models import SIDE, hills, is_water, load, written
 
 from shared_map.array_files import Floats
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 
 
 @pytest.mark.parametrize(

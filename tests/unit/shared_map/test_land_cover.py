@@ -14,7 +14,7 @@ from shared_map.importers.cover.cover_codes import (
     read_cover_table,
 )
 from shared_map.importers.cover.land_cover import read_cover
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import COVER_TABLES
 from swarm.errors import TerrainError

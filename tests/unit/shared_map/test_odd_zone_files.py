@@ -11,7 +11,7 @@ from support import height_models
 from support.zone_shapes import UTM, feature, geojson, middles, painted, squares, written
 
 from shared_map.importers.zones.zone_features import outlines_of
-from shared_map.terrain.layers import polygon_mask
+from shared_map.terrain.pace_layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

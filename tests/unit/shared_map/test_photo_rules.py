@@ -14,7 +14,7 @@ from shared_map.importers.cover.photo_rules import (
 )
 from shared_map.importers.cover.photos import Photo
 from shared_map.importers.terrain_sources import Source, with_photo
-from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
+from shared_map.terrain.pace_layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.grid import GridSpec

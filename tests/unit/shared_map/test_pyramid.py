@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.pyramid import any_in_blocks, level_of
 from shared_map.terrain.terrain import terrain_of_pace
 

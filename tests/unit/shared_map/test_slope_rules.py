@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from shared_map.terrain.layers import terrain_pace
+from shared_map.terrain.pace_layers import terrain_pace
 from shared_map.terrain.slope_rules import (
     SLOPE_RULES,
     directional_factor,

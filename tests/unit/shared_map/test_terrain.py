@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 from support.height_models import written
 
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.store import (
     load_beside,
     load_prepared,

@@ -16,7 +16,7 @@ from support.height_models import written
 from shared_map.importers.cover.photos import read_photo
 from shared_map.importers.georeference import metres_per_degree
 from shared_map.importers.terrain_sources import Source, load_source
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario

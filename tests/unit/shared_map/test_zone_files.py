@@ -15,7 +15,7 @@ from rasterio.warp import transform as to_crs
 from scipy import ndimage
 from support.zone_shapes import OPEN, UTM, feature, geojson, middles, painted, squares, written
 
-from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import WayConfig, ZoneConfig
 from swarm.errors import TerrainError

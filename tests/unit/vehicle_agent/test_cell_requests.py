@@ -14,7 +14,7 @@ from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.steering import FAR_CELLS, Steering
+from vehicle_agent.traffic.next_cells import FAR_CELLS, Steering
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
 TICK_NS = NS_PER_S // 10

@@ -16,7 +16,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.child_process import ExitReason, Reports, run_child
+from launch_scripts.launcher.child_main import ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
 from launch_scripts.launcher.log_file import LogFormat

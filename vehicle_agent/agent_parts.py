@@ -37,8 +37,8 @@ from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 from vehicle_agent.start_cells import Spawning, entry_cells, spawn_cells
 from vehicle_agent.target_choice import GroupCosts
+from vehicle_agent.traffic.next_cells import FAR_CELLS
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
-from vehicle_agent.traffic.steering import FAR_CELLS
 
 _ACTS = 10
 """Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them. Each lets

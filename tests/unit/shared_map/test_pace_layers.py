@@ -9,7 +9,7 @@ import pytest
 from support.height_models import written
 
 from shared_map.importers.terrain_sources import load_source
-from shared_map.terrain.layers import (
+from shared_map.terrain.pace_layers import (
     CLASS_FACTOR,
     TerrainClass,
     gradient_of_padded,
