@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.web import LOOPBACK
+from launch_scripts.web.http_server import Audience
 from launch_scripts.web.live_page import LivePage, when_free
-from launch_scripts.web.server import Audience
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import StoreError

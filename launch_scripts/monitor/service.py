@@ -27,8 +27,8 @@ from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.observe.run_state import state_of
+from launch_scripts.web.http_server import Audience
 from launch_scripts.web.live_page import LivePage
-from launch_scripts.web.server import Audience
 from shared_map.array_files import give_back_memory
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica

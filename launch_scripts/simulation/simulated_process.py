@@ -27,7 +27,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
-from swarm.recording.recording import Recording
+from swarm.recording.record_inputs import Recording
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.first_use import Modules, in_loop
 from swarm.runtime.process import Service

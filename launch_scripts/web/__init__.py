@@ -1,11 +1,11 @@
 """One HTTP server, and what it serves: the page of the live view, health and metrics.
 
-- `server`: answers on loopback, or on an address that an operator names. On loopback only a request whose Host and
-  Origin are this machine is answered, with any method: a page of another site can make a browser connect to any
+- `http_server`: answers on loopback, or on an address that an operator names. On loopback only a request whose Host
+  and Origin are this machine is answered, with any method: a page of another site can make a browser connect to any
   loopback port, and can have its own name lead there (DNS rebinding). Connections are bounded in number and time.
 - `live_page`: the files of rerun's web viewer, and the stream behind them.
-- `health`: from what processes say of themselves to the answer that a probe gets; `probe` is the other end of it.
-- `metrics`: what a run has counted, as metric families of Prometheus.
+- `health_verdict`: from what processes say of themselves to the answer that `health_probe` gets.
+- `prometheus`: what a run has counted, as metric families of Prometheus.
 """
 
 from __future__ import annotations

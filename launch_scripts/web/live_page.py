@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 from launch_scripts import parent_death
 from launch_scripts.web import LOOPBACK, Page, Reply
-from launch_scripts.web.server import Server
+from launch_scripts.web.http_server import Server
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import BusError, StoreError
 

@@ -93,7 +93,7 @@ def stays_exact(grid, box, crop, cells, before, bound, route, known, mark):
 
 @kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
 def walk_by_costs(grid, box, crop, time_cost, ends, directions):
-    """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents`.
+    """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents_from_costs`.
 
     crop       one row of it after the other. All neighbours of a cell with a cost lie in the box
     time_cost  float32 (size,), s, of a straight step into a padded cell

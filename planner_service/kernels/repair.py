@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.decorators import helper, step_kernel
 from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, cuts_corner, diagonal_length
-from planner_service.kernels.parents import point_row_to_parents
+from planner_service.kernels.parents_from_costs import point_row_to_parents
 
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)

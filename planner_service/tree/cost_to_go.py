@@ -20,7 +20,7 @@ from planner_service.kernels.cell_costs import find_rim, merge_window
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
 from planner_service.kernels.layout import NONE, Labels
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.parents import point_to_parents
+from planner_service.kernels.parents_from_costs import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid

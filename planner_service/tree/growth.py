@@ -13,7 +13,7 @@ from planner_service.kernels import queue_dial, queue_wide
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import NONE, RULE_FOUR, RULE_OCTILE, SQRT2, TOO_FINE, PaddedGrid, step_offsets
-from planner_service.kernels.parents import point_to_parents, untie_parents
+from planner_service.kernels.parents_from_costs import point_to_parents, untie_parents
 from planner_service.kernels.queue_multilevel import BASE_BITS, WIDTH, grow_directed_by_buckets, make_scratch
 from planner_service.tree.cost_changes import CostRange
 from shared_map.array_files import Floats

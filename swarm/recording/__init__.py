@@ -5,9 +5,9 @@ A service is deterministic but for what it reads, so a recording is enough to re
 
 1. `service_boundary` wraps the bus, the worker and whatever else is outside (`ExternalCalls`). All inputs and
    outputs of the service cross one of these wrappers, under one name for recording and for replay.
-2. `recording` writes each call of the service with its time (start, tick, stop, or an event), then its
+2. `record_inputs` writes each call of the service with its time (start, tick, stop, or an event), then its
    readings, then key, length and digest of each output. The file can be torn anywhere (`recording_file`).
-3. `replaying` makes the service again behind the same boundary, feeds it the recorded calls and readings, and
+3. `replay_service` makes the service again behind the same boundary, feeds it the recorded calls and readings, and
    compares its outputs one by one. The first difference ends the replay and is named with its event.
 4. `role_process` runs a role's service behind its boundary, from the opening of its bus to its end.
 

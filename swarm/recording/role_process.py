@@ -7,7 +7,7 @@ from collections.abc import Callable
 from swarm.bus.bus import Bus
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.recording.recording import recorded
+from swarm.recording.record_inputs import recorded
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, Service

@@ -1,7 +1,7 @@
 """The boundary of a service: the bus, the worker and the objects outside, as it sees them.
 
 Everything that enters a service passes here, and everything that leaves it. The same wrappers record a run
-(`recording.py`) and feed a recording to the cores (`replaying.py`), so that both give an output the same name.
+(`record_inputs`) and feed a recording to the cores (`replay_service`), so that both give an output the same name.
 """
 
 from __future__ import annotations

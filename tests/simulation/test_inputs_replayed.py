@@ -18,15 +18,15 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.replay import recordings_of, replay_run
+from launch_scripts.simulation.replay_run import recordings_of, replay_run
 from launch_scripts.simulation.sample_worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.recording import recording_file
-from swarm.recording.recording import Recording
+from swarm.recording.record_inputs import Recording
 from swarm.recording.recording_file import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
-from swarm.recording.replaying import Outcome
+from swarm.recording.replay_service import Outcome
 from swarm.recording.service_boundary import ExternalCalls
 from swarm.runtime.role_setup import RoleSetup
 from vehicle_agent.agent import Agent

@@ -15,7 +15,7 @@ from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
 from launch_scripts.monitor.rerun_outputs import Pen, Sinks
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.web.server import Audience
+from launch_scripts.web.http_server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.scenario import MonitorConfig, Scenario

@@ -29,7 +29,7 @@ from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_probe import ask, fast
 from launch_scripts.web.health_verdict import Process, health_pages, verdict
-from launch_scripts.web.server import MOST_CONNECTIONS, Server, refusal
+from launch_scripts.web.http_server import MOST_CONNECTIONS, Server, refusal
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals

@@ -16,8 +16,8 @@ from support.processes import eventually
 from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.rerun_outputs import Sinks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.web import server as web
-from launch_scripts.web.server import MOST_CONNECTIONS, Audience
+from launch_scripts.web import http_server as web
+from launch_scripts.web.http_server import MOST_CONNECTIONS, Audience
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 

@@ -21,9 +21,9 @@ from shared_map.vehicle_class_grounds import load_classes
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
-from swarm.recording.recording import versions
+from swarm.recording.record_inputs import versions
 from swarm.recording.recording_file import FOLDER, SUFFIX, Head, RecordReader
-from swarm.recording.replaying import Outcome, Replaying, replay
+from swarm.recording.replay_service import Outcome, Replaying, replay
 from swarm.runtime.process import Service
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.codec import decode

@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
-from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as
+from swarm.recording.record_inputs import FAILED, RAISED, digest_of, raised_as
 from swarm.recording.recording_file import (
     Call,
     Called,
