@@ -25,7 +25,7 @@ from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from launch_scripts.report.compare import LeftRun
-    from launch_scripts.simulation.replay_run import Replayed
+    from launch_scripts.simulation.replay import Replayed
 
 app = family_app("Compare, export and replay finished runs, and write their reports again.")
 RunArgument = Annotated[
@@ -170,7 +170,7 @@ def replay(
     process  Only this process, such as planner-t3.
     until_s  Stop at this time (s) of the run's own clock.
     """
-    from launch_scripts.simulation.replay_run import other_versions, recordings_of, replay_run, unreadable
+    from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 
     logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
     folder = find_run(run, runs)

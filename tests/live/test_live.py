@@ -15,7 +15,7 @@ import pytest
 from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
 from support.processes import eventually, session_of
 
-from launch_scripts.simulation.replay_run import replay_run
+from launch_scripts.simulation.replay import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.replay_run import recordings_of, replay_run
+from launch_scripts.simulation.replay import recordings_of, replay_run
 from launch_scripts.simulation.sample_worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
