@@ -2,16 +2,16 @@
 
 Commands and the ends of runs and studies write it; nothing else imports it. Matplotlib is imported here alone.
 
-| module            | makes                                                                                   |
-|-------------------|-----------------------------------------------------------------------------------------|
-| write_report.py   | report.json, tables as CSV, and all files below                                         |
-| run_arrays.py     | tracks.npz and ground.npz, and reads them again, checked                                |
-| run_picture.py    | report.png: main figures, map, plots; the map of a run: ground, tracks, marks, captures |
-| run_page.py       | report.html, one file: figures, map, plots, tables (templates/)                         |
-| run_plots.py      | plots of a run over time and as distributions, and of the outcomes of a study           |
-| terrain_figure.py | figures of a terrain, of a route on it, of slope rules                                  |
-| compare.py        | what differs between runs                                                               |
-| exporter.py       | the one exporter: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF, missions                 |
-| run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm runs export`              |
-| mcap_export.py    | a run as MCAP with ROS 2 messages, in order of time                                     |
+| module             | makes                                                                                   |
+|--------------------|-----------------------------------------------------------------------------------------|
+| write_report.py    | report.json, tables as CSV, and all files below                                         |
+| run_arrays.py      | tracks.npz and ground.npz, and reads them again, checked                                |
+| run_picture.py     | report.png: main figures, map, plots; the map of a run: ground, tracks, marks, captures |
+| run_page.py        | report.html, one file: figures, map, plots, tables (templates/)                         |
+| plots_and_cards.py | plots of a run over time and as distributions, its main figures; a study's outcomes     |
+| terrain_figure.py  | figures of a terrain, of a route on it, of slope rules                                  |
+| compare.py         | what differs between runs                                                               |
+| exporter.py        | the one exporter: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF, missions                 |
+| run_layers.py      | tracks, captures, routes and marks of a run as layers; `swarm runs export`              |
+| mcap_export.py     | a run as MCAP with ROS 2 messages, in order of time                                     |
 """

@@ -23,18 +23,9 @@ from launch_scripts.observe.palette import colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, headline
 from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
-from launch_scripts.report.run_picture import (
-    GROUND_FILE,
-    LEARNED_FILE,
-    QUICKER,
-    SLOWER,
-    cards,
-    draw_map,
-    headline,
-    size_km,
-)
-from launch_scripts.report.run_plots import PLOTS, STYLE, draw_plot
+from launch_scripts.report.run_picture import GROUND_FILE, LEARNED_FILE, QUICKER, SLOWER, draw_map, size_km
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import BLUE, RED, hillshade
-from launch_scripts.report.run_plots import saved
+from launch_scripts.report.plots_and_cards import saved
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.pyramid import Level, level_of
 from shared_map.terrain.synthetic.landscape import TINT

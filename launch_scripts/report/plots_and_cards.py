@@ -1,7 +1,9 @@
-"""Plots, drawn from a report: one table for the picture and for the page of a run; and the outcomes of a study.
+"""Plots and cards, made from a report: one table for the picture and for the page of a run; and a study's outcomes.
 
 A plot is one row of `PLOTS`. It names what it shows of the report, and is drawn in one of three ways: courses over
 time, states of all vehicles in a stack, or the share of all that is at most so large.
+
+A card is one main figure of a run, in words.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -22,6 +24,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from launch_scripts.observe import palette
+from launch_scripts.observe.fact_table import count, duration, fact
+from launch_scripts.observe.summed_counts import percent
 from swarm.errors import StoreError
 from swarm.files import replacing
 
@@ -209,3 +213,64 @@ def saved(path: Path, size_in: tuple[float, float], dpi: int = 120, **look: Any)
                 figure.savefig(target, format="png", pil_kwargs={"compress_level": 4})
         except ValueError as error:  # too many pixels
             raise StoreError(f"cannot write {path}: {error}") from error
+
+
+class Card(NamedTuple):
+    """One of the main figures of a run: what it is called, in words, what it means.
+
+    tone  good, bad or nothing
+    """
+
+    label: str
+    text: str
+    meaning: str
+    tone: str = ""
+
+
+def cards(report: Mapping[str, Any]) -> list[Card]:
+    """The main figures of a run, for the picture and the page."""
+    gap = report["certified_gap"]
+    unproven = gap.get("unproven") or 0
+    not_counted = f" {count(unproven)} had none and are not counted." if unproven else ""
+    proven = (
+        "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
+        f"bound with each.{not_counted}"
+    )
+    best = f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}."
+    times = (
+        ("growth_ms", "growth of a tree, p50", "All cheapest paths to one target"),
+        ("route_query_ms", "route query, p50", "From a vehicle's question to the answer"),
+        ("mark_to_tree_ms", "mark to tree, p50", "From a sensor's view to a tree's cost"),
+    )
+
+    def of_facts(*names: str, tone: Callable[[Any], str] = lambda value: "") -> list[Card]:
+        told = [(fact(name), report[name]) for name in names]
+        return [Card(each.label, each.text(value), each.meaning, tone(value)) for each, value in told]
+
+    return [
+        *of_facts("captures", "marks", "reroute_requests", "routes_served"),
+        Card("certified gap, mean", percent(gap["mean"]), proven),
+        Card("certified gap, p95", percent(gap["p95"]), best),
+        *(
+            Card(label, duration(report[name]["p50"]), f"{meaning}; p99 {duration(report[name]['p99'])}.")
+            for name, label, meaning in times
+        ),
+        Card("messages/s, mean", count(report["messages_per_s"]), "Sums over all processes and the whole run."),
+        *of_facts("collisions", "lethal_entries", tone=lambda value: {None: "", 0: "good"}.get(value, "bad")),
+    ]
+
+
+def headline(report: Mapping[str, Any], run: str | None) -> list[str]:
+    """Returns which run it was and how long, in a few words each."""
+    seconds, scale, startup_s = (report[name] for name in ("seconds", "time_scale", "startup_s"))
+    known = {
+        f"scenario {report['scenario']}": True,
+        f"run {run}": run,
+        f"seed {report['seed']}": True,
+        f"{seconds or 0:.0f} s" + (f" at {scale:g} times real motion" if scale != 1 else ""): seconds is not None,
+        "simulated in one process": "simulated" in report,
+        f"{report['processes']} processes": report["processes"] is not None and "simulated" not in report,
+        f"{report['restarts']} restarts": report["restarts"],
+        f"all running after {startup_s or 0:.1f} s": startup_s is not None,
+    }
+    return [text for text, is_known in known.items() if is_known]
