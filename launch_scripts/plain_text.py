@@ -15,6 +15,8 @@ from swarm.clock import NS_PER_S
 _UNITS = (("d", 86_400, "h", 3_600), ("h", 3_600, "min", 60), ("min", 60, "", 1))
 _SECONDS_UP_TO = 100
 """Longer durations are in minutes, hours or days."""
+_NAMED = 3
+"""Names in a line for many: three ids fit 80 columns beside label, count and time."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -42,6 +44,17 @@ class Moment:
     def __str__(self) -> str:
         """14:22:10, by the clock on this machine's wall"""
         return time.strftime("%H:%M:%S", time.localtime(self.ns // NS_PER_S))
+
+
+def number_of(number: int, thing: str) -> str:
+    """no routes, 1 process, 2,345 processes"""
+    plural = "" if number == 1 else "es" if thing.endswith("s") else "s"
+    return f"{number:,} {thing}{plural}" if number else f"no {thing}{plural}"
+
+
+def first_of(names: Sequence[str]) -> str:
+    """a0, a1, a2 and 4 more"""
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 def unanswered(silent: Sequence[str], asked: int, within_s: float) -> str:

@@ -208,6 +208,7 @@ def _files_of(incomplete: str) -> Iterator[str]:
 
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
@@ -254,10 +255,11 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     except OSError as error:
         if error.errno in _NO_PATHS and error.filename is not None:
             return _refused(f"{quoted(str(error.filename))}: {error.strerror}", ConfigError.exit_code)
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+        if error.errno not in _NO_ROOM:
             raise
-        discard_output(1)
-        return _refused(f"cannot write the output: {error.strerror}", StoreError.exit_code)
+        if error.filename is None:
+            discard_output(1)
+        return _refused(f"cannot write {error.filename or 'the output'}: {error.strerror}", StoreError.exit_code)
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code

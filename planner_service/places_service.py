@@ -216,7 +216,7 @@ class PlacesService(PlanningProcess):
         """The question of which the worker has a slice."""
         self._going_on: list[_Question] = []
         """Questions that wait for another slice. The last one has the lowest turn."""
-        for name in ("place_routes", "place_cells_grown", "place_questions_refused", "pushes"):
+        for name in ("routes_served", "place_cells_grown", "place_questions_refused", "pushes"):
             self.counters.count(name, 0)
 
     def start(self, now_ns: int) -> None:
@@ -365,7 +365,7 @@ class PlacesService(PlanningProcess):
         )
         event.answer(reply, places=self._job)
         event.end()
-        self.counters.count("place_routes", len(question.found))
+        self.counters.count("routes_served", len(question.found))
         for vehicle, route in zip(request.vehicles, routes, strict=False):
             if _asker(vehicle) == event.asker:  # no other asker may have it pushed routes
                 push_ns = now_ns + self._push_ns

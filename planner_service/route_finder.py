@@ -33,7 +33,7 @@ class FoundRoute:
     cells          int64 (steps + 1, 2), row and col of every cell from the start to the target; the start alone
                    where there is no route
     cost_s         s, what driving it takes; inf where there is no route
-    lower_bound_s  s, proven: no route from there to the target takes less
+    lower_bound_s  s; no route from there to the target takes less, which is proven
     length_m       m
     """
 

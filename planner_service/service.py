@@ -57,6 +57,8 @@ _PRESENCE_NS = 5 * NS_PER_S
 """A vehicle that was silent for this time sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 """A query waits at most this time for a tree to answer from, and of more the oldest are answered at once."""
+_AWAITED_NS = 10 * NS_PER_S
+"""A target without a first pose for this time is an alarm: simulated targets have theirs within two seconds."""
 _AT_ONCE, _ROUTE_COST = 1 << 16, 64
 """Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
 
@@ -108,6 +110,8 @@ class PlannerService(PlanningProcess):
         self._forced = False
         """True if another than an agent has forced the tree to grow since the last tick."""
         self._served = False
+        self._began_ns = 0
+        """Time of `start`."""
         self._held: list[tuple[int, Asked]] = []
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
         self.counters.count("marks_merged", 0)
@@ -155,6 +159,7 @@ class PlannerService(PlanningProcess):
         return planner
 
     def start(self, now_ns: int) -> None:
+        self._began_ns = now_ns
         if self._untracked:
             self._listen(True)
         else:
@@ -208,6 +213,7 @@ class PlannerService(PlanningProcess):
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
         self._tell_lethal(now_ns)
+        self._tell_no_tracker(now_ns)
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
@@ -221,6 +227,14 @@ class PlannerService(PlanningProcess):
         nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
         text = f"no vehicle can reach {self._target} on lethal ground at {shown[0]}; {nearest}"
         self._member.alarms.begin("target-lethal", self._target, text, now_ns, lethal.cell, self._target)
+
+    def _tell_no_tracker(self, now_ns: int) -> None:
+        waits = self._candidacy.leads and self._watch.pose is None and not (self._untracked or self._removed)
+        if waits and now_ns - self._began_ns >= _AWAITED_NS:
+            text = f"no tracker has published {self._target} yet; its vehicles wait"
+            self._member.alarms.begin("no-tracker", self._target, text, now_ns, target=self._target)
+        else:
+            self._member.alarms.end("no-tracker", self._target, now_ns)
 
     def _take_collected(self, now_ns: int) -> None:
         for heard in self._bus.collected(POSE):

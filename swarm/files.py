@@ -58,6 +58,12 @@ def write_file(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
 
 
+def make_folder(folder: Path, mode: int = 0o777) -> None:
+    """Makes a folder and its parents, if they are missing. Raises StoreError."""
+    with writing(folder):
+        folder.mkdir(mode, parents=True, exist_ok=True)
+
+
 def sync_folder(folder: Path) -> None:
     """Has the names in a folder on the disk: a file that replaced another stays there after a loss of power."""
     opened = os.open(folder, os.O_RDONLY)

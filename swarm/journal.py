@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import DamagedError, StoreError, SwarmError
-from swarm.files import sync_folder, writing
+from swarm.files import make_folder, sync_folder, writing
 
 DIGEST_BYTES = 8
 _HEAD = struct.Struct("<32s8sQQ8s")
@@ -81,11 +81,9 @@ class Lock:
 
     def __init__(self, path: Path, in_use: str, *, waits: bool = False) -> None:
         self._path = path
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
+        with writing(path):
             self._file = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
-        except OSError as error:
-            raise StoreError(f"cannot open {path}: {error.strerror}") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
         except OSError as error:

@@ -12,6 +12,7 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
+from launch_scripts.plain_text import number_of
 from swarm.errors import require
 
 require(__name__, "numpy")
@@ -47,8 +48,7 @@ def warning(about: str, text: str) -> Finding:
 
 def counted(findings: Sequence[Finding], level: Level) -> str:
     """Returns the number of findings of a level: "1 failure", "no warnings"."""
-    many = sum(finding.level == level for finding in findings)
-    return f"{many or 'no'} {level}{'' if many == 1 else 's'}"
+    return number_of(sum(finding.level == level for finding in findings), level)
 
 
 def answer(found: Sequence[Finding], as_json: bool, facts: dict[str, Any], summary: str = "") -> int:

@@ -13,6 +13,8 @@ import typer
 from launch_scripts.commands.shared_options import (
     HIGHEST_PORT,
     AsJson,
+    Crs,
+    Force,
     PresetOption,
     SignalsAddress,
     VehicleClass,
@@ -40,6 +42,8 @@ def route(
     vehicle_class: VehicleClass = "ground",
     out: Path | None = None,
     preset: PresetOption = None,
+    crs: Crs = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Find the cheapest route to a target or a place of a running swarm, or on a terrain file.
@@ -60,17 +64,19 @@ def route(
     out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
     """
     from launch_scripts.commands import terrain_routes
+    from launch_scripts.launcher.run_options import find_scenario
     from launch_scripts.report.exporter import FORMATS, MISSIONS, check_target
     from swarm.places import read_place
 
-    check_target(out, "--out", *FORMATS, *MISSIONS, ".png")
+    check_target(out, "--out", *FORMATS, *MISSIONS, ".png", force=force)
     if terrain is not None:
         if start is None or end is None or target is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
-        terrain_routes.print_route(terrain_routes.find_route(terrain, start, end, preset), out, as_json)
+        scenario = find_scenario(terrain, preset, crs)
+        terrain_routes.print_route(terrain_routes.find_route(scenario, start, end), out, as_json)
         return
-    if preset is not None:
-        raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
+    if preset is not None or crs is not None:
+        raise ConfigError("--preset and --crs go with --terrain: planners of a running swarm go by its scenario")
     if (target is None) == (end is None) or start is None:
         raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
     place = read_place(start, "--from")
@@ -115,10 +121,7 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
 @command(app, ASK)
 def top(
-    where: Where,
-    each: bool = False,
-    once: bool = False,
-    as_json: Annotated[bool, typer.Option("--json")] = False,
+    where: Where, each: bool = False, once: bool = False, as_json: Annotated[bool, typer.Option("--json")] = False
 ) -> None:
     """Watch a running swarm, once a second; Ctrl-C ends it.
 

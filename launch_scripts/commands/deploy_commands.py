@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.check.scenario_check import check_start
-from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
+from launch_scripts.commands.shared_options import AsJson, Force, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
@@ -34,7 +34,9 @@ from launch_scripts.deploy.machines_needed import (
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
 from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
 from launch_scripts.launcher.terminal_tables import columns
+from launch_scripts.plain_text import number_of
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
+from launch_scripts.report.exporter import check_target
 from launch_scripts.typer_commands import command, complete_scenarios, family_app
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config import revocations
@@ -137,9 +139,9 @@ def _show(made: Plan, kit: KitName) -> None:
         table.add_row(Text(label, "dim"), *(Text(text or "-") for text in texts))
     console = Console(highlight=False)
     console.print(table)
-    lost = made.survive
-    what = "no machine may be lost" if not lost else f"{lost} of {len(made.hosts)} machines may be lost at once"
-    console.print(f"run {made.run_id}: {len(made.processes)} processes; {what}", soft_wrap=True)
+    without = f"continues without any {made.survive} of its {number_of(len(made.hosts), 'machine')}"
+    what = f"the run {without if made.survive else 'needs every machine'}"
+    console.print(f"run {made.run_id}: {number_of(len(made.processes), 'process')}; {what}", soft_wrap=True)
     if kit == "systemd":
         console.print(f"{made.records} records the run and writes its report", soft_wrap=True)
 
@@ -203,8 +205,7 @@ def size(
 
 
 def _show_size(found: Needs) -> None:
-    machines = f"{found.machines:,} machine{'s' * (found.machines > 1)}"
-    table = columns("Needs of this swarm", machines)
+    table = columns("Needs of this swarm", number_of(found.machines, "machine"))
     for name, value in (
         ("cores, all machines", sum(found.cpu_cores.values())),
         *((f"  {role}", each) for role, each in found.cpu_cores.items()),
@@ -289,6 +290,7 @@ def zenohd(
     namespace: Namespace = None,
     scenario: Annotated[str | None, typer.Option(autocompletion=complete_scenarios)] = None,
     plugins: Path | None = None,
+    force: Force = False,
 ) -> None:
     """Write a configuration for zenohd as the router of a swarm.
 
@@ -300,6 +302,7 @@ def zenohd(
     scenario  Scenario whose processes may take part: needed with certificates.
     plugins   Folder with libzenoh_plugin_storage_manager.so, to store marks, too.
     """
+    check_target(out, "OUT", force=force)
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
     chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))

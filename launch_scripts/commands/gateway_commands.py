@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
-from launch_scripts.commands.shared_options import VehicleClass, Where
+from launch_scripts.commands.shared_options import VehicleClass, Where, duration
 from launch_scripts.observe.run_folder import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
@@ -130,7 +130,7 @@ class Vehicle:
     group        Its group.
     radius       Metres around it that others keep clear.
     sysid        Its MAVLink system; if not given, the first autopilot.
-    lost_after   Seconds without heartbeat or position, after which it is left to its fail-safe.
+    lost_after   Time without heartbeat or position, after which it is left to its fail-safe.
     signing_key  File of 64 hexadecimal digits: messages are signed; unsigned ones are ignored.
     """
 
@@ -139,7 +139,7 @@ class Vehicle:
     group: str = "all"
     radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0
     sysid: Annotated[int | None, typer.Option(min=1, max=244)] = None
-    lost_after: Annotated[float, typer.Option(min=1.5, max=60.0)] = 5.0
+    lost_after: Annotated[float, duration(least_s=1.5, most_s=60.0)] = 5.0
     signing_key: Path | None = None
 
 

@@ -15,9 +15,10 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from launch_scripts.commands.shared_options import AsJson, Where
+from launch_scripts.commands.shared_options import AsJson, Force, Where
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import ask_learned
+from launch_scripts.plain_text import number_of
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from launch_scripts.typer_commands import command, family_app
@@ -72,7 +73,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
         counts["sets"] += 1
         counts["marks"] += len(each.kinds)
         counts["tombstones"] += not each.kinds
-    found = {
+    found: dict[str, Any] = {
         "store": str(store),
         "terrain": terrain,
         "rows": grid.rows,
@@ -93,19 +94,22 @@ def show(store: Store, as_json: AsJson = False) -> None:
     print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
     if grid.crs != "local":
         print(f"it lies at {extent_of(frame, 'latlon')}")
-    cells = f"{found['cells_with_marks']} cells marked, {found['cells_lethal']} of them lethal"
-    print(f"{found['marks']} marks in {len(sets)} sets; {cells}")
+    print(
+        f"{number_of(found['marks'], 'mark')} in {number_of(len(sets), 'set')};"
+        f" {number_of(found['cells_with_marks'], 'cell')} marked, {found['cells_lethal']:,} of them lethal"
+    )
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if found["authors_that_learned"]:
-        print(f"  learned factors of kinds of ground, by {len(words)} authors: swarm marks factors {store}")
+        learned = f"  learned factors of kinds of ground, by {number_of(len(words), 'author')}"
+        print(f"{learned}: swarm marks factors {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
 
 
 @command(app)
-def export(store: Store, out: Path) -> None:
+def export(store: Store, out: Path, force: Force = False) -> None:
     """Export the marks of a store.
 
     JSON holds all marks and learned factors. Other formats hold the winning marks as pixels or
@@ -118,32 +122,29 @@ def export(store: Store, out: Path) -> None:
     out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
     terrain, grid, sets = _read(store)
-    check_target(out, "OUT", ".json", *TIFF, *AREAS)
+    check_target(out, "OUT", ".json", *TIFF, *AREAS, force=force)
     ending = out.suffix.lower()
     marks, words = _parted(grid, sets)
-    more = f", and what {len(words)} authors have learned" if words else ""
+    more = f", and learned factors of {number_of(len(words), 'author')}" if words else ""
     if ending == ".json":
         with KeeperStore(store, read_only=True) as kept:
             classes = kept.classes
         write_file(out, to_json(terrain, grid, sets, classes).encode())
     else:  # pixels and polygons show the winners among the marks for all vehicles
         own = sum(len(each.kinds) for each in marks if each.tile > grid.tiles)
-        more = f"; {own} marks for one class alone are left out, .json has them" if own else ""
+        more = f"; without {number_of(own, 'mark')} for one class alone, which .json has" if own else ""
         marks = [each for each in marks if each.tile < grid.tiles]
         if ending in TIFF:
             _write_tiff(out, terrain, grid, sets)
         else:
             pace, kind, _ = to_cells(grid, sets, time.time_ns())
             write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
-    print(f"{out}: {sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets{more}")
+    many = sum(len(each.kinds) for each in marks)
+    print(f"{out}: {number_of(many, 'mark')} in {number_of(len(marks), 'set')}{more}")
 
 
 @command(app)
-def factors(
-    where: Where,
-    store: Annotated[Path | None, typer.Argument()] = None,
-    as_json: AsJson = False,
-) -> None:
+def factors(where: Where, store: Annotated[Path | None, typer.Argument()] = None, as_json: AsJson = False) -> None:
     """Show the learned factors of kinds of ground.
 
     Each row: measured pace / prior pace, and the factor applied to the prior (map.learning).

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
 
 from launch_scripts.commands.shared_options import AsJson, Where
-from launch_scripts.plain_text import unanswered
+from launch_scripts.plain_text import number_of, unanswered
 from launch_scripts.typer_commands import ORDER, command, family_app
-from swarm.config.explain import choice, explain
+from swarm.config.explain import choice
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from swarm.runtime.operator import Acknowledged
-    from swarm.wire.messages import Message
 
-M = TypeVar("M", bound="Message")
 app = family_app("Pause a running swarm, change its settings, zones, targets and vehicles.")
 short = typer.Typer()
 """The commands which are also called without their family."""
@@ -80,10 +78,7 @@ def group(
 
 @command(app, name="set", context_settings={"ignore_unknown_options": True})  # a number below 0 is no option
 def set_(
-    key: Key,
-    where: Where,
-    value: Annotated[float, typer.Argument(metavar="VALUE")],
-    as_json: AsJson = False,
+    key: Key, where: Where, value: Annotated[float, typer.Argument(metavar="VALUE")], as_json: AsJson = False
 ) -> int:
     """Change a setting of a running swarm.
 
@@ -144,14 +139,7 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
 
 
 @command(target_app)
-def add(
-    id: Id,
-    at: At,
-    where: Where,
-    walk: str = "waypoints",
-    speed: float = 4.0,
-    as_json: AsJson = False,
-) -> int:
+def add(id: Id, at: At, where: Where, walk: str = "waypoints", speed: float = 4.0, as_json: AsJson = False) -> int:
     """Add a target. A launcher starts its planner; groups that may chase every target chase it.
 
     swarm order target add x --at 36.41,-84.29 --walk evade
@@ -195,7 +183,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_observer import frame_of_run
     from swarm.places import cell_of, fields_of, read_place, written
-    from swarm.runtime.operator import Operator
+    from swarm.runtime.operator import Operator, checked
     from swarm.wire.messages.orders import GiveOrder, SendVehicle
 
     # The cell is known once the swarm has said where its terrain lies; all else is checked before it is asked.
@@ -230,26 +218,12 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     return silent
 
 
-def checked(kind: type[M], fields: dict[str, Any]) -> M:
-    """The order of these fields; those which are None are left out. Raises ConfigError."""
-    from swarm.wire.versions import schema_of_type
-
-    given = {name: value for name, value in fields.items() if value is not None}
-    try:
-        return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
-    except (msgspec.ValidationError, ValueError) as error:
-        said = str(error)
-        ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
-        said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)
-        raise ConfigError(f"the order is not possible: {said}") from None
-
-
 def print_obeyed(acknowledged: Acknowledged) -> int:
     """Prints the processes that obey an order, and those that have not replied. Returns the exit code."""
     from swarm.runtime.operator import OBEY_S
 
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
-    typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
+    typer.echo(f"obeyed by {number_of(len(acknowledged.obeyed), 'process')}, the last after {took_ms:.0f} ms")
     if acknowledged.silent:
         asked = len(acknowledged.silent) + len(acknowledged.obeyed)
         said = unanswered(acknowledged.silent, asked, OBEY_S)

@@ -25,7 +25,7 @@ from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import RUN, command, complete_runs
 from swarm.errors import ConfigError, StoreError, SwarmError
-from swarm.files import check_writable
+from swarm.files import check_writable, make_folder
 
 if TYPE_CHECKING:
     from launch_scripts.observe.run_registry import KnownRun
@@ -219,9 +219,9 @@ def in_background(*, as_json: bool) -> int:
     if as_json:
         raise ConfigError("--json prints the report at the end, and --detach does not wait for it")
     try:
-        registry().mkdir(parents=True, exist_ok=True)
+        make_folder(registry())
         check_writable(registry())
-    except (OSError, RuntimeError, StoreError) as error:
+    except (RuntimeError, StoreError) as error:
         raise StoreError(f"--detach: the run could not be registered, so not be found: {error}") from error
     words = [sys.executable, "-P", "-m", "launch_scripts.entry", *sys.argv[1:]]
     words = [word for word in words if not re.fullmatch("-d+|--detach", word)]

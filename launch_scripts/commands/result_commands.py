@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.commands.shared_options import AsJson, Runs
+from launch_scripts.commands.shared_options import AsJson, Force, Runs, duration
 from launch_scripts.launcher.console import REPORTED, progress
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
@@ -110,7 +110,7 @@ def export(
     what: list[str] | None = None,
     format: str | None = None,
     out: Path | None = None,
-    force: bool = False,
+    force: Force = False,
     runs: Runs = Path("runs"),
 ) -> None:
     """Export a run for a GIS, a spreadsheet or Foxglove.
@@ -127,7 +127,6 @@ def export(
     what    tracks, targets, captures, routes or marks; may be given several times; all by default.
     format  geojson, csv or gpx: a file per layer; gpkg or kml: one file; mcap: ROS 2 messages.
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
-    force   Replace files that are there.
     """
     from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
@@ -155,7 +154,7 @@ def export(
 def replay(
     run: RunArgument = "LAST",
     process: str | None = None,
-    until_s: Annotated[float | None, typer.Option(min=0)] = None,
+    until_s: Annotated[float | None, duration(least_s=0.0)] = None,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> int:
@@ -168,7 +167,7 @@ def replay(
     Simulated runs always record inputs. Exit code 1 if any output differs or a recording cannot be replayed.
 
     process  Only this process, such as planner-t3.
-    until_s  Stop at this time (s) of the run's own clock.
+    until_s  Stop at this time of the run's own clock.
     """
     from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 

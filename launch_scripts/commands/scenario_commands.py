@@ -9,14 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.commands.shared_options import (
-    AsJson,
-    PortOption,
-    PresetOption,
-    Runs,
-    ScenarioArgument,
-    Seconds,
-)
+from launch_scripts.commands.shared_options import AsJson, PortOption, PresetOption, Runs, ScenarioArgument, Seconds
 from launch_scripts.typer_commands import PREPARE, command
 from swarm.errors import ConfigError
 from swarm.files import write_file

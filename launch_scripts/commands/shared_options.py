@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import msgspec
 import typer
@@ -31,7 +31,24 @@ MOST_SEED = 2**53
 HIGHEST_PORT = 65535
 """Ports of TCP are numbers of 16 bits."""
 
-Seconds = Annotated[float | None, typer.Option(min=0.1, max=MOST_SECONDS)]
+_UNITS_S = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def duration(*names: str, least_s: float, most_s: float = MOST_SECONDS) -> Any:
+    """An option which is a duration: a number of seconds, or with a unit."""
+
+    def parse(text: str) -> float:
+        number = text.rstrip("smindh ")
+        with suppress(ValueError, KeyError):
+            if least_s <= (found_s := float(number) * _UNITS_S[text.removeprefix(number).strip()]) <= most_s:
+                return found_s
+        bounds = f"{least_s:g} to {most_s:g} s"
+        raise typer.BadParameter(f"found {text!r}, expected {bounds}, such as 90, 90s, 10min, 2h or 1d")
+
+    return typer.Option(*names, parser=parse, metavar="DURATION")
+
+
+Seconds = Annotated[float | None, duration(least_s=0.1)]
 Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
 VehicleClass = Annotated[str, typer.Option("--class")]
 ScenarioArgument = Annotated[
@@ -43,38 +60,31 @@ ScenarioArgument = Annotated[
     ),
 ]
 Namespace = Annotated[
-    str | None,
-    from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet."),
+    str | None, from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet.")
 ]
 Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder of the runs of this machine.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
     typer.Option(
-        min=0,
-        max=HIGHEST_PORT - 1,
-        help="Router on this port, live view on the next; 0 picks free ones.",
+        min=0, max=HIGHEST_PORT - 1, help="Router on this port, live view on the next; 0 picks free ones."
     ),
 ]
 PresetOption = Annotated[
-    str | None,
-    typer.Option(
-        help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
-    ),
+    str | None, typer.Option(help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.")
 ]
 SignalsAddress = Annotated[
     str,
     typer.Option(
-        metavar="ADDRESS",
-        help="Address at which metrics and health are served; 0.0.0.0 for other machines.",
+        metavar="ADDRESS", help="Address at which metrics and health are served; 0.0.0.0 for other machines."
     ),
 ]
+Force = Annotated[bool, typer.Option(help="Replace files that are there.")]
+Crs = Annotated[str | None, typer.Option(help="Coordinate system, if the file names none, such as EPSG:32632.")]
 LogFormatOption = Annotated[
     Literal["text", "json"],
     from_environment(
-        "SWARM_LOG_FORMAT",
-        metavar="FORMAT",
-        help="Logs as text, or as json: one object a line, for programs.",
+        "SWARM_LOG_FORMAT", metavar="FORMAT", help="Logs as text, or as json: one object a line, for programs."
     ),
 ]
 Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.commands.shared_options import AsJson, Runs, Seed
+from launch_scripts.commands.shared_options import AsJson, Runs, Seconds, Seed
+from launch_scripts.plain_text import number_of
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import RUN, command, complete_scenarios, family_app
 from swarm.config.input_files import quoted
@@ -41,7 +42,7 @@ def simulate(
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete_scenarios)] = None,
     seed: Seed = None,
     seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1)] = None,
+    seconds: Seconds = None,
     runs: Runs = Path("runs"),
     trace: Path | None = None,
     as_json: AsJson = False,
@@ -69,6 +70,8 @@ def simulate(
     if seeds is None:
         if scenario is None:
             raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
+        if trace is not None and trace.is_file():
+            raise ConfigError(f"--trace {trace}: the file exists; name another")
         _simulate_once(scenario, seed, seconds, trace, runs, as_json)
         return 0
     if seed is not None or trace is not None:
@@ -163,13 +166,13 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json:
         if name.startswith("faults.")
     )
     typer.echo(
-        f"{len(some)} seeds, {len(some) * seconds:g} simulated seconds in "
+        f"{number_of(len(some), 'seed')}, {len(some) * seconds:g} simulated seconds in "
         f"{sum(each.wall_s for each in results):.0f} s; {told}\n"
         f"longest wait without a reason {waits_s:.1f} s, all routed at most {routed_s:.2f} s after the last fault"
     )
     for failure in failing:
         typer.echo(f"failed: {failure['replay']}")
-    typer.echo(f"{len(failing)} of {len(some)} seeds broke a law")
+    typer.echo(f"{len(failing)} of {number_of(len(some), 'seed')} broke a law")
     return not failing
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
+from launch_scripts.commands.shared_options import AsJson, Crs, Force, PresetOption, VehicleClass, duration
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_raster
@@ -36,7 +36,6 @@ app = family_app("""Look at terrains: what a file holds, what it costs, what a p
     """)
 console = Console()
 
-Crs = Annotated[str | None, typer.Option(help="Coordinate system, if the file names none, such as EPSG:32632.")]
 Metres = Annotated[
     float | None, typer.Option(min=1e-6, max=1e6, help="Cell size (m) to which everything is resampled.")
 ]
@@ -126,7 +125,9 @@ def cost(
     out: Path | None = None,
     picture: Picture = None,
     preset: PresetOption = None,
+    crs: Crs = None,
     vehicle_class: VehicleClass = "ground",
+    force: Force = False,
 ) -> None:
     """Build the prior cost map of a scenario; write it and a picture of it.
 
@@ -142,9 +143,9 @@ def cost(
     """
     from shared_map.vehicle_class_grounds import class_terrains
 
-    check_target(out, "--out", *TIFF)
-    check_target(picture, "--picture", ".png")
-    loaded = find_scenario(scenario, preset)
+    check_target(out, "--out", *TIFF, force=force)
+    check_target(picture, "--picture", ".png", force=force)
+    loaded = find_scenario(scenario, preset, crs)
     with progress() as tell:
         started = time.perf_counter()
         terrain = class_terrains(loaded, build_terrain(loaded, tell), [vehicle_class])[vehicle_class]
@@ -177,6 +178,7 @@ def generate(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     photo: Path | None = None,
     picture: Picture = None,
+    force: Force = False,
 ) -> None:
     """Make a synthetic landscape: mountains, rivers, forest, roads.
 
@@ -193,9 +195,9 @@ def generate(
     seed          The same seed makes the same landscape.
     photo         Write a photo of it (.tif) too.
     """
-    check_target(out, "--out", *TIFF)
-    check_target(photo, "--photo", *TIFF)
-    check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *TIFF, force=force)
+    check_target(photo, "--photo", *TIFF, force=force)
+    check_target(picture, "--picture", ".png", force=force)
     config = TerrainConfig(
         source="synthetic",
         rows=rows,
@@ -222,8 +224,10 @@ def reach(
     start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
     slack: Annotated[float, typer.Option(min=0.0, max=100.0)] = 0.05,
     out: Path | None = None,
-    every_s: Annotated[float | None, typer.Option(min=0.001, max=1e9)] = None,
+    every_s: Annotated[float | None, duration(least_s=0.001, most_s=1e9)] = None,
     preset: PresetOption = None,
+    crs: Crs = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Compute the driving time to a location from everywhere, as GeoTIFF or areas.
@@ -241,15 +245,16 @@ def reach(
     start    Start of a corridor: only cells on near-optimal paths from there.
     slack    With --from: a path may take this share longer than the best.
     out      Write .tif: seconds, -1 without a path; .geojson, .gpkg, .kml or .csv: areas.
-    every_s  Step between areas (s). Default 600; for a corridor a fifth of the slack time.
+    every_s  Time between areas. Default 600 s; for a corridor a fifth of the slack time.
     """
     from launch_scripts.commands import terrain_routes
 
-    check_target(out, "--out", *TIFF, *AREAS)
+    check_target(out, "--out", *TIFF, *AREAS, force=force)
+    scenario = find_scenario(terrain, preset, crs)
     if start is None:
-        found = terrain_routes.reach(terrain, to, preset)
+        found = terrain_routes.reach(scenario, to)
     else:
-        found = terrain_routes.corridor(terrain, start, to, slack, preset)
+        found = terrain_routes.corridor(scenario, start, to, slack)
     if out is not None:
         terrain_routes.write_reach(found, out, every_s, slack)
     median_s, longest_s = found.quantiles_s()
@@ -278,6 +283,7 @@ def classify(
     picture: Picture = None,
     crs: Crs = None,
     resolution_m: Metres = None,
+    force: Force = False,
 ) -> None:
     """Classify a photo: water, forest, rock, grass, soil, road, built, snow.
 
@@ -292,8 +298,8 @@ def classify(
     labels     Learn from these labels (TOML), and compare with them.
     out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
     """
-    check_target(out, "--out", *TIFF)
-    check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *TIFF, force=force)
+    check_target(picture, "--picture", ".png", force=force)
     config = TerrainConfig(
         source=str(elevation),
         photo=str(photo),

@@ -8,13 +8,12 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.observe.palette import said_length
 from launch_scripts.report.exporter import (
     COSTS,
@@ -173,15 +172,15 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     draw_route(route.terrain, path, title, route.metres(), route.at_m, route.height_m)
 
 
-def find_route(source: str, start: str, end: str, preset: str | None = None) -> DescribedRoute:
-    """The cheapest route between two places of a terrain file, a scenario or a built-in one.
+def find_route(scenario: Scenario, start: str, end: str) -> DescribedRoute:
+    """The cheapest route between two places of a scenario's terrain.
 
     Raises
     ------
     TerrainError, ConfigError
         With one sentence, also if there is no way.
     """
-    scenario, terrain, first, last = between(source, start, end, preset)
+    terrain, first, last = between(scenario, start, end)
     grid, finder = terrain.grid, finder_for(scenario, terrain)
     found = finder.between(grid.row_col(first), grid.row_col(last))
     _check_open(scenario, terrain, first, "--from", last)
@@ -226,26 +225,16 @@ def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
     )
 
 
-class Ends(NamedTuple):
-    """Two cells of a terrain, and the scenario that says what driving on it costs."""
-
-    scenario: Scenario
-    terrain: Terrain
-    first: int
-    last: int
-
-
-def between(source: str, start: str, end: str, preset: str | None = None) -> Ends:
-    """Returns the terrain of a file, a scenario or a built-in scenario, with the cells of two places on it.
+def between(scenario: Scenario, start: str, end: str) -> tuple[Terrain, int, int]:
+    """Returns the terrain of a scenario, with the cells of two places on it.
 
     The places are parsed before the terrain is built, so that a mistake in one is reported at once. Raises
     ConfigError or TerrainError.
     """
     places = read_place(start, "--from"), read_place(end, "--to")
-    scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
     frame = MapFrame(terrain.grid)
-    return Ends(scenario, terrain, cell_of(places[0], frame, "--from"), cell_of(places[1], frame, "--to"))
+    return terrain, cell_of(places[0], frame, "--from"), cell_of(places[1], frame, "--to")
 
 
 def finder_for(scenario: Scenario, terrain: Terrain, target: int | None = None) -> RouteFinder:
@@ -309,17 +298,16 @@ class Reach:
         return float(np.median(known)), float(known.max())
 
 
-def reach(source: str, place: str, preset: str | None = None) -> Reach:
+def reach(scenario: Scenario, place: str) -> Reach:
     """Computes the driving time to a location from every cell. Raises TerrainError or ConfigError with one
     sentence."""
     goal = read_place(place, "--to")
-    scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
     seconds = _to(scenario, terrain, cell_of(goal, MapFrame(terrain.grid), "--to"), "--to")
     return Reach(terrain.grid, seconds, said_of_cost(scenario.cost))
 
 
-def corridor(source: str, start: str, end: str, slack: float, preset: str | None = None) -> Reach:
+def corridor(scenario: Scenario, start: str, end: str, slack: float) -> Reach:
     """Cells through which a way between two places leads that takes at most `slack` (a share) more than the best.
 
     Each cell has the time of a way that passes it and can be driven: to the cell along the cheapest way back from
@@ -331,7 +319,7 @@ def corridor(source: str, start: str, end: str, slack: float, preset: str | None
     ConfigError, TerrainError
         With one sentence, also if there is no way.
     """
-    scenario, terrain, first, last = between(source, start, end, preset)
+    terrain, first, last = between(scenario, start, end)
     if terrain.climb is not None or scenario.planner.length_weight:
         raise ConfigError("--from: no corridors with cost.directional = true or with planner.length_weight")
     back_s = _to(scenario, terrain, first, "--from")

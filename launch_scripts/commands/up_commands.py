@@ -135,11 +135,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
     if run.port is not None:
         chosen = run_options.with_port(chosen, run.port)
     chosen = run_options.with_network(
-        chosen,
-        connect=meeting.connect,
-        also_listen=meeting.listen,
-        namespace=meeting.namespace,
-        tls=meeting.tls(),
+        chosen, connect=meeting.connect, also_listen=meeting.listen, namespace=meeting.namespace, tls=meeting.tls()
     )
     chosen = msgspec.structs.replace(
         chosen,

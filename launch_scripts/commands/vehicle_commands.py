@@ -113,11 +113,7 @@ def add(
 
 
 @command(app)
-def remove(
-    names: list[str],
-    where: Where,
-    as_json: AsJson = False,
-) -> int:
+def remove(names: list[str], where: Where, as_json: AsJson = False) -> int:
     """Remove vehicles from the map. Returns once their cells are free for others.
 
     An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.

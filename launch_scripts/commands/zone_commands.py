@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.commands.order_commands import checked, print_obeyed
-from launch_scripts.commands.shared_options import AsJson, Where
+from launch_scripts.commands.order_commands import print_obeyed
+from launch_scripts.commands.shared_options import AsJson, Where, duration
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
 from launch_scripts.typer_commands import command, family_app
@@ -22,7 +21,7 @@ from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
 from swarm.errors import ConfigError, TerrainError
 from swarm.places import corners_of, fields_of, read_place, written
-from swarm.runtime.operator import Acknowledged, Operator
+from swarm.runtime.operator import Acknowledged, Operator, checked
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ app = family_app("""Close areas of the terrain, slow them down, and open them ag
 
     The shared map holds a zone: all planners and vehicles obey it, also those that start later.
     """)
-_LASTS = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
-_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 @command(app)
@@ -44,7 +41,7 @@ def add(
     layer: str | None = None,
     crs: str | None = None,
     kind: str = "lethal",
-    for_: Annotated[str | None, typer.Option("--for")] = None,
+    for_: Annotated[float | None, duration("--for", least_s=0.001)] = None,
     name: str = "",
     vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
     as_json: AsJson = False,
@@ -65,11 +62,11 @@ def add(
     layer          Layer of a file that has several.
     crs            Coordinate system, if the file names none, such as EPSG:32632, or local.
     kind           lethal, keep-in (all else is lethal), or pace:X for X seconds per metre.
-    for_           Duration: 90s, 10m, 2h. Until it is removed, if not given.
+    for_           Such as 10min; until removed, if not given.
     name           Zone name. Replaces a zone of the same name.
     vehicle_class  Vehicle class; if not given, all vehicles.
     """
-    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(for_)}
+    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": for_}
     fields["vehicle_class"] = vehicle_class
     inside = kind == "keep-in"
     if file is None:
@@ -203,12 +200,3 @@ def _kind(text: str) -> dict[str, object]:
     except ValueError:
         pass
     raise ConfigError(f"--kind: {text!r} is neither lethal, keep-in nor pace:X, with X in seconds per metre")
-
-
-def _lasts_s(text: str | None) -> float | None:
-    if text is None:
-        return None
-    match = _LASTS.fullmatch(text)
-    if match is None or not float(match[1]) > 0:
-        raise ConfigError(f"--for: {text!r} is no time such as 90s, 10m, 2h or 1d")
-    return float(match[1]) * _SECONDS[match[2]]

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from launch_scripts.process_table import check_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
-from swarm.files import replacing, write_file, writing
+from swarm.files import make_folder, replacing, write_file
 
 CA = "ca"
 THIS_MACHINE = ("localhost", "127.0.0.1")
@@ -217,8 +217,7 @@ def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.Ellip
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with private_file(folder / f"{name}.key") as file:
         file.write(secret)
     write_file(folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM))

@@ -45,7 +45,7 @@ _LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
 REPORTED = {
     "seconds": "seconds",
     "startup_s": "start-up, s",
-    "processes": "processes",
+    "processes": "needed processes",
     "restarts": "restarts",
     "vehicles_routed": "vehicles that had a route",
     "captures": "captures",

@@ -35,21 +35,23 @@ from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
-from swarm.files import writing
+from swarm.files import make_folder, writing
 from swarm.journal import digest_of
 from swarm.liveness import split_rank
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
-def find_scenario(name: str, preset: str | None = None) -> Scenario:
+def find_scenario(name: str, preset: str | None = None, crs: str | None = None) -> Scenario:
     """Loads a built-in scenario by name, or one from a file. A file of elevation stands for a scenario on it that
-    says nothing else, but the preset of its cost."""
+    says nothing else, but the preset of its cost and its coordinate system."""
     path = Path(name)
     if os.path.isfile(name) and is_terrain(path):
-        return Scenario(name=path.stem, terrain=TerrainConfig(source=name), cost=cost_of_preset(preset))
-    if preset is not None:
-        raise ConfigError(f"--preset goes with a terrain file: in the scenario {name} set cost.preset")
+        ground = TerrainConfig(source=name, crs=crs)
+        return Scenario(name=path.stem, terrain=ground, cost=cost_of_preset(preset))
+    for option, given, key in (("--preset", preset, "cost.preset"), ("--crs", crs, "terrain.crs")):
+        if given is not None:
+            raise ConfigError(f"{option} goes with a terrain file: in the scenario {name} set {key}")
     return load_scenario(scenario_path(name))
 
 
@@ -188,10 +190,9 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
         raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
     run_dir = runs / run_id
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = "it is not a folder" if runs.is_file() else error.strerror or error
-        raise StoreError(f"cannot make a run folder in {runs}: {why}; choose another with --runs") from error
+        make_folder(run_dir)
+    except StoreError as error:
+        raise StoreError(f"{error}; --runs names another folder for runs") from error
     return run_dir.resolve()
 
 

@@ -73,7 +73,7 @@ def plain_line(state: RunState, title: str) -> str:
     )
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))
     return (
-        f"{title}: processes {facts.fact('processes_well').shown(state)}, "
+        f"{title}: {facts.fact('processes_well').labelled(state)}, "
         f"restarts {state.restarts}; vehicles {facts.fact('vehicles_driven').shown(state)}: "
         f"{facts.fact('states').shown(state)}; {told}{alarms}"
     )

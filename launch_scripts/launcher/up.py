@@ -401,7 +401,7 @@ class _Run:
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
-        title = self._title(facts.fact("processes_well").shown(state), elapsed_s, missing)
+        title = self._title(f"{facts.fact('processes_well').shown(state)} needed", elapsed_s, missing)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
     def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 from launch_scripts.observe.run_alarms import SERIOUS, Alarm
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
-from launch_scripts.plain_text import Duration
+from launch_scripts.plain_text import Duration, first_of, number_of
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 
@@ -113,8 +113,9 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("classes", "classes", each, "The vehicles by class."),
     Fact("following", "assigned", count, "Vehicles that have a target."),
     Fact("sent", "sent to places", each, "Vehicles that were sent to places, by the state of their goals."),
+    Fact("external", "external vehicles", first_of, "Vehicles and obstacles of other programs."),
     Fact("captures", "captures", count, "How often targets were caught."),
-    Fact("marks", "marks", count, "Cells that vehicles found other than the map said."),
+    Fact("marks", "marks", count, "Marks that vehicles made since the last start of their agents."),
     Fact(
         "reroute_requests", "re-route requests", count,
         "How often a vehicle's own route did not lead it on, so that it asked for another.",
@@ -136,9 +137,10 @@ FACTS: tuple[Fact[RunState], ...] = (
     ),
     Fact("hit_by_obstacles", "vehicles hit by obstacles", count, "The obstacles' own fault."),
     Fact(
-        "processes_well", "processes", of_all,
+        "processes_well", "needed processes", of_all,
         "Processes that are alive, or ended as asked, of those that the run needs.", of="well",
     ),
+    Fact("processes_ended", "of these ended as asked", count, "Needed processes that ended so.", of="ended"),
     Fact("restarts", "restarts", count, "How often a process was started again."),
     Fact(
         "messages_now_per_s", "messages/s", count,
@@ -153,7 +155,7 @@ FACTS: tuple[Fact[RunState], ...] = (
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
     Fact("target", "target", _word, "Its id, and exceptional states.", of="title"),
-    Fact("chased_by", "following", count, "Vehicles that go for it.", of="following"),
+    Fact("chased_by", "chased by", count, "Vehicles that go for it.", of="following"),
     Fact("nearest_m", "nearest", distance, "Distance of the nearest vehicle."),
     Fact("captures", "captures", count, "How often it was caught."),
     Fact(
@@ -191,7 +193,7 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("processes_well", "restarts", "messages_now_per_s"),
 )
 """Lines in which the facts of a run are set."""
-IF_ANY = ("learned", "sent")
+IF_ANY = ("learned", "sent", "external", "processes_ended")
 """Facts that have a line of their own, where there is anything to say."""
 MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "payloads_dropped")
 """Facts that are shown only where they are not 0."""
@@ -210,9 +212,6 @@ def lines(state: RunState) -> list[str]:
 
 _SAID_SINGLY = 2
 """Beyond this number alarms of one kind share one line: on a slow machine every process is behind."""
-_NAMED = 3
-"""Names in the line for many alarms: this number of ids fits a terminal's line of 80 columns beside label, count
-and time."""
 
 
 def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
@@ -244,10 +243,9 @@ def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[Ala
 def together(alarms: Sequence[Alarm]) -> str:
     """Many alarms of one kind in a line."""
     first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
-    names = list(dict.fromkeys(alarm.about for alarm in alarms))
-    others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    about = first_of(list(dict.fromkeys(alarm.about for alarm in alarms)))
     when = ("the longest " if first.lasts else "over, the first ") + (first.when or "now")
-    return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {when}"
+    return f"{first.label}: {len(alarms)} times, {about}, {when}"
 
 
 def for_report(state: RunState) -> dict[str, Any]:
@@ -276,8 +274,8 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     """
     captures, collisions = report.get("captures"), report.get("collisions")
     reached = [f"{count(report.get('vehicles_routed') or 0)} of {count(report['vehicles'])} vehicles routed"]
-    reached += [] if captures is None else [_many(captures, "capture")]
-    reached += [] if collisions is None else [_many(collisions, "collision")]
+    reached += [] if captures is None else [number_of(captures, "capture")]
+    reached += [] if collisions is None else [number_of(collisions, "collision")]
     forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
     serious = [
         alarm["text"] + (f" for {Duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
@@ -285,16 +283,14 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
         if alarm["kind"] in SERIOUS and (alarm["over_s"] is None or alarm["kind"] == "silent")
     ]
     wrong = list(dict.fromkeys([*failures, *forbidden, *serious, *left_behind(report)]))
-    more = f"; and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
-    how = f"Not all went well: {'; '.join(wrong[:_NAMED])}{more}." if wrong else WELL
+    more = f"; and {len(wrong) - _FAULTS} more" if len(wrong) > _FAULTS else ""
+    how = f"Not all went well: {'; '.join(wrong[:_FAULTS])}{more}." if wrong else WELL
     return f"{', '.join(reached)}. {how}"
 
 
+_FAULTS = 3
+"""Most faults that a verdict names."""
 WELL = "All went well."
-
-
-def _many(number: float, thing: str) -> str:
-    return f"{count(number) if number else 'no'} {thing}{'s' * (number > 1)}"
 
 
 def _plain(value: Any) -> Any:

@@ -29,7 +29,7 @@ from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Heartbeat, RunInfo, Stats
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Obstacle, VehicleState
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 
 K = TypeVar("K")
@@ -209,6 +209,8 @@ class LatestState(Counts):
         self.leads: dict[tuple[str, str], bool] = {}
         self._goals: dict[str, GoalState] = {}
         self._trackings = Trackings(grid)
+        self._obstacles: dict[str, tuple[Obstacle, int]] = {}
+        """Id -> its last report, and the time of its arrival."""
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._vehicles: VehicleColumns | None = None
         """The vehicles of `_fleets`, once asked for; None since the last news."""
@@ -247,6 +249,8 @@ class LatestState(Counts):
                     self._vehicles = None
                 if message.ids:
                     _remember(self._fleet_told_ns, agent_of(message.ids[0]), now_ns)
+            case Obstacle():
+                _remember(self._obstacles, message.id, (message, now_ns))
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
                 return self._trackings.counted(message, now_ns)
@@ -318,10 +322,12 @@ class LatestState(Counts):
 
     def is_well(self, role: str, id: str) -> bool:
         """Returns True if a process is in order: alive, or ended on request."""
-        if self._alive.get((role, id)):
-            return True
+        return bool(self._alive.get((role, id))) or self.has_ended(role, id)
+
+    def has_ended(self, role: str, id: str) -> bool:
+        """Returns True if a process ended on request."""
         stats = self.newest_stats(role, id)
-        return stats is not None and stats.gauges.get(ENDED, 0.0) > 0
+        return stats is not None and stats.gauges.get(ENDED, 0.0) > 0 and not self._alive.get((role, id))
 
     def fills(self, role: str, id: str) -> bool:
         """Returns True if the job of this process is done in order: by itself, or by a keeper or a targets process
@@ -410,6 +416,11 @@ class LatestState(Counts):
     def tells_of_vehicles(self, agent: str) -> bool:
         """Returns True if the agent has published its vehicles."""
         return agent in self._fleet_told_ns
+
+    def external(self, now_ns: int) -> tuple[str, ...]:
+        """Returns the ids of the external vehicles and other obstacles whose lease has not ended, in order."""
+        reports = sorted(self._obstacles.items())
+        return tuple(id for id, (each, heard_ns) in reports if now_ns - heard_ns < each.lease_s * NS_PER_S)
 
     def goals(self) -> list[GoalState]:
         """Progress of the vehicles that were sent to places, without those that were recalled."""

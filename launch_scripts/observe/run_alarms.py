@@ -43,6 +43,7 @@ KINDS: Mapping[str, str] = {
     **SERIOUS,
     "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
     "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
+    "no-tracker": "no tracker",  # none has published the target since its planner started
     "target-lethal": "target on lethal ground",  # no route leads to it
     "goal-blocked": "cannot reach its place",  # it was sent there by an order; it asks again every 3 s
     "shut-in": "vehicle shut in",  # obstacles leave it no cell to which it can drive

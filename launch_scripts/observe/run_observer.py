@@ -36,6 +36,7 @@ from swarm.wire.topics import (
     LEAD,
     MARKS,
     NOTE,
+    OBSTACLE,
     ORDERS,
     POSE,
     RUN,
@@ -56,6 +57,7 @@ HEARD: Mapping[Topic, float] = {
     LEAD: 0.5,
     ORDERS: 0.5,
     GOAL_STATES: 0.5,
+    OBSTACLE: 0.0,
     FLEET: 0.4,
 }
 """The topics of a `LatestState`, and how often the newest of each key is taken, in seconds; 0 for all that comes.

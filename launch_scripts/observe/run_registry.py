@@ -19,7 +19,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError, SwarmError
-from swarm.files import write_file
+from swarm.files import make_folder, write_file
 from swarm.runtime.run_secret import state_folder
 
 LAUNCHER_LOG = "launcher.log"
@@ -91,7 +91,7 @@ def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str 
             is_whole=is_whole,
         )
         file = registry() / f"{folder.name}.{os.getpid()}.json"
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent)
         write_file(file, msgspec.json.encode(entry))
     except (OSError, RuntimeError, ValueError, StoreError) as error:  # ValueError: a name that is no UTF-8
         return f"commands find this run in its folder only, as it cannot be registered: {error}"

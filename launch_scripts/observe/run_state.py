@@ -70,6 +70,8 @@ class RunState:
     driven          vehicles that an agent drives, and all of the run
     well            processes that are as they should be (alive, or ended because they were asked to), and all that
                     the run needs
+    ended           of these, processes that ended because they were asked to
+    external        ids of external vehicles and other obstacles which report their places now
     crew            the same by role
     learned         class of ground -> measured factor on its prior pace; only classes whose factor is not 1
     goals           progress of the vehicles that were sent to places
@@ -94,6 +96,8 @@ class RunState:
     messages_per_s: float | None
     payloads_dropped: int | None
     well: tuple[int, int]
+    ended: int
+    external: tuple[str, ...]
     restarts: int
     crew: dict[str, tuple[int, int]]
     beside: dict[str, int]
@@ -147,6 +151,8 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         following=int(np.count_nonzero(vehicles.targets >= 0)),
         messages_per_s=latest.now_of(MESSAGES_PER_S),
         well=(sum(well), len(crew)),
+        ended=sum(latest.has_ended(role, id) for role, id in crew),
+        external=latest.external(now_ns),
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),

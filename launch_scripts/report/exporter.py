@@ -35,7 +35,7 @@ from swarm.grid import GridSpec
 COSTS = "Costs are seconds of travel: a step takes its length times the pace (s/m) of the cell that it enters."
 """The convention of costs, in each file that has some."""
 _MEANINGS = {
-    "lower_bound_s": "proven, no route takes less", "certified_gap": "cost over a proven lower bound",
+    "lower_bound_s": "no route takes less than this", "certified_gap": "cost over a proven lower bound",
     "steps": "from cell to cell", "up_m": "sum of all climbs", "down_m": "sum of all descents",
     "height_m": "height of the ground", "at_m": "from the start", "at_s": "from the start",
     "from": "JSON, first cell", "to": "JSON, last cell", "from_s": "least of the area", "to_s": "most of the area",
@@ -112,16 +112,22 @@ TIFF = (".tif", ".tiff")
 """Endings of rasters (`write_raster`)."""
 
 
-def check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Raises ConfigError or StoreError now, not after the work, if a file cannot be written."""
+def check_target(path: Path | None, option: str, *endings: str, force: bool = False) -> None:
+    """Raises ConfigError or StoreError now, not after the work, if a file cannot be written.
+
+    endings  allowed ones; none: any
+    force    the file may exist, and is replaced
+    """
     if path is None:
         return
     if path.is_dir():
         raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
-    if path.suffix.lower() not in endings:
+    if endings and path.suffix.lower() not in endings:
         raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
+    if path.is_file() and not force:
+        raise ConfigError(f"{option} {path}: the file exists; --force replaces it")
     check_writable(path.parent, file=path)
 
 
@@ -135,7 +141,7 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     StoreError
         If the file cannot be written.
     """
-    check_target(path, "--out", *FORMATS)
+    check_target(path, "--out", *FORMATS, force=True)
     form = FORMATS[path.suffix.lower()]
     placed = frame.grid.crs != "local"
     if not placed and not form.local:

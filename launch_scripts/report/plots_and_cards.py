@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe import palette
 from launch_scripts.observe.fact_table import count, duration, fact
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.plain_text import number_of
 from swarm.errors import StoreError
 from swarm.files import replacing
 
@@ -269,8 +270,8 @@ def headline(report: Mapping[str, Any], run: str | None) -> list[str]:
         f"seed {report['seed']}": True,
         f"{seconds or 0:.0f} s" + (f" at {scale:g} times real motion" if scale != 1 else ""): seconds is not None,
         "simulated in one process": "simulated" in report,
-        f"{report['processes']} processes": report["processes"] is not None and "simulated" not in report,
-        f"{report['restarts']} restarts": report["restarts"],
+        number_of(report["processes"], "needed process"): report["processes"] and "simulated" not in report,
+        number_of(report["restarts"], "restart"): report["restarts"],
         f"all running after {startup_s or 0:.1f} s": startup_s is not None,
     }
     return [text for text, is_known in known.items() if is_known]

@@ -21,6 +21,7 @@ from launch_scripts.report.exporter import (
     Points,
     Value,
     areas_of,
+    check_target,
     moment,
     turns_of,
     write_layers,
@@ -28,7 +29,7 @@ from launch_scripts.report.exporter import (
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from swarm.errors import ConfigError
-from swarm.files import check_writable, writing
+from swarm.files import make_folder
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 
@@ -206,12 +207,9 @@ def free_places(folder: Path, names: Sequence[str], out: Path | None, force: boo
     if to.exists() and not to.is_dir():
         raise ConfigError(f"--out {to} is a file; expected a folder")
     paths = [to / name for name in names]
-    there = [path for path in paths if path.exists()]
-    if there and not force:
-        raise ConfigError(f"{there[0]} is there already; --force replaces it, --out FOLDER writes elsewhere")
-    with writing(to):
-        to.mkdir(parents=True, exist_ok=True)
-    check_writable(to)
+    make_folder(to)
+    for path in paths:
+        check_target(path, "--out", force=force)
     return paths
 
 

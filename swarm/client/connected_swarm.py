@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -20,22 +20,19 @@ from swarm.client.terrain_frame import Frame, Point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
-from swarm.runtime.operator import Acknowledged, Operator
+from swarm.runtime.operator import Acknowledged, Operator, checked
 from swarm.wire.access import OPERATOR
-from swarm.wire.codec import field_fault
-from swarm.wire.messages import WIRE_VERSION, Message
+from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.orders import GiveOrder, Order, SendVehicle, Then, VehicleGoals, Zone, ZoneOrder
 from swarm.wire.messages.planning import GROUND, POSE_LEASE_S, PlaceRouteReply, PlaceRouteRequest
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import PLACE_ROUTE, asker_of
-from swarm.wire.versions import are_neighbours, schema_of_type
+from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
     from swarm.right_of_way.external_session import ExternalSession
     from swarm.runtime.inbox import Inbox
-
-M = TypeVar("M", bound=Message)
 
 
 class Orders:
@@ -71,11 +68,12 @@ class Orders:
         places  as commands have them: "46.81,9.84", "xy:X,Y" or "cell:ROW,COL"
         then    after the last: "hold" there, "chase" targets again, or "repeat" from the first
         """
-        return self._operator.give(_checked(SendVehicle, vehicle=vehicle, places=list(places), then=then))[1]
+        order = checked(SendVehicle, {"vehicle": vehicle, "places": list(places), "then": then})
+        return self._operator.give(order)[1]
 
     def recall(self, vehicle: str) -> Acknowledged:
         """Returns it to the chase of targets."""
-        return self._operator.give(_checked(SendVehicle, vehicle=vehicle, off=True))[1]
+        return self._operator.give(checked(SendVehicle, {"vehicle": vehicle, "off": True}))[1]
 
     def goals(self) -> list[VehicleGoals]:
         """The places to which vehicles were sent."""
@@ -121,18 +119,17 @@ class Orders:
         for_s         the zone ends by itself; None: never
         vehicle_class  for vehicles of this class only; None: for all
         """
-        zones, acknowledged = self._operator.zone(
-            _checked(
-                ZoneOrder, action="add", name=name, kind="lethal" if pace_s_per_m is None else "pace",
-                pace_s_per_m=pace_s_per_m, polygon_m=[*map(list, polygon_m)],
-                lasts_s=for_s, vehicle_class=vehicle_class,
-            )
-        )  # fmt: skip
+        fields = {
+            "action": "add", "name": name, "kind": "lethal" if pace_s_per_m is None else "pace",
+            "pace_s_per_m": pace_s_per_m, "polygon_m": [*map(list, polygon_m)],
+            "lasts_s": for_s, "vehicle_class": vehicle_class,
+        }  # fmt: skip
+        zones, acknowledged = self._operator.zone(checked(ZoneOrder, fields))
         return zones.changed, acknowledged
 
     def remove_zone(self, name: str) -> Acknowledged:
         """Opens an area again."""
-        return self._operator.zone(_checked(ZoneOrder, action="remove", name=name))[1]
+        return self._operator.zone(checked(ZoneOrder, {"action": "remove", "name": name}))[1]
 
     def zones(self) -> list[Zone]:
         """The zones that stand."""
@@ -143,15 +140,7 @@ class Orders:
         return list(self._operator.orders().orders)
 
     def _give(self, **fields: Any) -> Acknowledged:
-        return self._operator.give(_checked(GiveOrder, **fields))[1]
-
-
-def _checked(message_type: type[M], /, **fields: Any) -> M:
-    given = {name: value for name, value in fields.items() if value is not None}
-    try:
-        return msgspec.convert({**given, "schema": schema_of_type(message_type)}, message_type)
-    except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"the order is not possible: {field_fault(error, given)}") from None
+        return self._operator.give(checked(GiveOrder, fields))[1]
 
 
 _ASK_S = 1.0

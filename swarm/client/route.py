@@ -28,7 +28,7 @@ class Route:
     turns          indices of the cells in which a pulled route turns, first and last included: it is straight from
                    one to the next. Empty: from cell to cell
     cost_s         seconds that it takes
-    lower_bound_s  proven: no route is quicker on the planner's present map
+    lower_bound_s  no route is quicker, on the planner's present map; proven
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
     pose_age_s     age of the target's pose when the planner replied; None if it does not state it
     tracker_lost   no tracker publishes the target now: this is its last known position

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind
-from swarm.files import writing
+from swarm.files import make_folder
 from swarm.journal import Journal
 
 HEARTBEAT_NS = NS_PER_S // 5
@@ -69,8 +69,7 @@ class GenerationFile(MemoryGenerations):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        with writing(path):
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_folder(path.parent, 0o700)
         self._journal = Journal(
             path,
             FileKind.GENERATIONS,

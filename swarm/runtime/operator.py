@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import msgspec
 from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
@@ -35,6 +37,7 @@ from swarm.wire.messages.orders import (
 )
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, SEND_VEHICLE, ZONES, Topic
+from swarm.wire.versions import schema_of_type
 
 _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
@@ -58,6 +61,21 @@ _MOST_SEEN = 1 << 12
 
 AnyOrder = GiveOrder | SendVehicle | ZoneOrder
 M = TypeVar("M", Zones, Orders, Goals)
+Given = TypeVar("Given", GiveOrder, SendVehicle, ZoneOrder)
+
+
+def checked(kind: type[Given], fields: Mapping[str, Any]) -> Given:
+    """The order of these fields; those which are None are left out. Raises ConfigError."""
+    from swarm.config.explain import explain
+
+    given = {name: value for name, value in fields.items() if value is not None}
+    try:
+        return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
+    except (msgspec.ValidationError, ValueError) as error:
+        said = str(error)
+        ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
+        said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)
+        raise ConfigError(f"the order is not possible: {said}") from None
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class Route(Bounded, frozen=True, kw_only=True):
     status is OK.
 
     cost_s         travel time of the whole route, as driven from middle to middle of neighbouring cells
-    lower_bound_s  proven: no route from cell to neighbouring cell is quicker on the map as the tree knows it
+    lower_bound_s  no route from cell to neighbouring cell is quicker, on the map as the tree knows it; proven
     length_m       length of the way given
     remaining_s    cost-to-go after it, 0 at the target
     legs           of each straight segment of a pulled route, over how many of the steps it goes, from

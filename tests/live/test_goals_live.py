@@ -97,7 +97,7 @@ def test_twenty_vehicles_get_to_twenty_places_though_their_agent_and_the_planner
             "order", "vehicle", "send", ids[0], cell(goals[ids[0]]), "--connect", fleet.endpoint,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-        assert "1 processes obey" in done.stdout
+        assert "obeyed by 1 process," in done.stdout
         for id in ids[1:]:
             assert orders.send(id, [cell(goals[id])]).silent == []
         for name in ("agent-a0", "places-all"):

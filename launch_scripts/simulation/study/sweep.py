@@ -26,7 +26,7 @@ from launch_scripts.simulation.study.summary import Summary, name_of, summarise
 from launch_scripts.simulation.trials import Result, Trial, run_trial
 from swarm.config.write import scenario_text
 from swarm.errors import BusError, StoreError
-from swarm.files import check_writable, write_file, writing
+from swarm.files import check_writable, make_folder, write_file, writing
 from swarm.journal import digest_of
 
 FIGURE = "figure."
@@ -224,8 +224,7 @@ class Sweep:
     def finish(self) -> Summary:
         """Writes the results, scenarios and summary. Raises StoreError."""
         cases, folder = [], self.folder / SCENARIOS
-        with writing(folder):
-            folder.mkdir(exist_ok=True)
+        make_folder(folder)
         for number, case in enumerate(self.cases):
             if case.given is not None and case.settings:  # no file says yet what it is
                 path = folder / f"{number}-{re.sub('[^A-Za-z0-9_.]+', '-', case.label)[:60]}.toml"

@@ -142,7 +142,7 @@ def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so(
     command += ["simulate", "jacksboro", "--seconds", "1", "--trace", "/dev/full", "--runs", str(tmp_path)]
     told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert told.returncode == 6, told.stderr
-    assert "of 100 vehicles routed, no capture, no collision. Not all went well" in told.stdout
+    assert "of 100 vehicles routed, no captures, no collisions. Not all went well" in told.stdout
     assert "times real time" in told.stdout
     assert told.stderr.splitlines()[-1] == "swarm: the event log /dev/full has no end: No space left on device"
     assert "Traceback" not in told.stderr

@@ -55,7 +55,7 @@ def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path, swarm: S
     assert json.loads(out.read_text())["classes"] == ["walker", "truck"]
     assert [each["tile"] for each in listed(out)] == [0, GRID.tile_for(0, 2)]
     _, pixels, _ = swarm("marks export", store, tmp_path / "map.tif")
-    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in " ".join(pixels.split())
+    assert "2 marks in 1 set; without 1 mark for one class alone, which .json has" in " ".join(pixels.split())
 
 
 def test_a_geotiff_says_where_and_what(tmp_path: Path, swarm: Swarm) -> None:
@@ -88,7 +88,7 @@ def test_what_is_learned_counts_as_no_mark(tmp_path: Path, swarm: Swarm) -> None
     assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
     assert found["authors_that_learned"] == ["all.a1.1"]
     told = swarm("marks export", store, tmp_path / "marks.json")[1]
-    assert told.endswith("3 marks in 3 sets, and what 1 authors have learned\n")
+    assert told.endswith("3 marks in 3 sets, and learned factors of 1 author\n")
 
 
 def test_what_is_learned_is_exported_and_shown(tmp_path: Path, swarm: Swarm) -> None:

@@ -13,26 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from launch_scripts.check.scenario_check import network
-from launch_scripts.monitor.movers_view import (
-    OVER_S,
-    alarm_marks,
-    searched_points,
-    target_labels,
-)
+from launch_scripts.monitor.movers_view import OVER_S, alarm_marks, searched_points, target_labels
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
-from launch_scripts.monitor.styles import (
-    HUES,
-    LOST_COLOUR,
-    Looks,
-)
+from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.vehicles_view import (
-    RouteLines,
-    RouteNow,
-    Trails,
-    cells_at,
-    vehicle_details,
-)
+from launch_scripts.monitor.vehicles_view import RouteLines, RouteNow, Trails, cells_at, vehicle_details
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of

@@ -85,7 +85,7 @@ def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
         "re-plans",
         "certified gap",
         "captures",
-        "processes 57 of 58",
+        "needed processes 57 of 58",
     )
     for columns, lines, last in ((80, 24, "more"), (160, 50, "convoy-19")):
         console = Console(file=io.StringIO(), width=columns, height=lines)

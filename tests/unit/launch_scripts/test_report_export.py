@@ -181,7 +181,7 @@ def test_nothing_is_replaced_unless_asked(run: Path, tmp_path: Path, swarm: Swar
     (path,) = (tmp_path / "new").iterdir()
     path.write_text("mine")
     code, _, told = swarm(*words)
-    assert (code, f"{path} is there already; --force replaces it" in told) == (2, True)
+    assert (code, f"{path}: the file exists; --force replaces it" in told) == (2, True)
     assert path.read_text() == "mine"
     assert swarm(*words, "--force")[0] == 0
     assert path.read_text() != "mine"

@@ -17,13 +17,7 @@ from support import slow_twins as naive
 from support.command import Swarm
 from support.height_models import written
 
-from launch_scripts.commands.terrain_routes import (
-    DescribedRoute,
-    corridor,
-    find_route,
-    metres_along,
-    write_route,
-)
+from launch_scripts.commands.terrain_routes import DescribedRoute, corridor, find_route, metres_along, write_route
 from launch_scripts.launcher.run_options import find_scenario
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones
@@ -47,7 +41,7 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
-    route = find_route(str(hill), "cell:10,5", "cell:10,75")
+    route = find_route(find_scenario(str(hill)), "cell:10,5", "cell:10,75")
     assert (route.cells // route.grid.cols).max() >= 50
     assert route.gap == pytest.approx(1, abs=1e-3)
     assert route.at_s[-1] == pytest.approx(route.cost_s, rel=1e-4)
@@ -78,7 +72,7 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
 
 
 def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Path, tmp_path: Path) -> None:
-    found = find_route(str(hill), "cell:10,5", "cell:50,75")
+    found = find_route(find_scenario(str(hill)), "cell:10,5", "cell:50,75")
     for ending in ("plan", "waypoints", "gpx", "gpkg"):
         write_route(found, tmp_path / f"way.{ending}")
     items = json.loads((tmp_path / "way.plan").read_text())["mission"]["items"]
@@ -100,7 +94,7 @@ def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Pa
         names = database.execute("SELECT srs_name FROM gpkg_spatial_ref_sys").fetchall()
         told = str(database.execute("SELECT description FROM gpkg_contents").fetchall())
     assert "seconds of travel" in told
-    assert "lower_bound_s: proven" in told
+    assert "lower_bound_s: no route takes less" in told
     assert ("unknown",) not in names
 
 
@@ -108,12 +102,13 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path, swarm: Swarm) -> None:
     with pytest.raises(
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
-        find_route(str(hill), "cell:10,35", "cell:10,75")
+        find_route(find_scenario(str(hill)), "cell:10,35", "cell:10,75")
     for start, end, option in (("cell:10,35", "cell:10,75", "--from"), ("cell:10,75", "cell:10,35", "--to")):
         with pytest.raises(SwarmError, match=f"{option} is on lethal ground") as told:
-            find_route(str(hill), start, end)
+            find_route(find_scenario(str(hill)), start, end)
         nearest = str(told.value).split("reached is ")[1].split()[0]
-        assert find_route(str(hill), *((nearest, end) if option == "--from" else (start, nearest))).cost_s > 0
+        ends = (nearest, end) if option == "--from" else (start, nearest)
+        assert find_route(find_scenario(str(hill)), *ends).cost_s > 0
     assert "give --from and --to" in swarm("route --from cell:1,1 --terrain", hill)[2]
     assert "give --from, and --target or --to" in swarm("route --from cell:1,1")[2]
 
@@ -127,7 +122,10 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
         assert (file.crs.to_string(), file.nodata, file.shape, file.units) == (SYSTEM, -1.0, (60, 80), ("s",))
-    assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
+    best = find_route(find_scenario(str(hill)), "cell:10,5", "cell:10,75")
+    assert seconds[10, 5] == pytest.approx(best.cost_s, rel=1e-5)
+    assert "the file exists; --force replaces it" in swarm(f"{line}/s.tif")[2]
+    assert swarm(f"{line}/s.tif --force")[0] == 0
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0
     swarm(f"{line}/a.geojson --every-s 60 --json")
@@ -135,15 +133,15 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(
     assert max(each["properties"]["to_s"] for each in features) >= seconds.max()
     lon, lat = features[0]["geometry"]["coordinates"][0][0]
     assert (lat, lon) == pytest.approx((46.95, 9.0), abs=0.05)
-    assert "areas, at most 200" in swarm(f"{line}/a.geojson --every-s 0.001")[2]
+    assert "areas, at most 200" in swarm(f"{line}/a.geojson --force --every-s 0.001")[2]
     assert "--to is on lethal ground" in swarm(f"terrain reach {hill} --to cell:10,35")[2]
 
 
 def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
     """Against all cheapest ways there and on, by their slow twin. Ways from a cell are ways to it turned round, on
     which a step has the pace of the cell that it leaves."""
-    best = find_route(str(hill), "cell:20,5", "cell:30,75")
-    found = corridor(str(hill), "cell:20,5", "cell:30,75", 0.1)
+    best = find_route(find_scenario(str(hill)), "cell:20,5", "cell:30,75")
+    found = corridor(find_scenario(str(hill)), "cell:20,5", "cell:30,75", 0.1)
     pace = build_terrain(find_scenario(str(hill))).pace_s_per_m
     there, on = naive.cost_to_go(pace, ALPS.cell(20, 5), left_share=1.0), naive.cost_to_go(pace, ALPS.cell(30, 75))
     truth = 20.0 * (there + on)
@@ -155,7 +153,7 @@ def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path:
     assert inside.sum() >= 0.95 * (truth <= best.cost_s * 1.1).sum() > 300
     line = f"terrain reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --out {tmp_path}/c.geojson"
     for more, fewest, most in ("", 3, 6), (" --every-s 5", 3, 99):
-        assert f"the best takes {best.cost_s:.0f} s" in swarm(line + more)[1]
+        assert f"the best takes {best.cost_s:.0f} s" in swarm(f"{line} --force {more}")[1]
         features = json.loads((tmp_path / "c.geojson").read_text())["features"]
         bands = {each["properties"]["from_s"] for each in features}
         assert min(bands) == 0
@@ -165,7 +163,7 @@ def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path:
             assert turned(border) > 0
             assert all(turned(hole) < 0 for hole in holes)
     with pytest.raises(SwarmError, match="--from is on lethal ground, cell:10,35"):
-        corridor(str(hill), "cell:10,35", "cell:30,75", 0.1)
+        corridor(find_scenario(str(hill)), "cell:10,35", "cell:30,75", 0.1)
 
 
 def turned(ring: list[list[float]]) -> float:

@@ -31,7 +31,7 @@ from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Heartbeat, Note, Stats
-from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import Fleet, Followed, Obstacle, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -107,6 +107,11 @@ def status(target: str, gap_max: float | None, following: int = 1) -> PlannerSta
     return planner_status(target, stamp_ns=0, following=following, **gaps)
 
 
+def test_an_external_vehicle_is_named_until_its_lease_ends(recorder: Recorder) -> None:
+    hear(recorder, Obstacle(id="rover", incarnation=1, seq=1, x_m=0.0, y_m=0.0, radius_m=1.0, lease_s=2.0))
+    assert [recorder.summary(int(at_s * NS_PER_S)).external for at_s in (1.9, 2.1)] == [("rover",), ()]
+
+
 def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
     report = recorder.report()
     for name in ("seconds", "captures", "collisions", "lethal_entries", "stranded", "lost", "marks", "startup_s"):
@@ -170,11 +175,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observe = "launch_scripts.observe"
-    for limit in (
-        "latest_messages._MOST_NAMES",
-        "latest_messages._MOST_SETS",
-        "summed_counts._MOST_GENERATIONS",
-    ):
+    for limit in ("latest_messages._MOST_NAMES", "latest_messages._MOST_SETS", "summed_counts._MOST_GENERATIONS"):
         monkeypatch.setattr(f"{observe}.{limit}", 10)
     latest = LatestState(plan_of(scenario(), 0), GRID)
 
@@ -211,12 +212,7 @@ def test_tokens_of_strangers_that_have_fallen_take_no_place(monkeypatch: pytest.
 
 
 def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
-    hear(
-        recorder,
-        stats("planner", "t0", gap_excess=[0.0, 0.0, 0.0, 0.04]),
-        status("t0", 1.2),
-        status("t0", 1.05),
-    )
+    hear(recorder, stats("planner", "t0", gap_excess=[0.0, 0.0, 0.0, 0.04]), status("t0", 1.2), status("t0", 1.05))
     gap = recorder.report()["gap"]
     assert gap["mean"] == pytest.approx(1.01, abs=0.001)
     assert gap["p95"] == pytest.approx(1.04, abs=0.002)

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain_commands import app
 from launch_scripts.commands.terrain_routes import find_route
+from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report import terrain_figure
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.load import load_scenario
@@ -131,7 +132,8 @@ def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_th
     assert (facts["slope_rule"], facts["preset"]) == ("tobler", "hiker")
     there = ("reach", file, "--to", "cell:10,10")
     assert told(*there, "--preset", "hiker")["longest_s"] > 8 * told(*there)["longest_s"]
-    on_foot, driven = (find_route(str(file), "cell:1,1", "cell:10,15", preset).cost_s for preset in ("hiker", None))
+    scenarios = (find_scenario(str(file), preset) for preset in ("hiker", None))
+    on_foot, driven = (find_route(each, "cell:1,1", "cell:10,15").cost_s for each in scenarios)
     assert on_foot > 8 * driven
     with pytest.raises(ConfigError, match=r"no preset 'hikr'; did you mean 'hiker'\?; there are hiker, wheeled"):
         told("info", file, "--preset", "hikr")

@@ -11,11 +11,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from typer import BadParameter
 from typer._completion_classes import BashComplete  # what a shell asks: there is no public name for it
 
 from launch_scripts import cli
 from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
+from launch_scripts.commands.shared_options import duration
 from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
 
@@ -35,6 +37,14 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tu
 
 
 EVERY = list(commands())
+
+
+def test_a_duration_is_a_number_of_seconds_or_has_a_unit() -> None:
+    parse = duration(least_s=0.1).parser
+    assert [parse(text) for text in ("90", "90s", "1.5 min", "2m", "2h", "1d")] == [90, 90, 90, 120, 7200, 86400]
+    for text in ("", "5minutes", "0", "nan", "inf", "s", "1e99d"):
+        with pytest.raises(BadParameter, match="such as 90, 90s, 10min"):
+            parse(text)
 
 
 def test_every_command_completes_its_options_and_its_sub_commands() -> None:

@@ -98,6 +98,16 @@ def lethal_alarms(swarm: Swarm) -> list[int | None]:
     return [each.over_ns for each in alarms if each.kind == "target-lethal"][:1]
 
 
+def test_a_target_whose_tracker_never_came_is_an_alarm_until_one_comes() -> None:
+    swarm = Swarm()
+    swarm.run(11.0)
+    alarms = swarm.planners["t"]._member.alarms
+    assert [(each.kind, each.over_ns) for each in alarms.current()] == [("no-tracker", None)]
+    swarm.cells["t"] = GRID.cell(10, 10)
+    swarm.run(0.3)
+    assert [each.kind for each in alarms.current() if each.over_ns is None] == []
+
+
 def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None:
     pace = flat()
     pace[:, 25] = np.inf

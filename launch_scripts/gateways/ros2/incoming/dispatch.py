@@ -16,6 +16,7 @@ from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_n
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
 from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, VEHICLE_GOAL, ZONE
+from launch_scripts.plain_text import number_of
 from swarm.client import Swarm
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
@@ -256,7 +257,7 @@ class Incoming:
             def give() -> None:
                 told = orders.resume() if resumes else orders.pause()
                 silent = f", no reply from: {', '.join(told.silent)}" if told.silent else ""
-                respond(True, f"{len(told.obeyed)} processes obey{silent}")
+                respond(True, f"obeyed by {number_of(len(told.obeyed), 'process')}{silent}")
 
             if not self._orders.give(name, give, lambda why: respond(False, why)):
                 respond(False, "too many orders wait already")
