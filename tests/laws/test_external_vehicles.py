@@ -170,7 +170,11 @@ RULES: list[rules.Broken] = [
 
 FIRST = {
     "a_robot_that_is_replaced_says_that_it_has_ended": 3,
-    "a_cell_that_was_shut_for_a_external_is_anybodys": 3,
+    "a_robot_drives_on_though_it_is_replaced": 11,
+    "a_cell_that_was_shut_for_a_external_is_anybodys": 1,
+    "forgets_those_before_in_earlier_generations": 29,
+    "forgets_where_bodies_are": 3,
+    "says_of_each_generation_before_that_it_has_ended": 1,
 }
 """Histories tried before the others, because they collided last: rare faults are found soon."""
 

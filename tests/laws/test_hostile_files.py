@@ -192,7 +192,7 @@ def test_a_terrain_that_explodes_is_refused_in_a_sentence(
 
 def test_a_member_that_nobody_asked_for_is_not_unpacked(tmp_path: Path, run: Run) -> None:
     small = npy((8, 8), body=bytes(256))
-    path = archive(tmp_path / "a.npz", elevation=small, x=500)
+    path = archive(tmp_path / "a.npz", elevation=small, x=300)
     code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)
     assert code == 0, said
     assert peak_mb < MOST_MB

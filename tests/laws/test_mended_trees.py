@@ -1,4 +1,5 @@
-"""A tree made exact through its parents equals the one grown from scratch, whatever was done to it before."""
+"""A tree made exact through its parents, or repaired after marks, equals the one grown from scratch on the new map:
+every cost, every parent, to the last bit."""
 
 from typing import Any
 from unittest import mock
@@ -11,16 +12,104 @@ from support import slow_twins as naive
 from support.effort import few
 from support.kernel_oracle import inner
 from support.planner_play import Play
-from support.planner_strategies import RULES, Job, Marks, Move, random_climb, random_pace
-from support.repaired_tree import FACTORS, Patchwork
+from support.planner_strategies import RULES, Job, Marks, Move, happenings, random_climb, random_pace
 
 from planner_service import target_tree
+from planner_service.kernels import repair as kernels
+from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
+from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
+
+FACTORS = (0.3, 0.7, 1.5, 3.0, np.inf, 0.0)
+"""Changes of the paces of a patch: times the factor; 0 draws them again, lethal ones too."""
+NO_LIMIT = 10**9
+"""Bound on cells, edges and steps of a repair."""
+
+
+class Patchwork:
+    """The tree is repaired or, where that gives way, grown. `mended` counts the repairs.
+
+    climb  of a map where uphill is not downhill
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, pace: Floats, rules: dict[str, Any], climb: Climb | None = None
+    ) -> None:
+        self.rng = rng
+        self.pace = pace
+        self.grid = GridSpec(*pace.shape, 1.0)
+        self.climb = climb
+        self.config = PlannerConfig(**rules)
+        self.costs = self._fresh()
+        self.tree = CostToGoTree(self.costs)
+        self.tree.grow(int(rng.choice(np.flatnonzero(np.isfinite(pace)))))
+        self.mended = 0
+
+    @property
+    def root(self) -> int:
+        return self.tree.root
+
+    def _fresh(self) -> CostGrid:
+        costs = CostGrid(self.grid, self.config, self.climb)
+        costs.load(self.pace)
+        return costs
+
+    def change(self, factor: float, side: int, near_root: bool = False) -> Window:
+        """Changes a square somewhere, or around the root. The root stays passable."""
+        rows, cols = self.grid.rows, self.grid.cols
+        row, col = int(self.rng.integers(rows)), int(self.rng.integers(cols))
+        if near_root:
+            row, col = (max(at - side // 2, 0) for at in self.grid.row_col(self.root))
+        window = Window(row, col, min(row + side, rows), min(col + side, cols))
+        patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
+        if factor == 0.0:
+            patch[:] = random_pace(self.rng, *patch.shape, 5.0, 0.3)
+        else:
+            patch *= np.float32(factor)
+        if not np.isfinite(self.pace.flat[self.root]):
+            self.pace.flat[self.root] = 1.0
+        return window
+
+    def mend(self, windows: list[Window]) -> None:
+        if self.tree.repair(self.costs.apply(self.pace, windows)) < 0:
+            self.tree.grow(self.root)
+        else:
+            self.mended += 1
+
+    def repair_at_any_price(self, changes: Changes, buckets: tuple[float, int] | None = None) -> int:
+        """Calls the kernel without a limit. Returns how many cells it took."""
+        labels, most = (self.tree.cost, self.tree.parent, self.costs.pad(self.root)), 3 * (NO_LIMIT,)
+        taken, highest = kernels.repair(*self._given(labels, changes), buckets or self.costs.buckets, most,
+                                        self.costs.repair_scratch)  # fmt: skip
+        self.tree.reach = max(self.tree.reach, float(highest))
+        return int(taken)
+
+    def _given(self, labels: tuple[Any, ...], changes: Changes) -> tuple[Any, ...]:
+        return self.costs.padded, self.costs.climbs, labels, changes.cells, changes.before
+
+    def check(self) -> None:
+        fresh = CostToGoTree(self._fresh())
+        fresh.grow(self.root)
+        np.testing.assert_array_equal(inner(self.tree, self.tree.cost), inner(fresh, fresh.cost))
+        np.testing.assert_array_equal(inner(self.tree, self.tree.parent), inner(fresh, fresh.parent))
+        assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
+
+    def check_lowered(self) -> int:
+        """A heuristic without parents that is lowered is the tree of the map that got cheaper. Returns how many
+        cells changed."""
+        changes = self.costs.apply(self.pace, [self.change(factor, 6) for factor in (0.5, 0.25, 0.9)])
+        heuristic = self.tree.cost.copy()
+        given = self._given((heuristic, np.empty(0, np.uint8), 0), changes)
+        done, _ = kernels.repair(*given, self.costs.buckets, (0, 0, NO_LIMIT), self.costs.repair_scratch)
+        self.tree.grow(self.root)
+        np.testing.assert_array_equal(inner(self.tree, heuristic), inner(self.tree, self.tree.cost))
+        return int(done)
+
 
 WAYS_TO_PRICE: tuple[dict[str, Any], ...] = (*RULES, {"length_weight": 0.5}, {"directional": True})
 SMALL = mock.patch.object(target_tree, "exact_half", lambda grid, old, new: max(1, grid.distance_cells(old, new)))
@@ -131,19 +220,7 @@ def test_a_tree_whose_costs_are_too_large_for_its_parents_to_be_trusted_is_not_m
         tree.mend()
 
 
-MANY = st.lists(
-    st.one_of(
-        st.builds(Move, st.integers(-1, 1), st.integers(-1, 1)),
-        st.builds(Move, st.integers(-9, 9), st.integers(-9, 9)),
-        st.builds(Marks, st.integers(0, 2**31), st.integers(1, 6)),
-        st.builds(Job, st.sampled_from(["begin", "end", "force"])),
-    ),
-    min_size=4,
-    max_size=14,
-)
-
-
-@given(st.integers(0, 2**32 - 1), st.sampled_from(WAYS_TO_PRICE), MANY)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(WAYS_TO_PRICE), happenings(14))
 @settings(max_examples=few(40), deadline=None)
 def test_under_exact_every_update_leaves_the_tree_that_would_have_grown(
     seed: int, priced: dict[str, Any], events: list[Move | Marks | Job]
@@ -168,3 +245,95 @@ def test_exact_moves_are_what_happens_on_a_walk() -> None:
         kinds.append(play.last.kind)
     play.check()
     assert kinds.count("exact") > 20, kinds
+
+
+def patchwork(rng: np.random.Generator, pace: Floats, n: int, directed: bool) -> Patchwork:
+    """A map by the nth rules, directed or not."""
+    grid = GridSpec(*pace.shape, 1.0)
+    climb = random_climb(rng, grid, (0.0, 0.1, 0.4)[n % 3], (0.3, 0.6)[n % 2]) if directed else None
+    return Patchwork(rng, pace, RULES[n % 5], climb)
+
+
+def trials(count: int, seed: int, shape: tuple[int, int], most_side: int, directed: bool = False) -> int:
+    """Number of changes, on maps of all kinds, that were repaired without a fallback."""
+    mended = 0
+    for n in range(0, count, 12):
+        rng = np.random.default_rng([seed, n])
+        ratio, walls = (1.0, 4.0, 30.0, 1000.0)[n // 12 % 4], (0.0, 0.15, 0.35)[n // 48 % 3]
+        work = patchwork(rng, random_pace(rng, *shape, ratio, walls), n // 12, directed)
+        for m in range(12):
+            # Every other time several patches at once, of different kinds and sizes.
+            parts = [FACTORS[(m + part) % 6] for part in range(1 if m % 2 else 3)]
+            windows = [
+                work.change(factor, int(rng.integers(1, most_side + 1)), bool(rng.random() < 0.2))
+                for factor in parts
+            ]
+            work.mend(windows)
+            work.check()
+        mended += work.mended
+    return mended
+
+
+@pytest.mark.parametrize(
+    ("count", "shape", "most_side", "directed"),
+    [
+        (180, (48, 53), 9, True),
+        (1200, (64, 61), 17, False),
+        pytest.param(2400, (48, 53), 9, False, marks=pytest.mark.thorough),
+    ],
+)
+def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(
+    count: int, shape: tuple[int, int], most_side: int, directed: bool
+) -> None:
+    assert trials(count, 1, shape, most_side, directed) > count // 3
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
+    rng = np.random.default_rng(3)
+    work = Patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), rules)
+    for factor in (2.0, 0.5):
+        work.pace *= np.float32(factor)
+        assert work.repair_at_any_price(work.costs.apply(work.pace, [work.grid.window])) > 1000
+        work.check()
+
+
+def test_a_wall_across_the_map_takes_the_way_from_all_behind_it_and_a_door_gives_it_back() -> None:
+    work = Patchwork(np.random.default_rng(1), np.ones((30, 30), np.float32), RULES[0])
+    work.tree.grow(work.grid.cell(2, 2))
+    work.pace[15] = np.inf
+    work.mend([Window(15, 0, 16, 30)])
+    work.check()
+    assert np.isinf(inner(work.tree, work.tree.cost)[16:]).all()
+    work.pace[15, 29] = 1.0
+    work.mend([Window(15, 29, 16, 30)])
+    work.check()
+    assert np.isfinite(inner(work.tree, work.tree.cost)[16:]).all()
+
+
+def test_a_repair_that_concerns_too_much_gives_way() -> None:
+    work = Patchwork(np.random.default_rng(1), np.ones((60, 60), np.float32), RULES[0])
+    work.pace[:] = 2.0
+    assert work.tree.repair(work.costs.apply(work.pace, [work.grid.window])) == -1
+    work.tree.grow(work.root)
+    work.pace[:] = 1.0
+    assert work.tree.repair(work.costs.apply(work.pace, [work.grid.window])) == -1
+
+
+@pytest.mark.parametrize("count", [4, 512])
+@pytest.mark.parametrize("width", [0.01, 1.0, 40.0])
+def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float, count: int) -> None:
+    rng = np.random.default_rng(5)
+    work = Patchwork(rng, random_pace(rng, 40, 45, 30.0, 0.2), RULES[0])
+    work.pace[10:30, 10:30] *= np.float32(3)
+    work.pace[20:25, 20:40] *= np.float32(0.5)
+    changes = work.costs.apply(work.pace, [Window(10, 10, 30, 40)])
+    assert work.repair_at_any_price(changes, (width, count)) > 0
+    work.check()
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(directed: bool) -> None:
+    rng = np.random.default_rng(6)
+    for n in range(60):
+        patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), n, directed).check_lowered()

@@ -1,13 +1,24 @@
-"""Many sets at once: the same map, digests and counts as one by one, and as the two rules taken by hand."""
+"""The merge law: marks come to the same map, digests and counts in any order, grouping and repetition, which is the
+map of the two rules taken by hand."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, Composite, held_winners, mark_sets, merge_one, naive_winners, set_of
+from support.map_strategies import (
+    GRID,
+    Composite,
+    held_winners,
+    mark_sets,
+    merge_one,
+    naive_winners,
+    replica_of,
+    set_of,
+)
 
 from shared_map.replication import merge as merge_module
 from shared_map.replication.author_limits import Capacity
+from shared_map.replication.digest import fingerprint
 from shared_map.replication.marks import Statements, mark_set, packed, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
@@ -39,11 +50,6 @@ def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(merge_module, "_FEW", request.param)
 
 
-def replica() -> tuple[MapReplica, Composite]:
-    composite = Composite()
-    return MapReplica(GRID, composite), composite
-
-
 def assert_equal_now_and_later(
     together: MapReplica, many: Composite, singly: MapReplica, single: Composite
 ) -> None:
@@ -65,8 +71,8 @@ def assert_equal_now_and_later(
 def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
     sets: list[MarkSet], data: st.DataObject
 ) -> None:
-    singly, single = replica()
-    together, many = replica()
+    singly, single = replica_of([])
+    together, many = replica_of([])
     singly.tick(3)
     together.tick(3)
     for each in sets:
@@ -80,40 +86,45 @@ def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
     assert_equal_now_and_later(together, many, singly, single)
 
 
-@given(st.lists(mark_sets(), max_size=30))
-def test_many_at_once_stand_at_the_winners_of_the_two_rules(sets: list[MarkSet]) -> None:
-    together, _ = replica()
-    together.merge(sets)
-    assert held_winners(together) == naive_winners(sets)
-
-
-@given(st.lists(mark_sets(), max_size=12), st.lists(mark_sets(), max_size=12))
-def test_what_is_returned_is_what_was_news_and_how_many_cells_it_changed(
-    before: list[MarkSet], sets: list[MarkSet]
-) -> None:
-    newest = {(each.tile, each.author): each for each in sets}
-    some = [
-        each for n, each in enumerate(newest.values()) if all(e.tile != each.tile for e in [*newest.values()][:n])
-    ]
-    singly, _ = replica()
-    together, _ = replica()
-    for each in before:
-        singly.merge([each])
-        together.merge([each])
-    expected = {each.tile: changed for each in some if (changed := merge_one(singly, each)) is not None}
-    merged = together.merge(some)
-    found = {each.tile: changed for each, changed in zip(merged.sets, merged.changed, strict=True)}
-    assert len(merged.sets) == len(found)
-    assert found == {tile: len(changed) for tile, changed in expected.items()}
-    assert together.counts == singly.counts
-
-
 def test_an_author_whose_set_was_replaced_reasserts_it_among_many_too() -> None:
     own = MapReplica(GRID, Composite(), author="a1.1")
     own.write([5], [LETHAL], [0], 100)
     own.merge([set_of("a1.1", 0, 9, {}, epoch=4), set_of("b", 1, 0, {3: (LETHAL, 0, 1)})])
     assert [(each.author, each.epoch) for each in own.held.of_tile(0)] == [("a1.1", 5)]
     assert held_winners(own) == {(0, 5): (LETHAL, 0.0), (1, 3): (LETHAL, 0.0)}
+
+
+@given(st.lists(mark_sets(), max_size=15))
+def test_the_cost_map_always_stands_at_the_winners(sets: list[MarkSet]) -> None:
+    replica, composite = replica_of(sets)
+    winners = naive_winners(sets)
+    assert held_winners(replica) == winners
+    for tile in range(GRID.tiles):
+        window = GRID.tile_window(tile)
+        for row in range(window.row0, window.row1):
+            for col in range(window.col0, window.col1):
+                inner = (row - window.row0) * 32 + col - window.col0
+                expected = winners.get((tile, inner), (MarkKind.CLEAR, 0.0))
+                cell = GRID.cell(row, col)
+                assert (composite.kinds[cell], composite.paces[cell]) == expected
+
+
+@given(st.lists(mark_sets(), max_size=15), st.lists(st.booleans(), min_size=15, max_size=15))
+def test_what_was_lost_is_fetched_after_comparing_digests(sets: list[MarkSet], lost: list[bool]) -> None:
+    whole, composite = replica_of(sets)
+    partial, partial_composite = replica_of([each for each, gone in zip(sets, lost, strict=False) if not gone])
+    asked = partial.missing(whole.held.ledger.held())
+    for author, tiles in asked:
+        for each in whole.held.answer(MarksRequest(authors=[author], tiles=tiles)):
+            assert partial.merge([each]).sets == [each], "only what differs is fetched"
+        theirs = list(whole.held.asked(MarksRequest(), author))
+        assert [each for each in theirs if each] == whole.held.answer(MarksRequest(authors=[author]))
+        assert theirs.count(None) == len(theirs) / 2, "only tiles of the author are looked at"
+    assert partial.missing(whole.held.ledger.held()) == []
+    assert fingerprint(partial.held.ledger.held()) == fingerprint(whole.held.ledger.held())
+    # Sets that differ under one number are damage, which digests do not show.
+    if len({(s.author, s.tile, s.epoch, s.seq) for s in sets}) == len(sets):
+        assert composite.same(partial_composite)
 
 
 # --- many in one message ------------------------------------------------------------------------------------
@@ -175,7 +186,7 @@ def test_beyond_its_share_an_author_is_refused_and_the_others_are_not() -> None:
 
 
 def test_what_has_no_room_is_not_asked_for_again() -> None:
-    whole, _ = replica()
+    whole, _ = replica_of([])
     whole.merge([set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
     bounded = MapReplica(GRID, capacity=Capacity(max_sets=8))
     for each in whole.held.answer(MarksRequest()):
@@ -197,8 +208,8 @@ def test_messages_of_many_sets_merge_as_these_one_by_one(
     sets: list[MarkSet], cut: int, data: st.DataObject
 ) -> None:
     """Also after other sets and tombstones were heard, in any order of the messages."""
-    singly, single = replica()
-    together, many = replica()
+    singly, single = replica_of([])
+    together, many = replica_of([])
     singly.tick(3)
     together.tick(3)
     for each in sets[:cut]:

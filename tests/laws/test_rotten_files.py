@@ -181,7 +181,7 @@ def tally(kind: Kind, folder: Path, count: int) -> Counter[str]:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_no_change_of_a_file_goes_unnoticed(tmp_path: Path, name: str) -> None:
-    found = tally(KINDS[name], tmp_path, few(800))
+    found = tally(KINDS[name], tmp_path, few(500))
     assert not [each for each in found if not each.endswith((": refused", ": as it was"))], found
     assert {"flip: refused", "zeros: refused", "cut: refused", "older: refused"} <= found.keys()
     assert "older: as it was" not in found

@@ -15,7 +15,7 @@ from planner_service.search.growth_from_vehicle import Ways
 from planner_service.search.search_places import IDLE_S, Searcher
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.step_climb import climb_of
+from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
@@ -34,6 +34,27 @@ def _pace(rows: int, cols: int, seed: int) -> NDArray[np.float32]:
     pace[chance.random((rows, cols)) < chance.choice([0.0, 0.2, 0.5])] = np.inf
     pace[chance.integers(rows), chance.integers(cols)] = 0.3
     return pace
+
+
+def costs_of(pace: NDArray[np.float32], climb: Climb | None = None) -> CostGrid:
+    costs = CostGrid(GridSpec(*pace.shape, METRES), PlannerConfig(), climb)
+    costs.load(pace)
+    return costs
+
+
+def begun(
+    pace: NDArray[np.float32],
+    costs: CostGrid,
+    sense_range_m: float,
+    last: int | None = None,
+    age_s: float = 0.0,
+    seed: object = "s",
+) -> tuple[Searcher, Ways]:
+    """A search for a target which was last seen somewhere, or never."""
+    ways = Ways(costs)
+    searcher = Searcher(ways, sense_range_m, 3.0, f"{seed}")
+    searcher.begin(pace, last, age_s)
+    return searcher, ways
 
 
 @settings(max_examples=few(80), deadline=None)
@@ -62,17 +83,13 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
     rows: int, cols: int, seed: int, known: bool, places: list[tuple[float, float]]
 ) -> None:
     pace = _pace(rows, cols, seed)
-    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
-    costs.load(pace)
-    chance = np.random.default_rng(seed)
+    costs, chance = costs_of(pace), np.random.default_rng(seed)
     open_ = np.flatnonzero(np.isfinite(pace))
     last = int(chance.choice(open_)) if known else None
     asked = [int(cell) for cell in chance.integers(-2, rows * cols + 2, 5)]
     told = []
     for _ in range(2):
-        ways = Ways(costs)
-        searcher = Searcher(ways, 30.0, 3.0, f"{seed}")
-        searcher.begin(pace, last, 60.0)
+        searcher, ways = begun(pace, costs, 30.0, last, 60.0, seed)
         searcher.tick(40.0, places)
         routes = [searcher.route(ways, f"v{n}", cell, 0, 0)[0] for n, cell in enumerate(asked)]
         told.append((routes, dict(searcher.goals)))
@@ -98,12 +115,7 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
 def searching_flat_ground(side: int) -> tuple[Searcher, Ways]:
     """A search for a target which no vehicle has ever seen, with sensors of 50 m."""
     pace = np.full((side, side), 0.2, np.float32)
-    costs = CostGrid(GridSpec(side, side, METRES), PlannerConfig())
-    costs.load(pace)
-    ways = Ways(costs)
-    searcher = Searcher(ways, 50.0, 2.0, "s")
-    searcher.begin(pace, None, 0.0)
-    return searcher, ways
+    return begun(pace, costs_of(pace), 50.0)
 
 
 def test_vehicles_look_at_places_apart_from_each_other() -> None:
@@ -128,14 +140,9 @@ def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_
 
 def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_looked() -> None:
     pace = np.full((100, 100), 0.2, np.float32)
-    grid = GridSpec(100, 100, METRES)
-    costs = CostGrid(grid, PlannerConfig())
-    costs.load(pace)
-    ways = Ways(costs)
-    searcher = Searcher(ways, 100.0, 4.0, "s")
-    searcher.begin(pace, 5050, 60.0)
+    searcher, ways = begun(pace, costs_of(pace), 100.0, 5050, 60.0)
     route = searcher.route(ways, "v", 0, 0, 0)[0]
-    path = walk(grid, route.start, route.directions)
+    path = walk(GridSpec(100, 100, METRES), route.start, route.directions)
     rest = searcher.route(ways, "v", path[3], 0, 0)[0]
     assert rest.directions == route.directions[3:]
     goal = searcher.goals["v"]
@@ -154,13 +161,9 @@ def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
     rows: int, cols: int, seed: int, range_m: float, most_blocks: int
 ) -> None:
     pace = _pace(rows, cols, seed)
-    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
-    costs.load(pace)
-    ways = Ways(costs)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("planner_service.search.belief.MOST_BLOCKS", most_blocks)
-        searcher = Searcher(ways, range_m, 3.0, f"{seed}")
-        searcher.begin(pace, None, 0.0)
+        searcher, ways = begun(pace, costs_of(pace), range_m, seed=seed)
     blocks = searcher.belief.blocks
     for n, cell in enumerate(np.random.default_rng(seed).choice(np.flatnonzero(np.isfinite(pace)), 4).tolist()):
         searcher.tick(0.0, [])
@@ -179,13 +182,9 @@ def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
 
 
 def test_a_mark_in_the_middle_of_a_block_does_not_take_it_out_of_the_search() -> None:
-    grid = GridSpec(15, 30, METRES)
     pace = np.full((15, 30), 0.2, np.float32)
-    costs = CostGrid(grid, PlannerConfig())
-    costs.load(pace)
-    ways = Ways(costs)
-    searcher = Searcher(ways, 150.0, 3.0, "s")  # two blocks
-    searcher.begin(pace, None, 0.0)
+    costs = costs_of(pace)
+    searcher, ways = begun(pace, costs, 150.0)  # two blocks
     pace[7, 22] = np.inf
     costs.apply(pace, [Window(7, 22, 8, 23)])
     route = searcher.route(ways, "v", 7 * 30 + 7, 0, 1)[0]
@@ -196,11 +195,7 @@ def test_a_mark_in_the_middle_of_a_block_does_not_take_it_out_of_the_search() ->
 def test_a_place_at_which_nothing_is_believed_is_given_up_in_time() -> None:
     pace = np.full((20, 60), 0.2, np.float32)
     pace[:, 29] = np.inf  # the target is on the other side
-    costs = CostGrid(GridSpec(20, 60, METRES), PlannerConfig())
-    costs.load(pace)
-    ways = Ways(costs)
-    searcher = Searcher(ways, 50.0, 3.0, "s")
-    searcher.begin(pace, 10 * 60 + 45, 60.0)
+    searcher, ways = begun(pace, costs_of(pace), 50.0, 10 * 60 + 45, 60.0)
     assert searcher.route(ways, "v", 10 * 60 + 5, 0, 0)[0].status is RouteStatus.SEARCHING
     searcher.tick(IDLE_S / 2, [])
     assert not searcher.wants_place("v")
@@ -216,9 +211,7 @@ def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_
 ) -> None:
     pace = _pace(rows, cols, seed)
     pace[:, :: max(cols // 3, 1)] = 0.02  # roads
-    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
-    costs.load(pace)
-    chance = np.random.default_rng(seed)
+    costs, chance = costs_of(pace), np.random.default_rng(seed)
     start, goal = (int(each) for each in chance.choice(np.flatnonzero(np.isfinite(pace)), 2))
     tree = CostToGoTree(costs)
     tree.grow(goal)
@@ -227,8 +220,7 @@ def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_
     if goal == start or np.isinf(ways.costs_s.flat[start]):
         return
     took_s = 3.0 * float(inner(tree, tree.cost)[divmod(start, cols)])
-    searcher = Searcher(ways, range_m, 3.0, "s")
-    searcher.begin(pace, start, took_s * (1 + 1e-5))
+    searcher, _ = begun(pace, costs, range_m, start, took_s * (1 + 1e-5))
     assert searcher.belief.reachable[searcher.belief.blocks.of_cell(goal)]
 
 
@@ -239,12 +231,8 @@ def test_where_one_can_come_down_and_not_up_nobody_is_sent_to_where_he_stands(se
     heights[:, 15:] = 30.0  # a step that is too steep to climb, and not to come down
     grid = GridSpec(12, 30, METRES)
     climb = climb_of(grid, heights, CostConfig(directional=True, max_climb_deg=20.0, max_descent_deg=89.0))
-    costs = CostGrid(grid, PlannerConfig(), climb)
     pace = np.full((12, 30), 0.2, np.float32)
-    costs.load(pace)
-    ways = Ways(costs)
-    searcher = Searcher(ways, 20.0, 2.0, f"{seed}")
-    searcher.begin(pace, None, 0.0)
+    searcher, ways = begun(pace, costs_of(pace, climb), 20.0, seed=seed)
     for n in range(12):
         for _ in range(80):  # a vehicle that is told to ask again does so
             searcher.tick(0.1, [])

@@ -123,25 +123,6 @@ def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: di
         assert set(label[way]) <= {label[cells[a]], label[cells[b]]}
 
 
-def test_a_closed_wall_stays_closed_and_a_passage_of_one_cell_open_at_every_stride() -> None:
-    for gap in (None, 0, 37, 63):
-        pace = np.ones((64, 64), np.float32)
-        pace[:, 33] = np.inf
-        if gap is not None:
-            pace[gap, 33] = 50.0
-        ground = CostGrid(GridSpec(64, 64, 1.0), PlannerConfig())
-        ground.load(pace)
-        network = find_strides(ground)
-        centre, doublings, *_ = network.arrays
-        left = centre % ground.stride - 1 < 33
-        for level in (1, 2, 3):
-            same = [(a, b) for a, b, _ in _links(network) if doublings[a] == doublings[b] == level]
-            label = _components(centre.size, same)
-            nodes = doublings == level
-            connected = set(label[nodes & left]) == set(label[nodes & ~left])
-            assert connected == (gap is not None)
-
-
 @given(st.integers(0, 2**31), st.sampled_from(RULES))
 @settings(max_examples=20, deadline=None)
 def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict) -> None:

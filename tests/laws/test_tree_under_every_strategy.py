@@ -1,4 +1,8 @@
-"""The laws of the tree under everything that happens to it, for every strategy."""
+"""The laws of the tree under everything that happens to it, for every strategy, and where a growth is left to a
+worker: until it is adopted, answers are of the older tree, keep every law and say where they lead."""
+
+from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -18,12 +22,18 @@ from support.planner_strategies import (
     random_climb,
     random_pace,
 )
+from support.planner_swarm import GRID, Swarm, flat
 
-from planner_service.growth_times import block_half
+from planner_service import growth_times
+from planner_service.growth_times import WindowSchedule, block_half
 from planner_service.strategy import STAGES
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.route_columns import RouteStatus
+from swarm.wire.topics import ROUTE
 
 
 @st.composite
@@ -66,6 +76,31 @@ def test_after_a_jump_every_route_arrives(strategy: str, jump: int) -> None:
     for rows, cols in ((jump, 0), (0, jump), (-jump, -jump), (47, 47)):
         play.happen(Move(rows, cols))
         play.check()
+
+
+def one_way() -> Climb:
+    """A terrace: from column 20 on the ground lies 1 m lower, which may be driven down and not up."""
+    heights = np.zeros((30, 40), np.float32)
+    heights[:, 20:] = -1.0
+    climb = climb_of(GridSpec(30, 40, 1.0), heights, CostConfig(directional=True, max_slope_deg=60))
+    factors = climb.factors.copy()
+    factors[ENTRIES + 10 :] = np.inf
+    return replace(climb, factors=factors)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_who_has_a_way_only_to_where_the_target_is_now_gets_one(strategy: str) -> None:
+    """Down a terrace there is a way, up it none: when the target comes up, those below lose their ways; once it is
+    down again, all have one."""
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
+    play = Play(np.ones((30, 40), np.float32), config, climb=one_way())
+    kinds = []
+    for rows, cols in ((15, 16), *6 * ((0, 1),), *6 * ((0, -1),), (1, 1), (1, 1)):
+        play.happen(Move(rows, cols))
+        kinds.append(play.last.kind)
+        play.check()
+    assert strategy in ("full", "exact") or "full" in kinds[1:], kinds
+    assert strategy in ("full", "exact") or {"window", "coarse"} & {*kinds}, kinds
 
 
 def printed_half(grid: GridSpec, old: int, new: int) -> int:
@@ -142,3 +177,81 @@ def test_a_window_reaches_at_least_as_far_as_the_target_moved(a: int, b: int, c:
     window = grid.around(new, block_half(grid, old, new, k))
     assert window.contains(a, b)
     assert window.contains(c, d)
+
+
+LARGE = mock.patch.object(growth_times, "INLINE_NS", 100)
+"""Every map counts as too large: growing seven of its cells takes too long."""
+
+
+@given(paces(), planner_configs(), happenings())
+@settings(max_examples=few(200), deadline=None)
+def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
+    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
+) -> None:
+    with LARGE:
+        play = Play(pace, config, has_worker=True)
+        play.check()
+        for event in events:
+            play.happen(event)
+            play.check()
+        for _ in range(2):
+            play.happen(Job("begin"))
+            play.happen(Job("end"))
+        play.check()
+        if np.isfinite(play.pace.flat[play.target]):
+            assert play.tree.target_cell == play.target
+
+
+@LARGE
+def test_after_a_jump_the_older_tree_leads_where_it_led_and_follows_the_map() -> None:
+    pace = random_pace(np.random.default_rng(1), 40, 40, 5.0, 0.1)
+    play = Play(pace, PlannerConfig(k_min=0), has_worker=True, chosen_by=STAGES["rotate"])
+    assert play.last.wants_full
+    play.check()
+    play.happen(Job("begin"))
+    play.happen(Job("end"))
+    before = play.target
+    with mock.patch.object(play.tree._tree, "grow", side_effect=AssertionError("grown by the thread that answers")):
+        play.happen(Move(30, 30))
+        assert (play.tree.ready, play.tree.target_cell, play.last.wants_full) == (True, before, True)
+        play.happen(Job("begin"))
+        play.happen(Marks(3, 1))
+        play.check()
+        play.happen(Job("end"))
+    assert play.tree.target_cell == play.target != before
+    play.check()
+
+
+def test_a_query_waits_for_the_first_tree_but_not_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth_times, "INLINE_NS", 100)
+    swarm = Swarm(flat())
+    for growth_s, expected in ((0.4, RouteStatus.OK), (30.0, RouteStatus.NO_TARGET)):
+        monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(growth_s * 1e9 / GRID.cells))
+        swarm = Swarm(flat())
+        swarm.cells["t"] = GRID.cell(20, 30)
+        swarm.run(0.25)
+        assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0]), target="t") == []
+        swarm.run(1.3)
+        (reply,) = swarm.ear.replies
+        assert reply.routes[0].status is expected
+
+
+def test_while_a_worker_grows_after_a_jump_routes_say_where_they_lead_and_how_old_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(growth_times, "INLINE_NS", 100)
+    monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(0.4e9 / GRID.cells))
+    monkeypatch.setattr(WindowSchedule, "half", lambda *_: 40)
+    swarm = Swarm(flat(), "multi_resolution")
+    first, second = GRID.cell(20, 5), GRID.cell(20, 45)
+    swarm.cells["t"] = first
+    swarm.run(1.0)
+    assert swarm.ear.routes(0).target_cell == first
+    swarm.cells["t"] = second
+    swarm.run(0.3)
+    reply = swarm.ear.routes(0)
+    assert (reply.target_cell, reply.routes[0].status) == (first, RouteStatus.OK)
+    assert reply.tree_age_ms > 300
+    swarm.run(1.0)
+    reply = swarm.ear.routes(0)
+    assert (reply.target_cell, reply.routes[0].status) == (second, RouteStatus.OK)

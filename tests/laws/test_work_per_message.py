@@ -76,7 +76,7 @@ def swarm() -> Iterator[Measured]:
 def test_the_longest_message_of_each_topic_costs_no_service_much(topic: Topic, swarm: Measured) -> None:
     """Messages of trusted topics come from a process that has the run's secret."""
     sender = swarm.bus("sender", authenticator=swarm.authenticator)
-    for seed in range(few(5)):
+    for seed in range(few(3)):
         fuzzer = MessageFuzzer(swarm.terrain.grid, seed, NAMES_SENT, now_ns=lambda: swarm.now_ns)
         if topic.access.put:
             message = fuzzer.large(topic.message, topic.put_bytes)

@@ -1,4 +1,4 @@
-"""`bench swarm`: a small swarm of real processes is measured, and nothing is left however the bench ends."""
+"""`bench swarm` and `bench chaos`: swarms of real processes are measured and struck, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 from support.benchmarks import command
+from support.live_swarm import folders_of_runs, write_scenario
 
-pytestmark = pytest.mark.network
+from launch_scripts.launcher.takeover import processes
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
 SMALL = ("swarm", "--vehicles", "20", "--targets", "2")
 
 
@@ -47,3 +50,37 @@ def test_a_swarm_of_twenty_is_measured(temporary: Path) -> None:
     assert route["ratio_p50_us"] == pytest.approx(route["ours_p50_us"] / route["raw_p50_us"], rel=0.01)
     assert row["collisions"] == row["lethal_entries"] == row["exit_code"] == 0
     assert list(temporary.glob("swarm-bench-*")) == []
+
+
+def running(runs: Path) -> dict[str, int]:
+    """Processes of all runs in a folder."""
+    return {name: pid for run_dir in folders_of_runs(runs) for name, pid in processes(run_dir).items()}
+
+
+@pytest.mark.thorough
+def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    options = ("--seconds", 16, "--every", 4, "--within", 30, "--seed", 57, "--runs", runs, "--json")
+    ended = command("chaos", write_scenario(tmp_path), *options, timeout_s=240)
+    report = json.loads(ended.stdout)
+    assert report["broken"] == [], ended.stderr
+    assert ended.returncode == 0
+    kinds = [outcome["kind"] for outcome in report["outcomes"]]
+    assert kinds[:2] == ["calm", "kill"]
+    assert report["outcomes"][1]["back_s"] > 0
+    assert "messages" not in kinds[2:] or sum(report["messages"].values()) > 0
+    [run_dir] = folders_of_runs(runs)
+    whole = json.loads((run_dir / "chaos.json").read_text())
+    assert whole["minutes"][0]["agent_mb"] > 20
+    assert running(runs) == {}
+
+
+def test_an_unknown_blow_or_scenario_is_named(tmp_path: Path) -> None:
+    for words, said in (
+        (("--blow", "flood"), "--blow: no 'flood'; there are "),
+        (("--spare", "monitor"), "--spare: no 'monitor'; there are router-0, "),
+        (("nowhere",), "no scenario 'nowhere'"),
+    ):
+        ended = command("chaos", *words, "--runs", tmp_path)
+        assert ended.returncode == 2
+        assert said in ended.stderr

@@ -1,15 +1,20 @@
-"""Every role started by hand, as on several machines, and a part of a swarm that joins the rest."""
+"""Every role started by hand, as on several machines: a part of a swarm that joins the rest, and what a role tells
+probes, a supervisor and a collector of logs."""
 
 from __future__ import annotations
 
 import json
 import signal
-import time
+import socket
+from pathlib import Path
 
 import pytest
 from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
+from launch_scripts.ports import free_ports
+from launch_scripts.web.health_probe import ask
+from swarm.errors import BusError
 from swarm.wire.route_columns import RouteStatus
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -41,26 +46,44 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
         assert process.wait(30) == 0, hands.logs()
 
 
-@pytest.mark.thorough
-def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: Hands) -> None:
-    text = hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1")
-    hands.path.write_text(text)
-    scenario, connect = str(hands.path), hands.network.connect[0]
-    keeper = hands.start("role", "keeper", scenario)
-    part = hands.start("up", scenario, "--connect", connect, "--only", "planner", "--plain")
-    impatient = hands.start("role", "agent", scenario, "--id", "a0")
-    sentence = f"no router at {connect} yet: waiting for one"
-    eventually(lambda: hands.logs().count(sentence) == 3, 150, "three who wait")
-    impatient.send_signal(signal.SIGINT)
-    impatient.wait(10)
-    time.sleep(3)  # longer than the timeout of a connection
-    assert keeper.poll() is part.poll() is None
-    assert hands.logs().count(sentence) == 3
-    hands.start("role", "router", scenario)
-    eventually(lambda: swarm("status", "--connect", connect).returncode == 0, 60, "the router")
-    eventually(lambda: len(hands.members()) == 4, 150, "router, keeper and planners")
-    assert len({run_id for role, _, run_id in hands.members() if role != "router"}) == 1
-    for process in (part, keeper):
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0, hands.logs()
-    assert "Traceback" not in hands.logs()
+def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
+    hands: Hands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [port] = free_ports(1)
+    url = f"http://127.0.0.1:{port}"
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+    manager.settimeout(60)
+    with manager:
+        monkeypatch.setenv("NOTIFY_SOCKET", manager.getsockname())
+        keeper = hands.start("role", "keeper", str(hands.path), "--health-port", str(port), "--log-format", "json")
+        monkeypatch.delenv("NOTIFY_SOCKET")
+        assert manager.recv(100) == b"STATUS=its start"
+
+        def missing() -> list[str] | None:
+            """The keeper's stated lack; None while no keeper answers."""
+            try:
+                answer = ask(url, live=False)
+            except BusError:
+                return None
+            found: list[str] = answer.told["missing"]
+            assert answer.ok == (not found)
+            return found
+
+        eventually(lambda: missing() == ["keeper-0: its router"], 60, "that it waits for its router")
+        assert ask(url, live=True).ok, "waiting is no fault"
+        router = hands.start("role", "router", str(hands.path))
+        while b"READY=1" not in manager.recv(1000):
+            pass
+        eventually(lambda: missing() == [], 60, "that it is ready")
+        assert swarm("health", "--url", url).stdout == "ready\n"
+        router.send_signal(signal.SIGINT)
+        eventually(lambda: missing() == ["keeper-0: its router"], 60, "that its router is gone")
+        assert ask(url, live=True).ok
+        keeper.send_signal(signal.SIGINT)
+        assert keeper.wait(60) == 0, hands.logs()
+    [log] = hands.folder.glob("role-keeper*.log")
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert {(line["role"], line["id"]) for line in lines} == {("keeper", "0")}
+    assert any("keeper started" in line["message"] for line in lines)
+    assert sum("yet: waiting for one" in line["message"] for line in lines) == 1

@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
+OPTIONS = ("--no-live",)
 ALSO = '\n[[targets]]\nname = "fox"\nwalk = "external"\n'
 RUST = os.environ.get("RUST_VEHICLE", "")
 

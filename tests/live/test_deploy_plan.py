@@ -14,15 +14,18 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from bench.wire.partition import partitions
+from support import onlooker_program
 from support.live_swarm import SMALL_WORLD
 from support.machines import Machines, machines, why_not
-from support.onlooker import Onlooker
 from support.processes import eventually
 
 from swarm.liveness import job_of, split_rank
@@ -35,6 +38,7 @@ LOST = "alpha"
 LOOKS_FROM, THROUGH = "desk", "bravo"
 LONGEST_S = 60.0
 """Beside other tests on two cores."""
+ENDS_S = 600.0
 ADDRESSES = {"alpha": "10.77.0.1", "bravo": "10.77.0.2", "charlie": "10.77.0.3", LOOKS_FROM: "10.77.0.9"}
 PER_AGENT = 2
 SCENARIO = f"""
@@ -104,6 +108,33 @@ class Deployed:
 
     def logs(self) -> str:
         return "\n".join(f"{path.name}:\n{path.read_text()[-3000:]}" for path in self.folder.glob("*.log"))
+
+
+class Onlooker:
+    """A program on a machine of its own that notes what the swarm says of itself: `onlooker_program`, line by line.
+    `notes` holds its latest values; see `onlooker_program.Notes`."""
+
+    def __init__(self, machines: Machines, name: str, scenario: Path, endpoint: str, certificates: Path) -> None:
+        command = [sys.executable, str(onlooker_program.__file__), str(scenario), endpoint, str(certificates)]
+        self.notes: dict[str, Any] = {}
+        self._process = machines.start(name, [*command, str(ENDS_S)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.notes = json.loads(line)
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(20)
+        self._reader.join(20)
 
 
 @contextmanager
@@ -249,6 +280,15 @@ def test_the_page_brings_up_three_machines_and_the_loss_of_one_costs_no_route_an
 
 def test_the_page_needs_few_commands() -> None:
     assert len(block("Steps", 1)) + len(block("Steps", 2)) <= COMMANDS_AT_MOST
+
+
+def test_replicas_on_both_sides_of_a_partition_are_soon_equal_again(tmp_path: Path) -> None:
+    reason = why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    (figures,) = partitions(1, 5.0, tmp_path)
+    assert figures["digests_apart"] >= 2
+    assert figures["equal_after_s"] < 5.0
 
 
 if __name__ == "__main__":

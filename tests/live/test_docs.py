@@ -21,6 +21,7 @@ from support.installed import ROOT, environment
 from support.processes import eventually
 
 from launch_scripts.cli import command
+from launch_scripts.launcher.run_options import scenario_path
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -115,10 +116,13 @@ class Bench:
 
 @pytest.fixture
 def beside(tmp_path: Path) -> Any:
-    """The demo, for all blocks beside it. It is the newest swarm of its folder, so commands find it."""
-    bench = Bench(tmp_path, "all")
-    words = ["swarm", "demo", "--port", "0", "--seconds", "600", "--no-live"]
-    demo = subprocess.Popen(
+    """The demo, of fewer vehicles and targets, for all blocks beside it. It is the newest swarm of its folder, so
+    commands find it."""
+    bench, demo = Bench(tmp_path, "all"), scenario_path("demo").read_text(encoding="utf-8")
+    fewer = demo.replace("vehicles = 99", "vehicles = 9").replace("count = 9", "count = 4")
+    (tmp_path / "demo.toml").write_text(fewer, encoding="utf-8")
+    words = ["swarm", "up", "demo.toml", "--port", "0", "--seconds", "600", "--no-live"]
+    swarm = subprocess.Popen(
         words, cwd=bench.folder, env=bench.around, start_new_session=True, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
     )  # fmt: skip
@@ -127,8 +131,8 @@ def beside(tmp_path: Path) -> Any:
         eventually(lambda: asks().returncode == 0, 60, "the demo")
         yield bench
     finally:
-        demo.kill()  # its processes end with it
-        demo.communicate(timeout=60)
+        swarm.kill()  # its processes end with it
+        swarm.communicate(timeout=60)
 
 
 def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:

@@ -30,6 +30,8 @@ from swarm.wire.topics import ROUTE, RUN
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
+OPTIONS = ("--no-live",)
+
 
 @pytest.fixture(scope="module")
 def run(live: LiveSwarm) -> RunInfo:

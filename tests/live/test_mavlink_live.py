@@ -78,7 +78,7 @@ class Child:
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
     folder = tmp_path_factory.mktemp("mavlink")
     write_ground(folder / "ground.tif")
-    with running(folder, text=_SCENARIO) as live:
+    with running(folder, "--no-live", text=_SCENARIO) as live:
         yield live
 
 

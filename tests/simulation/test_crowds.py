@@ -19,7 +19,7 @@ SECONDS = 24.0
     "kind", [kind if kind == "maze" else pytest.param(kind, marks=pytest.mark.thorough) for kind in CROWDS]
 )
 def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
-    scenario, terrain = crowd(kind, 1, vehicles=100, per_agent=13, side=30)
+    scenario, terrain = crowd(kind, 1, vehicles=56, per_agent=7, side=22)
     plan = random_plan(scenario, 1, SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
@@ -29,7 +29,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
 
 @pytest.mark.seeds(1)
 def test_a_crowd_with_certificates_and_every_fault_flows(seed):
-    scenario, terrain = crowd("open", seed, vehicles=48, per_agent=8, side=20)
+    scenario, terrain = crowd("open", seed, vehicles=30, per_agent=5, side=16)
     tls = TlsConfig(ca="ca.pem", certificate="certs", key="certs")
     scenario = replace(scenario, network=replace(scenario.network, tls=tls))
     simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS), terrain=terrain)
@@ -58,9 +58,9 @@ def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_go
     assert laws.collisions == []
 
 
-@pytest.mark.parametrize("skew_s", [-3600.0, 3600.0, -1_799_999_000.0])
+@pytest.mark.parametrize("skew_s", [3600.0, -1_799_999_000.0])
 def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s):
-    """An hour back, an hour forward, and in 1970."""
+    """An hour forward, and in 1970."""
     simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(6, "agent-a1"),)))
     laws = LawBook(simulation)
     simulation.run_until(6.1)

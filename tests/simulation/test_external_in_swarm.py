@@ -3,14 +3,12 @@
 import random
 from typing import Any
 
-import numpy as np
 from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
 from launch_scripts.simulation.sample_worlds import crowd, seeded
 from launch_scripts.simulation.simulated_process import Node
 from swarm.bus.bus import Event, Replied
 from swarm.config.agent_plan import added_agent
-from swarm.right_of_way.generations import MemoryGenerations
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE, OBSTACLE
@@ -18,60 +16,23 @@ from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
 
-def external(
-    simulation: OrderedSimulation, name: str, cell: int, generations: MemoryGenerations | None = None
-) -> ExternalVehicle:
-    open = np.isfinite(simulation.terrain.pace_s_per_m).ravel()
-    found = ExternalVehicle(simulation, name, cell, random.Random(name), open, generations)
-    found.boot()
-    return found
-
-
-def drive(simulation: OrderedSimulation, rovers: list[ExternalVehicle], seconds: float) -> None:
+def drive(simulation: OrderedSimulation, seconds: float) -> None:
     """Drives on, and looks that all vehicles are on cells of their own."""
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:
-        for rover in rovers:
-            rover.tick()
         simulation.run_until(simulation.now_s + 0.1)
-        on = [rover.on for rover in rovers if rover.on is not None] + places(simulation)
-        assert len(on) == len(set(on))
+        assert len(places(simulation)) == len(set(places(simulation)))
 
 
 def places(simulation: OrderedSimulation) -> list[int]:
     return list(cells(simulation).values())
 
 
-def test_an_external_vehicle_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
-    simulation = OrderedSimulation(seeded(3))
-    simulation.run_until(3)
-    # The cells of vehicles: they have to leave before it gets in.
-    rovers = [external(simulation, f"rover-{n}", cell) for n, cell in enumerate(places(simulation)[:3])]
-    drive(simulation, rovers, 12)
-    assert all(rover.moves > 5 for rover in rovers)
-    assert not any(rover.warnings for rover in rovers)
-
-    stands = [rover.on for rover in rovers]
-    for rover in rovers:
-        rover.crash()
-    drive(simulation, [], 3)
-    assert not set(stands).intersection(places(simulation))
-    moves = [rover.moves for rover in rovers]
-    for rover in rovers:
-        rover.boot()
-    drive(simulation, rovers, 6)
-    assert all(rover.moves > before + 3 for rover, before in zip(rovers, moves, strict=True))
-
-    for rover in rovers:
-        rover.leave()
-    drive(simulation, rovers, 1.5)
-    assert all(rover.service and rover.service.external and rover.service.external.gone for rover in rovers)
-
-
 def test_an_external_vehicle_must_not_have_the_name_of_an_agent() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(2)
-    rover = external(simulation, "a0", 5)
+    rover = ExternalVehicle(simulation, "a0", 5, random.Random(1), [])
+    rover.boot()
     simulation.run_until(4)
     assert rover.service.external is None
     assert rover.warnings == ["a0 is an agent of this run's scenario: an external vehicle needs another name"]
@@ -83,17 +44,17 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     group = simulation.scenario.groups[0].name
     here = simulation.terrain.grid.row_col(places(simulation)[0])
     node = simulation.add(added_agent(simulation.scenario, "extra", group, 3, here))
-    drive(simulation, [], 8)
+    drive(simulation, 8)
     agent = agent_of_node(node)
     assert sorted(agent.vehicles) == ["extra-00", "extra-01", "extra-02"]
     assert any(vehicle.target for vehicle in agent.vehicles.values())
     before = {id: vehicle.cell for id, vehicle in agent.vehicles.items()}
-    drive(simulation, [], 5)
+    drive(simulation, 5)
     assert any(vehicle.cell != before[id] for id, vehicle in agent.vehicles.items())
     assert set(before) <= set(simulation.recorder.observed.vehicles().ids)  # observers see them
 
     simulation.crash(node.name)
-    drive(simulation, [], 5)
+    drive(simulation, 5)
     agent = agent_of_node(node)
     assert sorted(agent.vehicles) == sorted(before)
     asked: list[Removed] = []
@@ -106,20 +67,20 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     one, other = "extra-01", next(iter(agent_of_node(simulation.nodes["agent-a0"]).vehicles))
     bus.ask(LEAVE, RemoveVehicles(vehicles=[one]), hear, tag="x", agent="extra")
     bus.ask(LEAVE, RemoveVehicles(vehicles=[other, "nobody"]), hear, tag="x", agent="a0")
-    drive(simulation, [], 2)
+    drive(simulation, 2)
     assert [each.left for each in asked] == [[one], [other]]
     assert asked[1].unknown == ["nobody"]
     assert one not in agent.vehicles
     simulation.crash("agent-a0")
-    drive(simulation, [], 5)
+    drive(simulation, 5)
     restarted = simulation.nodes["agent-a0"]
     assert other not in agent_of_node(restarted).vehicles
     assert restarted.service.lacks() == []
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
-    drive(simulation, [], 2)
+    drive(simulation, 2)
     assert node.service.over  # type: ignore[attr-defined]
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
-    drive(simulation, [], 0.5)
+    drive(simulation, 0.5)
     assert asked[-1].held == 0
 
 
@@ -139,7 +100,7 @@ def test_vehicles_are_added_beside_an_obstacle_and_outside_of_a_zone_where_their
                 simulation.add(added_agent(scenario, f"extra{n}", group, 1, place))
                 for n, place in enumerate([(17, 17), (10, 10)])
             ]
-        drive(simulation, [], 0.1)
+        drive(simulation, 0.1)
         if tick > 20:
             for node in nodes:
                 for vehicle in agent_of_node(node).vehicles.values():

@@ -19,9 +19,9 @@ def test_agents_listen_to_the_shards_near_their_vehicles_and_keep_every_law():
     shards = [len(service._right_of_way.core.holdings.shards) for service in agents(simulation).values()]
     assert len(shards) == 8
     assert sum(shards) < 48  # of 64
-    simulation.run_until(SECONDS)
+    simulation.run_until(15.0)
     simulation.finish()
-    report = simulation.report(SECONDS)
+    report = simulation.report(15.0)
     assert report["vehicles_routed"] == 24
     assert report["captures"] > 0
     assert laws.collisions == laws.lethal == []
@@ -57,7 +57,7 @@ def test_agents_that_begin_while_they_are_cut_off_find_all_their_vehicles_afterw
     )
     simulation = Simulation(seeded(3, WIDE), faults=plan)
     laws = LawBook(simulation)
-    simulation.run_until(SECONDS)
+    simulation.run_until(15.0)
     assert {name: len(service.agent.vehicles) for name, service in agents(simulation).items()} == {
         f"agent-a{n}": 3 for n in range(8)
     }

@@ -21,7 +21,7 @@ ROVERS = (
 
 
 def driven(kind: str, seed: int, seconds: float, faults: bool) -> tuple[LawBook, dict[str, int]]:
-    scenario, terrain = crowd(kind, seed, vehicles=40, per_agent=10, side=24)
+    scenario, terrain = crowd(kind, seed, vehicles=24, per_agent=6, side=19)
     scenario = msgspec.structs.replace(scenario, rovers=ROVERS)
     plan = random_plan(scenario, seed, seconds) if faults else None
     simulation = Simulation(scenario, terrain=terrain, faults=plan)

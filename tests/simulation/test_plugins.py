@@ -1,13 +1,13 @@
 """Plug-ins in a whole swarm: the examples of the pages, and what becomes of a swarm whose plug-ins fail."""
 
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.plugin_modules import forgotten_afterwards
-from support.plugin_pages import write_all_examples, write_example
 from support.simulated import simulate
 
 from launch_scripts.simulation.simulate import Simulation
@@ -16,6 +16,7 @@ from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.wire.messages.processes import Note
 
+SECONDS = 10.0
 SMALL = """
 seed = 3
 [terrain]
@@ -35,7 +36,7 @@ def _own_modules(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-def run(scenario: Path, seconds: float = 20.0) -> tuple[Simulation, list[str]]:
+def run(scenario: Path, seconds: float = SECONDS) -> tuple[Simulation, list[str]]:
     simulation = Simulation(load_scenario(scenario))
     notes: list[str] = []
     heard = simulation.recorder.heard
@@ -50,11 +51,41 @@ def run(scenario: Path, seconds: float = 20.0) -> tuple[Simulation, list[str]]:
     return simulation, notes
 
 
+PAGES = Path(__file__).parents[2] / "docs" / "plugins"
+_PAGES_OF = {"walk": "motion", "cost_layer": "cost-layer"}
+_BLOCK = re.compile(r'^```(\w+) title="([\w.]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+
+
+def write_example(kind: str, folder: Path, more: str = "") -> Path:
+    """Writes the files of a kind's page into a folder, and `more` in front of its scenario; returns that."""
+    page = PAGES / f"{_PAGES_OF.get(kind, kind)}.md"
+    for _, name, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        (folder / name).write_text(more + text if name == "scenario.toml" else text, encoding="utf-8")
+    return folder / "scenario.toml"
+
+
+def write_all_examples(folder: Path, more: str) -> Path:
+    """Like `write_example` for all pages together: one scenario with a plug-in of every kind, after `more`."""
+    arrays: list[str] = []
+    tables: dict[str, list[str]] = {}
+    for kind in PLUGIN_KINDS:
+        text = write_example(kind, folder).read_text(encoding="utf-8")
+        for header, body in re.findall(r"^(\[.+\])\n((?:[^\[\n].*\n)+)", text, re.MULTILINE):
+            if header.startswith("[["):
+                arrays.append(f"{header}\n{body}")
+            else:
+                tables.setdefault(header, []).append(body)
+    merged = [f"{header}\n{''.join(bodies)}" for header, bodies in tables.items()]
+    path = folder / "scenario.toml"
+    path.write_text("\n".join([more, *merged, *arrays]), encoding="utf-8")
+    return path
+
+
 @pytest.mark.parametrize("page", PLUGIN_KINDS)
 def test_the_example_of_a_page_runs_as_it_stands(page: str, tmp_path: Path) -> None:
     simulation, notes = run(write_example(page, tmp_path, SMALL))
     assert not notes
-    report = simulation.report(20.0)
+    report = simulation.report(SECONDS)
     assert report["vehicles_routed"] == 4
     assert report["collisions"] == report["lethal_entries"] == 0
 
@@ -88,7 +119,7 @@ def failed(tmp_path: Path, scenario: str, **bodies: str) -> tuple[list[str], dic
     (tmp_path / "failing.py").write_text(text)
     (tmp_path / "scenario.toml").write_text(f"time_scale = 5.0{SMALL}\n{scenario}")
     simulation, notes = run(tmp_path / "scenario.toml")
-    return notes, simulation.report(20.0)
+    return notes, simulation.report(SECONDS)
 
 
 SETTINGS = {

@@ -18,7 +18,7 @@ from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import POSE, ROUTE
 
 STANDING_BY = msgspec.structs.replace(SMALL, standbys=StandbyConfig(planner=1, targets=1))
-ASK_S = 0.05
+ASK_S = 0.1
 TOLD_AGAIN_S = 0.5
 """Seconds until the next pose of a target after a lost one."""
 LONGEST_GAP_S = 1.0
@@ -26,7 +26,7 @@ LONGEST_GAP_S = 1.0
 
 
 class Asker:
-    """A client that asks every planner for a route twenty times a second, and notes when it was answered."""
+    """A client that asks every planner for a route ten times a second, and notes when it was answered."""
 
     def __init__(self, simulation: Simulation, until_s: float) -> None:
         self.simulation = simulation

@@ -4,11 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 from support.simulated import agents, cells, simulate
+from support.vehicle_states import record, table
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.sample_worlds import SMALL, seeded
+from launch_scripts.simulation.sample_worlds import SMALL, seeded, world
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.simulated_process import Node
+from vehicle_agent.service import AgentService
 
 SECONDS = 24.0
 
@@ -104,3 +107,43 @@ def test_targets_that_evade_jump_or_stand_still_are_caught():
     assert result["captures"] > 0
     assert result["collisions"] == result["lethal_entries"] == 0
     assert result["targets"] == 4
+
+
+WITHIN_S = 1.3
+"""Seats, a leader, a table on file, costs and routes are a tick of an agent each, and a claim may come to nothing
+once."""
+
+
+@pytest.mark.seeds(6)
+def test_every_vehicle_has_a_route_soon_after_the_last_process_has_started_whatever_their_order(seed):
+    simulation = Simulation(seeded(seed, SMALL))
+    begun_s: list[float] = []
+    simulation.after_boot.append(lambda node: begun_s.append(simulation.now_s))
+    routed_s: dict[str, float] = {}
+
+    def look(node: Node) -> None:
+        if isinstance(node.service, AgentService) and node.name not in routed_s:
+            agent = node.service.agent
+            routed = [id for id, each in agent.vehicles.items() if each.route.left or each.in_reach]
+            if set(routed) == set(agent.plan.vehicle_ids):
+                routed_s[node.name] = simulation.now_s
+
+    simulation.after_tick.append(look)
+    simulation.run_until(3.0)
+    agents = [name for name in simulation.nodes if name.startswith("agent-")]
+    assert len(agents) >= 3
+    assert routed_s.keys() == set(agents)
+    assert max(routed_s.values()) - max(begun_s) < WITHIN_S
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"), [("small", 1), ("small", 4), pytest.param("rovers", 1, marks=pytest.mark.thorough)]
+)
+def test_simulated_vehicles_make_no_transition_but_those_of_the_table(
+    name: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = record(monkeypatch)
+    scenario, terrain = world(name, seed)
+    Simulation(scenario, faults=random_plan(scenario, seed, 8.0), terrain=terrain).run_until(8.0)
+    assert made - table() == set()
+    assert {event for _, event, _ in made} >= {"assign", "give_route"}

@@ -148,7 +148,7 @@ def states(simulation: Simulation) -> set[VehicleState]:
     return {each.state for each in vehicles(simulation).values() if each.target == "x"}
 
 
-@pytest.mark.parametrize("clock_off_s", [0.0, HOUR_S])
+@pytest.mark.parametrize("clock_off_s", [pytest.param(0.0, marks=pytest.mark.thorough), HOUR_S])
 def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clock_off_s: float) -> None:
     simulation = Simulation(seeded(1, EXTERNAL), faults=LOSSY)
     laws, ear = LawBook(simulation), Ear(simulation)
@@ -222,7 +222,7 @@ def test_a_target_whose_tracker_stays_lost_is_searched_for_until_it_or_a_vehicle
 
 
 @pytest.mark.seeds(3)
-@pytest.mark.parametrize("clock_off_s", [0.0, -HOUR_S])
+@pytest.mark.parametrize("clock_off_s", [pytest.param(0.0, marks=pytest.mark.thorough), -HOUR_S])
 def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: int, clock_off_s: float) -> None:
     simulation = Simulation(seeded(seed, EXTERNAL), faults=LOSSY)
     OutsideTracker(simulation, "m", 20, 3, 15)

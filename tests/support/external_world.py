@@ -8,7 +8,6 @@ from functools import partial
 
 from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, TrafficWorld
 
-from swarm.liveness import Peer
 from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
@@ -23,6 +22,10 @@ class ExternalProcess(Process):
     carried away."""
 
     world: ExternalWorld
+
+    def __init__(self, world: ExternalWorld, agent: str, disk: Disk) -> None:
+        super().__init__(world, agent, disk)
+        self.hear_token = self.external.hear_token
 
     def make_rights(self) -> RightOfWay:
         self.external = ExternalVehicle(self.world.shards, self.agent, self.disk.own.generations)
@@ -117,12 +120,6 @@ class ExternalProcess(Process):
             path.append(min(world.next_to(path[-1]), key=cost.__getitem__))
         external.want(path, sorted(world.next_to(here), key=lambda cell: (cost[cell], cell)))
 
-    def see_tokens(self) -> None:
-        up = {Peer("agent", each.agent, id(each)) for each in self.world.twins_of(self)}
-        for peer in up ^ self.tokens:
-            self.external.hear_token(peer, up=peer in up)
-        self.tokens = up
-
 
 class AddedProcess(Process):
     """One generation of an agent that is not in the scenario. Its vehicles enter where there is place; a new
@@ -160,6 +157,7 @@ class OperatorProcess(Process):
     """Declares a robot absent until leaders have freed its cells."""
 
     world: ExternalWorld
+    has_token = False
 
     def make_rights(self) -> RightOfWay:
         self.removal = Removal(self.world.shards, self.agent)
@@ -222,17 +220,6 @@ class ExternalWorld(TrafficWorld):
         if agent in self.robots:
             return ExternalProcess(self, agent, disk)
         return AddedProcess(self, agent, disk) if agent in self.added else Process(self, agent, disk)
-
-    def twins_of(self, process: Process) -> list[Process]:
-        """Other processes of the same external vehicle that it sees."""
-        return [
-            each
-            for each in self.processes
-            if each.agent == process.agent
-            and each is not process
-            and not isinstance(each, OperatorProcess)
-            and not self.is_cut(process, each)
-        ]
 
     def restart(self, process: Process) -> None:
         if process.agent not in self.gone | self.never_back and not isinstance(process, OperatorProcess):

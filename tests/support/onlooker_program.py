@@ -1,5 +1,5 @@
 """An operator's program on a machine of its own: it notes routed vehicles, answering processes, and
-acknowledgements of keepers. Run by `onlooker.Onlooker`.
+acknowledgements of keepers. Run by `Onlooker` of tests/live/test_deploy_plan.py.
 
 argv: the scenario, the router's endpoint, the folder of certificates, seconds after which it ends by itself. It
 prints a line of JSON ten times a second, and ends with its input, too.

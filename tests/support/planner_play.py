@@ -19,7 +19,11 @@ from planner_service.tree.strides import StrideNetwork
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 from swarm.wire.route_columns import RouteStatus
+
+_MARKED = np.array([np.inf, 0.5, 1.0, 20.0, 500.0, PACE_LEAST, PACE_MOST], np.float32)
+"""s/m: what a mark makes of a cell, up to the bounds of the wire. Another may undo it."""
 
 
 class Play:
@@ -123,7 +127,7 @@ class Play:
         window = Window(0, 0, 0, 0)
         for _ in range(event.count):
             row, col = int(rng.integers(self.grid.rows)), int(rng.integers(self.grid.cols))
-            self.pace[row, col] = rng.choice(np.array([np.inf, 0.5, 1.0, 20.0, 500.0], np.float32))
+            self.pace[row, col] = rng.choice(_MARKED)
             window = window.union(Window(row, col, row + 1, col + 1))
         return window
 

@@ -76,11 +76,14 @@ class Disk:
 class Process:
     """One generation of one agent. Its vehicles' bodies are on `disk`: they stand where they are when it dies."""
 
+    has_token = True
+
     def __init__(self, world: TrafficWorld, agent: str, disk: Disk) -> None:
         self.world, self.agent, self.disk = world, agent, disk
         self.alive = True
         self.hung: list[Callable[[], None]] | None = None
         self.rights = self.make_rights()
+        self.hear_token = self.rights.host.hear_token
         self.vehicles = list(world.spawns.get(agent, ()))
         # A clock of its own: it may be years off, and leaps.
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
@@ -187,10 +190,12 @@ class Process:
     def see_tokens(self) -> None:
         """Notice which other processes of this agent are up, and not cut off."""
         world = self.world
-        twins = [each for each in world.processes if each.agent == self.agent and each is not self]
+        twins = [
+            each for each in world.processes if each.agent == self.agent and each is not self and each.has_token
+        ]
         up = {Peer("agent", each.agent, id(each)) for each in twins if not world.is_cut(self, each)}
         for peer in up ^ self.tokens:
-            self.rights.host.hear_token(peer, up=peer in up)
+            self.hear_token(peer, up=peer in up)
         self.tokens = up
 
     def drive(self, vehicle: str) -> None:
