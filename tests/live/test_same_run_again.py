@@ -35,6 +35,7 @@ def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_wit
         first.wait_until_up()
         store = tmp_path / "runs" / "again" / "map.sqlite"
         eventually(lambda: store.exists() and sets_in(store) > 0, 60, "marks in the store")
+        os.kill(first.pid_of("planner-t0"), signal.SIGSTOP)  # which notices nothing
         kill(first.process.pid, signal.SIGKILL)  # with it or after it all that it started ends
         first.process.wait(10)
         eventually(lambda: not session_of(first.process.pid), 10, "the end of all")

@@ -23,13 +23,7 @@ from swarm.grid import walk
 from swarm.liveness import Peer
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
-from swarm.wire.messages.planning import (
-    CostReply,
-    CostRequest,
-    RouteReply,
-    RouteRequest,
-    TargetPose,
-)
+from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE

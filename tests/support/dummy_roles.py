@@ -41,16 +41,6 @@ def _write(setup: RoleSetup, sign: str) -> None:
         order.write(f"{sign}{setup.role}-{setup.id}\n")
 
 
-def crash_twice(setup: RoleSetup, built: Built) -> None:
-    assert setup.run_dir is not None
-    tries = setup.run_dir / "tries.txt"
-    with tries.open("a") as file:
-        file.write("x")
-    if len(tries.read_text()) <= 2:
-        raise ZeroDivisionError("a bug of ours")
-    quiet(setup, built)
-
-
 class Idle:
     """A service without any work, which is ready at once."""
 
@@ -118,10 +108,6 @@ def _run(setup: RoleSetup, service: Idle) -> None:
     process = Process(service, Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
     process.stop_on_signals()
     process.run()
-
-
-def tick(setup: RoleSetup, built: Built) -> None:
-    _run(setup, Idle())
 
 
 class StandsStill(Idle):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
-from support.makers import planner_status
+from support.makers import planner_status, stats
 
 from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web.prometheus import HELP, OneScrape, Run, families
 from shared_map.keeper.service import THROTTLED
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, READY, Counters
-from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import VehicleState
 
 _MEASURED = ("_ms", "_us", "_excess")
@@ -33,16 +32,7 @@ def exported() -> dict[str, set[str]]:
     counters.count_by(CAPTURES_OF, "t0")
     counters.observe_by(GAPS_TO, "t0", 0.03)
     counts = Counts()
-    counts.count(
-        Stats(
-            role="agent", id="a0", incarnation=1, stamp_ns=2, counts=counters.counts, gauges=counters.gauges,
-            histograms={name: each.buckets for name, each in counters.histograms.items()},
-            counts_by=counters.counts_by,
-            histograms_by={
-                name: {id: each.buckets for id, each in by.items()} for name, by in counters.histograms_by.items()
-            },
-        )
-    )  # fmt: skip
+    counts.count(stats(counters=counters))
     status = planner_status(pose_age_s=0.5, tracker_lost=True)
     text = generate_latest(
         OneScrape(families(Run("r", "demo", 1), counts, {"t0": status}, [("agent", "a0")]))

@@ -51,6 +51,12 @@ def little_terrain() -> Terrain:
     return terrain_of_pace(np.full((80, 100), 0.1, np.float32), 25.0, elevation_m)
 
 
+def hill(rows: int, cols: int, resolution_m: float = 10.0, top_m: float = 50.0) -> Terrain:
+    """Rises evenly to the east."""
+    elevation_m = np.tile(np.linspace(0, top_m, cols, dtype=np.float32), (rows, 1))
+    return terrain_of_pace(np.ones((rows, cols), np.float32), resolution_m, elevation_m)
+
+
 def hidden_truth(terrain: Terrain) -> NDArray[np.float32]:
     """A wall across the middle of the little terrain."""
     truth = np.array(terrain.pace_s_per_m)

@@ -11,19 +11,9 @@ from support.message_fuzzer import MessageFuzzer
 from swarm.grid import GridSpec
 from swarm.wire.fields import pack_column
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import (
-    MarkSet,
-    MarkSets,
-)
+from swarm.wire.messages.map_data import MarkSet, MarkSets
 from swarm.wire.messages.orders import Order, Orders
-from swarm.wire.messages.planning import (
-    CostReply,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-    Sighted,
-    TargetPose,
-)
+from swarm.wire.messages.planning import CostReply, PushedRoute, RouteReply, RouteRequest, Sighted, TargetPose
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -49,54 +50,9 @@ def test_every_alert_has_a_heading_with_its_severity_and_every_heading_an_alert(
     assert len(re.findall(r"^### ", _PAGE.read_text(), re.MULTILINE)) == len(told)
 
 
-_PROCESS = '{role="agent", id="a0"}'
-_COUNTED = "0+0x20 1+0x20"
-"""A counter that is 0 for five minutes, and then 1."""
-FIRES: dict[str, dict[str, str]] = {
-    "SwarmNotObserved": {},
-    "SwarmProcessDown": {f"swarm_process_up{_PROCESS}": "1+0x20 0+0x20"},
-    "SwarmProcessSilent": {
-        f"swarm_process_up{_PROCESS}": "1+0x40",
-        f"swarm_process_reported_timestamp_seconds{_PROCESS}": "0+15x16 240+0x24",
-    },
-    "SwarmProcessNotReady": {f"swarm_process_up{_PROCESS}": "1+0x40", f"swarm_ready{_PROCESS}": "1+0x10 0+0x30"},
-    "SwarmProcessRestarts": {f"swarm_process_start_time_seconds{_PROCESS}": "0+0x20 1+1x20"},
-    "SwarmStrangers": {f"swarm_strangers_total{_PROCESS}": _COUNTED},
-    "SwarmStoreNotWritten": {f"swarm_saves_failed_total{_PROCESS}": "0+0x20 1+1x20"},
-    "SwarmMarksRefused": {f"swarm_sets_without_room_total{_PROCESS}": _COUNTED},
-    "SwarmAuthorThrottled": {'swarm_author_throttled{role="keeper", id="0", author="all.a0.1"}': "1+0x40"},
-    "SwarmTargetLost": {'swarm_target_lost{target="t0"}': "1+0x40"},
-    "SwarmVehiclesLost": {'swarm_vehicles{role="agent", id="a0", state="lost"}': "3+0x40"},
-    "SwarmVehiclesStranded": {'swarm_vehicles{role="agent", id="a0", state="stranded"}': "3+0x40"},
-    "SwarmTicksLate": {
-        f"swarm_ticks_late_total{_PROCESS}": "0+50x40",
-        f"swarm_tick_seconds_count{_PROCESS}": "0+150x40",
-    },
-    "SwarmQuestionsExpired": {f"swarm_asks_expired_total{_PROCESS}": "0+1x40"},
-    "SwarmInboxFull": {f"swarm_events_dropped_total{_PROCESS}": _COUNTED},
-    "SwarmPayloadsDropped": {f"swarm_payloads_dropped_total{_PROCESS}": _COUNTED},
-    "SwarmPayloadsMisrouted": {f"swarm_payloads_misrouted_total{_PROCESS}": _COUNTED},
-    "SwarmPluginFailed": {f"swarm_plugin_failed_total{_PROCESS}": _COUNTED},
-    "SwarmCollision": {f"swarm_driven_into_total{_PROCESS}": _COUNTED},
-    "SwarmLethalEntry": {f"swarm_lethal_entries_total{_PROCESS}": _COUNTED},
-    "SwarmCertificateBroken": {f"swarm_broken_certificates_total{_PROCESS}": _COUNTED},
-}
-"""Alert -> series, a value each 15 s, by which it fires at 7 min."""
-WELL = {
-    'swarm_run_info{run_id="r"}': "1+0x40",
-    f"swarm_process_up{_PROCESS}": "1+0x40",
-    'swarm_process_up{role="agent", id="left"}': "0+0x40",
-    'swarm_ended{role="agent", id="left"}': "1+0x40",
-    f"swarm_ready{_PROCESS}": "1+0x40",
-    f"swarm_process_reported_timestamp_seconds{_PROCESS}": "0+15x40",
-    f"swarm_process_start_time_seconds{_PROCESS}": "5+0x40",
-    f"swarm_ticks_late_total{_PROCESS}": "0+1x40",
-    f"swarm_tick_seconds_count{_PROCESS}": "0+150x40",
-    f"swarm_strangers_total{_PROCESS}": "3+0x40",
-    'swarm_vehicles{role="agent", id="a0", state="lost"}': "0+0x40",
-    'swarm_target_lost{target="t0"}': "0+0x40",
-}
-"""A swarm about which there is nothing to say: one process has left as it was asked to."""
+HISTORIES = tomllib.loads(Path(__file__).with_name("alert_histories.toml").read_text(encoding="utf-8"))
+FIRES: dict[str, dict[str, str]] = HISTORIES["fires"]
+"""Alert -> the series by which it fires."""
 
 
 def test_there_is_a_history_for_every_alert() -> None:
@@ -121,7 +77,7 @@ def test_promtool_says_that_each_alert_fires_on_its_history_and_none_while_all_i
             ],
         }
 
-    tests = [history(WELL, dict.fromkeys(FIRES, False))]
+    tests = [history(HISTORIES["well"], dict.fromkeys(FIRES, False))]
     tests += [history(series, {alert: True}) for alert, series in FIRES.items()]
     (tmp_path / "tests.yml").write_text(yaml.safe_dump({"rule_files": ["alerts.yml"], "tests": tests}))
     for command in (["check", "rules", "alerts.yml"], ["test", "rules", "tests.yml"]):

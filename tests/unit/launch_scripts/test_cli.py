@@ -58,9 +58,7 @@ def test_a_port_gives_the_live_view_the_next_and_0_picks_free_ones() -> None:
 
 
 def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         scenario = Scenario(monitor=MonitorConfig(web_port=port))
         with pytest.raises(BusError, match=rf"port {port}, which the live view \(monitor.web_port\) needs"):

@@ -10,15 +10,8 @@ from skimage.graph import MCP_Geometric
 from support.makers import cost_reply, planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground_colours import (
-    CostSamples,
-    GroundColours,
-    TargetPictures,
-    coarse_tree,
-    nearest_target,
-)
-from launch_scripts.monitor.terrain_mesh import Floats, TerrainMesh
-from shared_map.terrain.terrain import Terrain
+from launch_scripts.monitor.ground_colours import CostSamples, coarse_tree, nearest_target
+from launch_scripts.monitor.terrain_mesh import Floats
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec
 from swarm.wire.topics import COST, STATUS
@@ -111,13 +104,6 @@ def test_territories_go_by_cost_and_not_by_distance() -> None:
     assert nearest[0, 22] == 1, "next to `a`, behind a wall"
     assert nearest[39, 0] == 0
     assert nearest[0, 20] == -1
-
-
-def pictures(terrain: Terrain) -> tuple[TargetPictures, CostSamples]:
-    mesh = TerrainMesh(terrain)
-    samples = CostSamples(terrain.grid, "t0")
-    samples.hear_target("t0")
-    return TargetPictures(mesh, GroundColours(mesh, terrain, terrain.ground_s_per_m, None), samples), samples
 
 
 def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:

@@ -19,15 +19,9 @@ from swarm.config.load import load_scenario
 from swarm.errors import ConfigError
 
 SCENARIO = """
-[terrain]
-source = "synthetic"
-
-[[targets]]
-count = 2
-
-[[groups]]
-vehicles = 30
-
+terrain.source = "synthetic"
+targets = [{ count = 2 }]
+groups = [{ vehicles = 30 }]
 [network]
 admit = ["operator.anna"]
 """

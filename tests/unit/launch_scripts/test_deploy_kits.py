@@ -114,17 +114,6 @@ def test_a_second_plan_keeps_keys_that_need_not_be_others(tmp_path: Path) -> Non
     assert (first / "certs" / "revoked").read_text() == "agent.all.a0\n"
 
 
-def test_a_second_plan_ships_no_certificate_that_has_expired(tmp_path: Path) -> None:
-    write_kits(planned(), tmp_path, systemd_files, 7)
-    certs = tmp_path / "certs"
-    for name in ("router.1", "keeper.0", "operator.0", "operator.m2"):
-        issue(certs, name, ["10.0.0.2", "router-m1", "localhost", "127.0.0.1"], 0, renew=True)
-    for folder in unpacked(planned(), tmp_path):
-        for path in (folder / "certs").glob("*.*.pem"):
-            check_signed(folder / "certs" / "ca.pem", path, path.with_suffix(".key"))
-    check_signed(certs / "ca.pem", certs / "operator.0.pem", certs / "operator.0.key")
-
-
 @pytest.mark.parametrize("start_days", [-20, 20])
 def test_an_authority_that_is_not_valid_today_signs_and_checks_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_days: int

@@ -9,15 +9,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from launch_scripts.commands.deploy_commands import app
-from launch_scripts.deploy.machines_needed import (
-    Estimate,
-    Machine,
-    Swarm,
-    fewest_machines,
-    measured_runs,
-    reaches,
-)
-from swarm.errors import ConfigError
+from launch_scripts.deploy.machines_needed import Estimate, Machine, Swarm, measured_runs, reaches
 
 WEAK, STRONG = Machine(8, 32, 10_000), Machine(16, 64, 100_000)
 
@@ -50,13 +42,6 @@ def test_needs_are_finite_and_positive_and_nothing_crosses_on_one_machine(size: 
         assert found.link_mbit_per_s == found.first_link_mbit_per_s == 0
     else:
         assert 0 < found.link_mbit_per_s <= found.first_link_mbit_per_s
-
-
-def test_a_swarm_that_no_number_of_machines_carries_is_refused_with_what_is_full() -> None:
-    with pytest.raises(
-        ConfigError, match=r"no number of machines up to 2000 carries this swarm: link: .* of 10 Mbit/s"
-    ):
-        fewest_machines(Estimate(swarm(10_000, 100)), Machine(4, 64, 10))
 
 
 def test_a_small_swarm_fits_one_machine_and_a_full_process_is_named() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.makers import planner_status, stats
 from support.map_strategies import set_of
-from support.monitor_rig import Rig, little_scenario, little_terrain
+from support.monitor_rig import Rig, hill, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground_colours import (
     FAST_MARK,
@@ -34,10 +34,7 @@ from launch_scripts.monitor.ground_view import (
     scenario_areas,
     title_places,
 )
-from launch_scripts.monitor.live_layout import (
-    COST,
-    PHOTO,
-)
+from launch_scripts.monitor.live_layout import COST, PHOTO
 from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import fact_table as facts
@@ -202,12 +199,6 @@ def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_co
 
 
 # --- the mesh, and words beside the view --------------------------------------------------------------------------
-
-
-def hill(rows: int, cols: int, resolution_m: float = 10.0, top_m: float = 50.0) -> Terrain:
-    """Rises evenly to the east."""
-    elevation_m = np.tile(np.linspace(0, top_m, cols, dtype=np.float32), (rows, 1))
-    return terrain_of_pace(np.ones((rows, cols), np.float32), resolution_m, elevation_m)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (64, 64), (65, 65), (100, 151), (424, 400)])

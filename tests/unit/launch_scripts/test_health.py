@@ -4,7 +4,6 @@ sentence each."""
 import contextlib
 import http.client
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -19,10 +18,10 @@ from unittest import mock
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.idle_swarm import idle_swarm
 from support.processes import eventually
 
 from launch_scripts.launcher import hang_watch, local_processes
-from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, Sight, Stillness
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
@@ -30,10 +29,8 @@ from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_probe import ask, fast
 from launch_scripts.web.health_verdict import Process, health_pages, verdict
 from launch_scripts.web.http_server import MOST_CONNECTIONS, Server, refusal
-from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals
-from swarm.runtime.role_setup import RoleSetup
 
 _NOW_NS = 100_000_000_000
 
@@ -165,7 +162,11 @@ def test_nothing_that_a_stranger_answers_is_obeyed_by_a_terminal() -> None:
         b"GET /healthz HTTP/9.9\r\n\r\n",
         b"POST /healthz HTTP/1.0\r\nHost: localhost\r\n\r\n",
         b"GET /healthz HTTP/1.0\r\nHost: example.org\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\nHost : localhost\r\n\r\n",
         b"GET /healthz HTTP/1.0\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\nHost: localhost\r\nX: a\r\n Host: evil.example\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\nHost: localhost\r\nOrigin: http://localhost\r\nOrigin: http://evil.example\r\n\r\n",
         b"GET /../../etc/passwd HTTP/1.0\r\nHost: localhost\r\n\r\n",
         b"GET /" + b"x" * 70_000 + b" HTTP/1.0\r\n\r\n",
         b"GET /healthz HTTP/1.0\r\n" + b"A: b\r\n" * 5000 + b"\r\n",
@@ -394,48 +395,28 @@ def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts
     assert sent == (ended if phase is Phase.RUNS else [])
 
 
-def started(tmp_path: Path, function: str) -> LocalSwarm:
-    """A launcher with one process that does what a dummy role does."""
-    warm_up = WarmUp(None)
-    warm_up.begin()
-    eventually(lambda: warm_up.done(0.05), 20)
-
-    def setup_of(spec: ProcessSpec) -> RoleSetup:
-        return RoleSetup(Scenario(), "run-1", spec.role, spec.id, time.time_ns(), 0, tmp_path)
-
-    return LocalSwarm([ProcessSpec("planner", "t0", f"support.dummy_roles:{function}")], setup_of, tmp_path)
-
-
-def is_ready(swarm: LocalSwarm) -> bool:
-    return verdict(READY, swarm.seen(), time.monotonic_ns()).ok
-
-
 @pytest.mark.network
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("function", ["stand_still", "tick"])
 def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One whose tick does not end, and one that was stopped, so that it cannot say anything."""
     monkeypatch.setattr(hang_watch, "STILL_S", 2.0)
-    swarm = started(tmp_path, function)
+    swarm = idle_swarm(tmp_path, ("planner", "t0", "stand_still"))
     endings: list[Ending] = []
+
+    def ready() -> bool:
+        return verdict(READY, swarm.seen(), time.monotonic_ns()).ok
+
     try:
         assert verdict(READY, swarm.seen(), time.monotonic_ns()).missing == ("planner-t0: it does not run",)
         swarm.start()
-        eventually(lambda: is_ready(swarm), 20, "ready")
-        if function == "tick":
-            [running] = swarm.running
-            assert running.process.pid is not None
-            os.kill(running.process.pid, signal.SIGSTOP)
+        eventually(ready, 20, "ready")
         eventually(lambda: endings.extend(swarm.poll()) or endings, 60, "its end")
         assert endings[0].sentence == "its loop stood still, so it was killed; its log says where"
         assert endings[0].restart_in_s == 0.2
-        assert not is_ready(swarm)
+        assert not ready()
         assert verdict(HEALTHY, swarm.seen(), time.monotonic_ns()).ok, "the launcher starts it again"
-        eventually(
-            lambda: endings.extend(swarm.poll()) or (swarm.restarts and is_ready(swarm)), 60, "its next generation"
-        )
+        eventually(lambda: endings.extend(swarm.poll()) or (swarm.restarts and ready()), 60, "its next generation")
     finally:
         swarm.kill()
-    assert ("stand_still" in (tmp_path / "planner-t0.log").read_text()) is (function == "stand_still")
+    assert "stand_still" in (tmp_path / "planner-t0.log").read_text()

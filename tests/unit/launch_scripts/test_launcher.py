@@ -2,40 +2,32 @@
 
 import multiprocessing
 import os
-import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
-from support.processes import eventually, session_of
+from support.idle_swarm import idle_swarm
+from support.processes import eventually
 
 from launch_scripts.launcher import forkserver
 from launch_scripts.launcher.child_main import ExitReason
-from launch_scripts.launcher.forkserver import WarmUp, _build
+from launch_scripts.launcher.forkserver import _build
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm
-from launch_scripts.launcher.takeover import has_ended, processes
+from launch_scripts.launcher.takeover import has_ended
 from launch_scripts.process_table import TABLE, ProcessSpec
 from planner_service import kernel_build
 from planner_service.kernel_build import name_of, needed_kernels, place_kernels
 from swarm.config.scenario import Scenario
-from swarm.runtime.role_setup import RoleSetup
 
 # Marked as network tests, like those: its tests wait for processes.
 pytestmark = [
     pytest.mark.network,
     pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _forkserver() -> None:
-    warm_up = WarmUp(None)
-    warm_up.begin()
-    eventually(lambda: warm_up.done(0.05), 20)
 
 
 @pytest.fixture
@@ -47,11 +39,7 @@ def swarms() -> Iterator[list[LocalSwarm]]:
 
 
 def swarm_of(swarms: list[LocalSwarm], folder: Path, *rows: tuple[str, str, str]) -> LocalSwarm:
-    def setup_of(spec: ProcessSpec) -> RoleSetup:
-        return RoleSetup(Scenario(), "run-1", spec.role, spec.id, time.time_ns(), 0, folder)
-
-    specs = [ProcessSpec(role, id, f"support.dummy_roles:{function}") for role, id, function in rows]
-    swarms.append(LocalSwarm(specs, setup_of, folder))
+    swarms.append(idle_swarm(folder, *rows))
     return swarms[-1]
 
 
@@ -86,20 +74,6 @@ def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm],
     assert swarm.stop(lambda: time.sleep(0.02)) == []
     assert order.read_text().split()[4:] == ["-agent-a0", "-planner-t0", "-keeper-0", "-router-0"]
     assert "hello from t0" in (tmp_path / "planner-t0.log").read_text()
-
-
-def test_a_process_that_crashes_is_restarted_until_it_runs(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "crash_twice"))
-    swarm.start()
-    (first,) = endings_within(swarm)
-    assert first.sentence == "ZeroDivisionError: a bug of ours"
-    assert first.restart_in_s == 0.2
-    (second,) = endings_within(swarm)
-    assert second.restart_in_s == 0.4
-    eventually(lambda: swarm.poll() or (tmp_path / "order.txt").exists(), 10)
-    assert swarm.restarts == 2
-    assert "ZeroDivisionError" in (tmp_path / "planner-t0.log").read_text()
-    assert swarm.stop(lambda: time.sleep(0.02)) == []
 
 
 @pytest.mark.parametrize(
@@ -190,33 +164,14 @@ def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed
     assert time.monotonic() - began_s < 2.0
 
 
-class Ended:
-    """A process that has ended, and the last words in its pipe."""
-
-    exitcode, pid = 4, 1
-
-    def __init__(self, refused: bool = True) -> None:
-        self._reason = ExitReason("cannot reach a router", 4, refused)
-        self._ended, self.sentinel = socket.socketpair()  # readable once the other end is closed
-        self._ended.close()
-
-    def join(self, timeout_s: float) -> None:
-        pass
-
-    def poll(self) -> bool:
-        return True
-
-    def recv(self) -> ExitReason:
-        return self._reason
-
-    def close(self) -> None:
-        pass
-
-
 def refused(swarm: LocalSwarm, ran_s: float, *, restarts: int = 1) -> float | None:
     """Ends the only process by a refusal after a run; returns the launcher's wait before the next start."""
     running = swarm.running[0]
-    running.process = running.pipe = Ended()  # type: ignore[assignment]
+    sentinel, other_end = socket.socketpair()
+    other_end.close()  # which makes it readable, as that of a process which has ended
+    ended = mock.Mock(exitcode=4, pid=1, sentinel=sentinel)
+    ended.recv.return_value = ExitReason("cannot reach a router", 4, True)
+    running.process = running.pipe = ended
     running.restarts, running.began_s = restarts, time.monotonic() - ran_s
     (ending,) = swarm.poll()
     return ending.restart_in_s
@@ -251,44 +206,6 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
     wait_for_line(tmp_path / "order.txt", "+keeper-0")
     (failure,) = swarm.stop(lambda: time.sleep(0.02))
     assert failure == "keeper-0 was asked to end, but RuntimeError: could not write the last page"
-
-
-_LAUNCHER = """
-import signal, sys, time
-from pathlib import Path
-from launch_scripts.launcher.local_processes import LocalSwarm
-from launch_scripts.launcher.forkserver import ROLES_ONLY, WarmUp
-from launch_scripts.process_table import ProcessSpec
-from swarm.config.scenario import Scenario
-from swarm.runtime.role_setup import RoleSetup
-
-asked = []
-signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
-folder = Path(sys.argv[1])
-warm_up = WarmUp(ROLES_ONLY)
-warm_up.begin()
-while not warm_up.done(0.05): pass
-specs = [ProcessSpec("planner", "t0", "support.dummy_roles:quiet"), ProcessSpec("agent", "a0", sys.argv[2])]
-swarm = LocalSwarm(specs, lambda s: RoleSetup(Scenario(), "r", s.role, s.id, 1, 0, folder), folder)
-swarm.start()
-while not asked: time.sleep(0.1); swarm.poll()
-sys.exit(len(swarm.stop(lambda: time.sleep(0.02))))
-"""
-
-
-def launcher(folder: Path, agent: str) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, "-c", _LAUNCHER, str(folder), agent]
-    return subprocess.Popen(command, start_new_session=True, env=environment)
-
-
-def test_kill_9_of_the_launcher_leaves_no_process_behind_not_even_a_stopped_one(tmp_path: Path) -> None:
-    with launcher(tmp_path, "support.dummy_roles:stubborn") as process:
-        wait_for_line(tmp_path / "order.txt", "+planner-t0", within_s=20)
-        assert len(session_of(process.pid)) == 5  # launcher, tracker, forkserver, two roles
-        os.kill(processes(tmp_path)["planner-t0"], signal.SIGSTOP)
-        process.kill()
-    eventually(lambda: not session_of(process.pid), 8, "the end of all")
 
 
 def test_processes_are_added_and_dismissed_while_the_others_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:

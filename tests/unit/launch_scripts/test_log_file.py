@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.command import Swarm
 
 from launch_scripts.launcher.console import Terminal
 from launch_scripts.launcher.log_file import FORMAT, JsonLines, Speaker
@@ -137,15 +138,15 @@ def test_what_a_launcher_says_of_others_is_one_line_that_no_terminal_obeys(text:
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
 
 
-def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
-    command += ["simulate", "jacksboro", "--seconds", "1", "--trace", "/dev/full", "--runs", str(tmp_path)]
-    told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert told.returncode == 6, told.stderr
-    assert "of 100 vehicles routed, no captures, no collisions. Not all went well" in told.stdout
-    assert "times real time" in told.stdout
-    assert told.stderr.splitlines()[-1] == "swarm: the event log /dev/full has no end: No space left on device"
-    assert "Traceback" not in told.stderr
+def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so(
+    tmp_path: Path, swarm: Swarm
+) -> None:
+    code, figures, said = swarm("simulate synthetic --seconds 1 --trace /dev/full --runs", tmp_path)
+    assert code == 6, said
+    assert "vehicles routed, no captures, no collisions. Not all went well" in figures
+    assert "times real time" in figures
+    assert said.splitlines()[-1] == "swarm: the event log /dev/full has no end: No space left on device"
+    assert "Traceback" not in said
 
 
 def test_a_folder_that_takes_no_data_is_named_once_a_minute_and_when_it_does_again(tmp_path: Path) -> None:

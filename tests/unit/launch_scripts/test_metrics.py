@@ -143,9 +143,7 @@ def test_no_name_from_the_network_breaks_a_scrape(
     from launch_scripts.web.prometheus import OneScrape
 
     heard = Counts()
-    heard.count(
-        Stats(role="agent", id="a0", incarnation=1, stamp_ns=1, counts=counts, gauges=gauges, histograms=histograms)
-    )
+    heard.count(stats(counts=counts, gauges=gauges, histograms=histograms))
     run = Run('a"\n\\b', "demo", _BEGAN_NS)
     text = generate_latest(OneScrape(families(run, heard, {}, [("agent", "a0")]))).decode()
     found = _samples(text)

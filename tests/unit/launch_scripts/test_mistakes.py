@@ -10,7 +10,6 @@ import shlex
 import socket
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -47,81 +46,51 @@ LONGEST_ANSWER = 400
 """Characters; two lines of a wide terminal."""
 
 
-def port_taken(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
-    taken = socket.socket()
+def port_taken(folder: Path, request: pytest.FixtureRequest) -> None:
+    taken = socket.create_server(("127.0.0.1", 0))
     request.addfinalizer(taken.close)
-    taken.bind(("127.0.0.1", 0))
-    taken.listen()
     endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     path = folder / "tiny.toml"
     path.write_text(f'{TINY}[network]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
-    return {}
 
 
-def one_machine(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def one_machine(folder: Path, request: pytest.FixtureRequest) -> None:
     (folder / "hosts.toml").write_text('survive = 1\n[[hosts]]\nname = "a"\naddress = "10.0.0.1"\n')
-    return {}
 
 
-def two_machines(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def two_machines(folder: Path, request: pytest.FixtureRequest) -> None:
     rows = (f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2))
     (folder / "hosts.toml").write_text("".join(rows))
-    return {}
 
 
-def free_port(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
-    return {"PORT": str(free_ports(1)[0])}
-
-
-def photo(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def photo(folder: Path, request: pytest.FixtureRequest) -> None:
     from rasterio.transform import from_origin
     from support.height_models import written
 
     pixels = np.random.default_rng(1).integers(0, 255, (3, 24, 24), np.uint8)
     place = from_origin(400000, 5000000, 10, 10)
     written(folder / "photo.tif", pixels, "uint8", photometric="RGB", transform=place)
-    return {}
 
 
-def hill(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def hill(folder: Path, request: pytest.FixtureRequest) -> None:
     np.savez(folder / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
-    return {}
 
 
-def certificates_of_another(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def certificates_of_another(folder: Path, request: pytest.FixtureRequest) -> None:
     certificates_but_one(folder, request)
     issue(folder / "certs", "planner.t", [], 9)
     issue(folder / "others", "operator.0", [], 9)
     (folder / "certs/ca.pem").write_bytes((folder / "others/ca.pem").read_bytes())
-    return {}
 
 
-def certificates_but_one(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def certificates_but_one(folder: Path, request: pytest.FixtureRequest) -> None:
     for name in certificate_names(load_scenario(folder / "tiny.toml")):
         if name != "planner.t":
             issue(folder / "certs", name, ["localhost"] * name.startswith("router"), 9)
-    return {}
 
 
-def latin_1(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+def latin_1(folder: Path, request: pytest.FixtureRequest) -> None:
     (folder / "s.toml").write_bytes('name = "H\u00fcgel"\n'.encode("latin-1"))
-    return {}
-
-
-GIVEN: dict[str, Callable[[Path, pytest.FixtureRequest], dict[str, str]]] = {
-    each.__name__: each
-    for each in (
-        port_taken,
-        one_machine,
-        two_machines,
-        free_port,
-        photo,
-        hill,
-        certificates_of_another,
-        certificates_but_one,
-        latin_1,
-    )
-}
 
 
 @pytest.fixture
@@ -172,10 +141,9 @@ def test_a_mistake_is_answered_with_what_to_do(
         (place / "s.toml").write_text(text)
     for name, text in mistake.get("files", {}).items():
         (place / name).write_text(text, encoding="utf-8")
-    given = GIVEN[mistake["given"]](place, request) if "given" in mistake else {}
-    line = mistake.get("do", "check s.toml")
-    for word, value in given.items():
-        line = line.replace(word, value)
+    if "given" in mistake:  # the function of this name lays it out
+        globals()[mistake["given"]](place, request)
+    line = mistake.get("do", "check s.toml").replace("PORT", str(free_ports(1)[0]))
     monkeypatch.setattr(sys, "argv", ["swarm", *shlex.split(line)])
     try:
         code = main()

@@ -15,15 +15,7 @@ import msgspec
 import psutil
 import pytest
 from support.fake_run import fake_run
-from support.monitor_rig import (
-    LIVE,
-    NOBODY,
-    SOMEBODY,
-    Rig,
-    hidden_truth,
-    little_scenario,
-    little_terrain,
-)
+from support.monitor_rig import LIVE, NOBODY, SOMEBODY, Rig, hidden_truth, little_scenario, little_terrain
 from support.processes import eventually
 from support.target_reports import fleet
 
@@ -393,9 +385,7 @@ time.sleep(60)
 @pytest.mark.network
 def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("launch_scripts.web.live_page.PORT_PATIENCE_S", 0.2)
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         config = MonitorConfig(web_port=port)
         with pytest.raises(

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.makers import stats
+from support.monitor_rig import hill
 
 from launch_scripts.check.scenario_check import network
 from launch_scripts.monitor.movers_view import OVER_S, alarm_marks, searched_points, target_labels
@@ -22,21 +24,13 @@ from launch_scripts.observe.latest_messages import LatestState, RunPlan, Vehicle
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of
 from launch_scripts.plain_text import Duration
-from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import Believed
 from swarm.wire.messages.processes import Alarm as WireAlarm
-from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Followed, VehicleState
-
-
-def hill(rows: int, cols: int) -> Terrain:
-    """Rises evenly to the east; cells of 10 m."""
-    elevation_m = np.tile(np.linspace(0, 50, cols, dtype=np.float32), (rows, 1))
-    return terrain_of_pace(np.ones((rows, cols), np.float32), 10.0, elevation_m)
 
 
 def columns(states: list[VehicleState], targets: list[int], target_ids: list[str]) -> VehicleColumns:
@@ -333,10 +327,7 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
 ) -> None:
     latest = LatestState(RunPlan((), (), 0, 1), GRID)
     told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
-    latest.heard(
-        Stats(role="agent", id="a0", incarnation=1, stamp_ns=2, counts={}, gauges={}, histograms={}, alarms=[told]),
-        2,
-    )
+    latest.heard(stats(alarms=[told]), 2)
     [alarm] = state_of(latest, 3).alarms
     assert alarm.line(GRID).isprintable()
     if text.isprintable():

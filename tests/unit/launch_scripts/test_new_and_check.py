@@ -304,18 +304,5 @@ def test_a_check_refuses_a_function_of_another_library_as_the_run_does(key: str)
     assert list(not_made(parse_scenario("[[targets]]"), GridSpec(4, 5, 10.0), np.ones((4, 5), np.float32))) == []
 
 
-@pytest.mark.parametrize(
-    ("hint", "words"),
-    [
-        (int, "a whole number"),
-        (float | None, "a number"),
-        (typing.Annotated[float, msgspec.Meta(gt=0, le=1e12)], "a number, more than 0"),
-        (typing.Annotated[int, msgspec.Meta(ge=0, le=9)], "a whole number, 0 to 9"),
-        (typing.Literal["a", "b"], "one of 'a', 'b'"),
-        (tuple[int, int] | str | None, "[a whole number, a whole number] or text in quotes"),
-        (tuple[str, ...], "a list"),
-        (Scenario, "a table"),
-    ],
-)
-def test_a_type_says_what_it_allows(hint: object, words: str) -> None:
-    assert expected(hint) == words
+def test_a_choice_is_said_with_all_that_it_allows() -> None:
+    assert expected(typing.Literal["a", "b"] | None) == "one of 'a', 'b'"

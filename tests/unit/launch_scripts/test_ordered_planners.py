@@ -65,40 +65,32 @@ def book(*orders: tuple[str, int, bool]) -> OrderBook:
 USUAL = ["t0", "t0.r1", "t1", "t1.r1"]
 
 
-def test_nothing_happens_while_nothing_is_ordered() -> None:
-    swarm = Swarm()
-    ordered, said = planners(swarm)
-    ordered.follow_orders(book(), set(), 0.0)
-    assert swarm.ids == USUAL
-    assert said == []
+def followed(swarm: Swarm, *turns: tuple[float, OrderBook], **part: Any) -> list[list[str]]:
+    """The planners here after each turn: a moment in s, and what is ordered then."""
+    ordered, _ = planners(swarm, **part)
+    found = []
+    for now_s, orders in turns:
+        ordered.follow_orders(orders, set(), now_s)
+        found.append(swarm.ids)
+    return found
 
 
 def test_an_added_target_gets_its_planner_and_standbys_and_loses_them_again() -> None:
-    swarm = Swarm()
-    ordered, _ = planners(swarm)
-    for now_s in (0.0, 1.0):
-        ordered.follow_orders(book(("x", 1, False)), set(), now_s)
-    assert swarm.ids == [*USUAL, "x", "x.r1"]
-    ordered.follow_orders(book(("x", 2, True)), set(), 2.0)
-    assert swarm.ids == USUAL
+    added, removed = book(("x", 1, False)), book(("x", 2, True))
+    with_x = [*USUAL, "x", "x.r1"]
+    assert followed(Swarm(), (0.0, added), (1.0, added), (2.0, removed)) == [with_x, with_x, USUAL]
 
 
 def test_a_target_of_the_scenario_that_is_removed_gets_its_planner_back_with_it() -> None:
-    swarm = Swarm()
-    ordered, _ = planners(swarm)
-    ordered.follow_orders(book(("t0", 1, True)), set(), 0.0)
-    assert swarm.ids == ["t1", "t1.r1"]
-    ordered.follow_orders(book(("t0", 2, False)), set(), 1.0)
-    assert swarm.ids == USUAL
+    turns = (0.0, book(("t0", 1, True))), (1.0, book(("t0", 2, False)))
+    assert followed(Swarm(), *turns) == [["t1", "t1.r1"], USUAL]
 
 
 def test_a_launcher_leaves_planners_of_the_scenario_that_it_did_not_start_to_others() -> None:
     swarm = Swarm()
     swarm.running = [running for running in swarm.running if running.spec.id in ("t0", "t1.r1")]
-    ordered, _ = planners(swarm)
-    ordered.follow_orders(book(("t0", 1, True), ("t1", 1, True)), set(), 0.0)
-    ordered.follow_orders(book(("t0", 2, False), ("t1", 2, False)), set(), 1.0)
-    assert swarm.ids == ["t0", "t1.r1"]
+    turns = (0.0, book(("t0", 1, True), ("t1", 1, True))), (1.0, book(("t0", 2, False), ("t1", 2, False)))
+    assert followed(swarm, *turns)[-1] == ["t0", "t1.r1"]
 
 
 def test_a_part_of_a_swarm_leaves_it_to_others_for_a_while() -> None:
@@ -116,9 +108,7 @@ def test_a_part_of_a_swarm_leaves_it_to_others_for_a_while() -> None:
 def test_a_launcher_that_starts_no_planners_starts_none_of_these() -> None:
     swarm = Swarm()
     swarm.running = []
-    ordered, _ = planners(swarm, ranks=())
-    ordered.follow_orders(book(("x", 1, False)), set(), 0.0)
-    assert swarm.ids == []
+    assert followed(swarm, (0.0, book(("x", 1, False))), ranks=()) == [[]]
 
 
 def test_one_that_cannot_start_is_said_once_and_ends_nothing() -> None:

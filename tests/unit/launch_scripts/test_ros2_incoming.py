@@ -17,9 +17,7 @@ from support.effort import few
 from support.ros_messages import path
 from support.ros_node import FakeNode
 
-from launch_scripts.gateways.ros2.gateway_settings import (
-    Robots,
-)
+from launch_scripts.gateways.ros2.gateway_settings import Robots
 from launch_scripts.gateways.ros2.incoming.ros_places import (
     MOST_CELLS,
     FrameReader,
@@ -58,17 +56,16 @@ def header(frame: str = "map") -> SimpleNamespace:
     return n(frame_id=frame, stamp=n(sec=0, nanosec=0))
 
 
-def odometry(x: float, y: float, forward: float = 0.0, left: float = 0.0, frame: str = "map") -> SimpleNamespace:
+def odometry(
+    x: float, y: float, forward: float = 0.0, left: float = 0.0, frame: str = "map", *turned: Any
+) -> SimpleNamespace:
     twist = n(twist=n(linear=n(x=forward, y=left, z=0.0)))
-    return n(header=header(frame), pose=n(pose=pose(x, y), covariance=()), twist=twist)
+    return n(header=header(frame), pose=n(pose=pose(x, y, *turned), covariance=()), twist=twist)
 
 
 messages = st.builds(
     lambda x, y, turned, forward, left, frame, kind: {
-        0: lambda: n(
-            header=header(frame), pose=n(pose=pose(x, y, turned), covariance=()),
-            twist=n(twist=n(linear=n(x=forward, y=left, z=0.0))),
-        ),
+        0: lambda: odometry(x, y, forward, left, frame, turned),
         1: lambda: n(header=header(frame), pose=pose(x, y, turned)),
         2: lambda: n(header=header(frame), pose=n(pose=pose(x, y, turned), covariance=())),
     }[kind](),

@@ -98,7 +98,7 @@ def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Pa
     assert ("unknown",) not in names
 
 
-def test_what_cannot_be_is_said_in_a_sentence(hill: Path, swarm: Swarm) -> None:
+def test_a_place_on_lethal_ground_is_refused_with_the_nearest_that_is_not(hill: Path) -> None:
     with pytest.raises(
         SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
     ):
@@ -109,8 +109,6 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path, swarm: Swarm) -> None:
         nearest = str(told.value).split("reached is ")[1].split()[0]
         ends = (nearest, end) if option == "--from" else (start, nearest)
         assert find_route(find_scenario(str(hill)), *ends).cost_s > 0
-    assert "give --from and --to" in swarm("route --from cell:1,1 --terrain", hill)[2]
-    assert "give --from, and --target or --to" in swarm("route --from cell:1,1")[2]
 
 
 def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(

@@ -23,7 +23,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
+from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
@@ -62,16 +62,13 @@ def stats(
     gauges: dict[str, float] | None = None,
     **histograms: list[float],
 ) -> Stats:
-    packed = {}
+    counters = Counters()
     for name, values in histograms.items():
-        histogram = Histogram()
         for value in values:
-            histogram.add(value)
-        packed[name] = histogram.buckets
-    return makers.stats(
-        role, id, incarnation=incarnation, stamp_ns=int(at_s * NS_PER_S), counts=counts or {}, gauges=gauges or {},
-        histograms=packed,
-    )  # fmt: skip
+            counters.observe(name, value)
+    stamp_ns = int(at_s * NS_PER_S)
+    told = {"incarnation": incarnation, "stamp_ns": stamp_ns, "counts": counts or {}, "gauges": gauges or {}}
+    return makers.stats(role, id, counters, **told)
 
 
 def fleet(

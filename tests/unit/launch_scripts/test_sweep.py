@@ -122,15 +122,6 @@ def test_each_study_of_the_project_can_be_read_and_each_of_its_variants_runs(nam
         assert told == list(study.outcomes), f"{name}: the report has {sorted(result.figures)}"
 
 
-def test_a_study_is_found_by_its_name_and_a_name_that_is_none_is_told_with_the_nearest(tmp_path):
-    assert study_path("laws").is_file()
-    assert study_path("some/laws.toml") == Path("some/laws.toml")
-    with pytest.raises(ConfigError, match="no study 'lows'; did you mean 'laws'"):
-        study_path("lows")
-    with pytest.raises(ConfigError, match=r"cannot read study nowhere\.toml: No such file"):
-        load_study(study_path("nowhere.toml"))
-
-
 # --- one trial ---------------------------------------------------------------------------------------------------
 
 
@@ -292,9 +283,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert min(found.values()) >= 88
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The exception comes while a future is cleared away: Python reports it there, and goes on."""
     told_of: list[int] = []
@@ -304,15 +294,10 @@ def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
             told_of.append(trial.seed)
             if len(told_of) == 2:
                 with contextlib.suppress(KeyboardInterrupt):
-                    signal.raise_signal(number)
+                    signal.raise_signal(signal.SIGTERM)
             told(trial, None)
 
     monkeypatch.setattr(Sweep, "run", run)
-    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            sweep_study(str(write_study(tmp_path)), None, 1, tmp_path / "out", as_json=False)
-    finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+    with pytest.raises(KeyboardInterrupt):
+        sweep_study(str(write_study(tmp_path)), None, 1, tmp_path / "out", as_json=False)
     assert len(told_of) == 2

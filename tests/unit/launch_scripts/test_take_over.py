@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -28,11 +29,6 @@ from swarm.runtime.health import BOARD_BYTES, GENERATION_BEFORE, Board, Health
 
 LAUNCHER = 100
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
-
-
-class Process:
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
 
 
 class Machine:
@@ -73,7 +69,7 @@ class Machine:
         for index, each in enumerate(self.running):
             if each.process is None and (each.begins_when is None or each.begins_when()):
                 each.begins_when = None
-                each.process = Process(200 + index)  # type: ignore[assignment]
+                each.process = SimpleNamespace(pid=200 + index)  # type: ignore[assignment]
                 each.health = bytearray(BOARD_BYTES)
 
     def happens(self, what: str) -> None:

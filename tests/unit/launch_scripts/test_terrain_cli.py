@@ -14,7 +14,6 @@ from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report import terrain_figure
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.load import load_scenario
-from swarm.errors import ConfigError
 
 runner = CliRunner()
 
@@ -135,7 +134,3 @@ def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_th
     scenarios = (find_scenario(str(file), preset) for preset in ("hiker", None))
     on_foot, driven = (find_route(each, "cell:1,1", "cell:10,15").cost_s for each in scenarios)
     assert on_foot > 8 * driven
-    with pytest.raises(ConfigError, match=r"no preset 'hikr'; did you mean 'hiker'\?; there are hiker, wheeled"):
-        told("info", file, "--preset", "hikr")
-    with pytest.raises(ConfigError, match=r"in the scenario jacksboro set cost\.preset"):
-        told("reach", "jacksboro", "--to", "cell:1,1", "--preset", "hiker")

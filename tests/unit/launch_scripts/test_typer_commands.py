@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support.command import Swarm
 from typer import BadParameter
 from typer._completion_classes import BashComplete  # what a shell asks: there is no public name for it
 
@@ -56,30 +57,21 @@ def test_every_command_completes_its_options_and_its_sub_commands() -> None:
             assert each.list_commands(None) == [name for name in offered(*path, "") if name[0] != "-"], path
 
 
-def test_every_command_answers_to_h_as_to_help(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_answers_to_h_as_to_help(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     for path, each in EVERY:
         if hasattr(each, "list_commands") or path[0] in ("up", "new", "check", "doctor"):
-            said = []
-            for option in ("-h", "--help"):
-                monkeypatch.setattr(sys, "argv", ["swarm", *path, option])
-                assert main() == 0
-                said.append(capsys.readouterr().out)
-            assert said[0] == said[1], path
-            assert f"Usage: {' '.join(['swarm', *path])} " in said[0]
-            assert max(map(len, said[0].splitlines())) <= 80
+            code, said, _ = told = swarm("", *path, "-h")
+            assert (code, told) == (0, swarm("", *path, "--help")), path
+            assert f"Usage: {' '.join(['swarm', *path])} " in said
+            assert max(map(len, said.splitlines())) <= 80
         # The others inherit it.
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
 
 
-def test_the_short_help_fits_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["swarm", "-h"])
-    assert main() == 0
-    rows = capsys.readouterr().out.splitlines()
+def test_the_short_help_fits_a_terminal(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    rows = swarm("-h")[1].splitlines()
     names = [
         row.split()[0] for row in inspect.cleandoc(cli.Root.__doc__ or "").splitlines() if row.startswith("  ")
     ]
@@ -139,35 +131,23 @@ def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatc
     assert offered("check", "nowhere/x") == []
 
 
-def test_the_shell_gets_its_words_from_the_command_itself(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shell_gets_its_words_from_the_command_itself(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
     """Through `main`, as the shell's function calls it."""
-    monkeypatch.setattr(sys, "argv", ["swarm"])
     asked = {"_SWARM_COMPLETE": "complete_bash", "COMP_WORDS": "swarm marks e", "COMP_CWORD": "2"}
     for name, value in asked.items():
         monkeypatch.setitem(os.environ, name, value)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert not ended.value.code
-    assert capsys.readouterr().out.split() == ["export"]
+    code, said, _ = swarm("")
+    assert (code, said.split()) == (0, ["export"])
 
 
 # --- swarm doctor -------------------------------------------------------------------------------------------------
 
 
-def doctor(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["swarm", "doctor", *words])
-    monkeypatch.setenv("COLUMNS", "80")
-    code = main()
-    return code, capsys.readouterr().out
-
-
 def test_doctor_looks_at_everything_and_says_how_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, said = doctor(monkeypatch, capsys)
+    code, said, _ = swarm("doctor")
     assert code == 0
     for about in machine.CHECKS:
         assert f": {about}: " in said, said
@@ -208,14 +188,14 @@ def test_what_doctor_finds_says_what_to_do(
 
 
 def test_a_folder_that_cannot_be_written_is_a_failure_and_the_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
     monkeypatch.setattr(machine, "CHECKS", {"disk": machine.CHECKS["disk"]})
     (tmp_path / "file").write_text("")
-    code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path / "file"))
+    code, said, _ = swarm("doctor --runs", tmp_path / "file")
     assert code == 1
     assert "Not a directory; choose another --runs" in " ".join(said.split())
-    code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path), "--json")
+    code, said, _ = swarm("doctor --json --runs", tmp_path)
     assert (code, '"ok": true' in said) == (0, True)
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support import slow_twins as naive
 from support.target_reports import RES, flat
 
 from launch_scripts.process_table import processes_of
@@ -138,22 +139,9 @@ def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
         assert cell in [to for _, to in where.steps(at)]
         cost += where.length_m(at, cell) * float(where.pace_s_per_m.flat[cell])
         at = cell
-    assert cost == pytest.approx(naive_cost(where, start, at))
-
-
-def naive_cost(where: TrueTerrain, start: int, end: int) -> float:
-    """Bellman-Ford: slow and obviously right."""
-    cost = {start: 0.0}
-    changed = True
-    while changed:
-        changed = False
-        for cell, so_far in list(cost.items()):
-            for _, to in where.steps(cell):
-                there = so_far + where.length_m(cell, to) * float(where.pace_s_per_m.flat[to])
-                if there < cost.get(to, math.inf) - 1e-12:
-                    cost[to] = there
-                    changed = True
-    return cost[end]
+    # Ways from a cell are ways to it turned round, on which a step has the pace of the cell that it leaves.
+    costs = naive.cost_to_go(where.pace_s_per_m, start, left_share=1.0)
+    assert cost == pytest.approx(RES * costs.flat[at])
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,16 @@ def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
     return watcher, heard
 
 
+def drive(swarm: SwarmModel, watcher: Watcher, ticks: int, every_s: float) -> None:
+    """An agent reports a vehicle at each tick, and the launcher listens."""
+    agent = swarm.bus("agent")
+    for tick in range(ticks):
+        report = fleet(100.0 * tick, ("a0-00", tick))
+        agent.publish(FLEET, report, region=0, author=report.author)
+        swarm.run(every_s)
+        watcher.listen(0.0)
+
+
 def followed() -> Followed:
     return Followed(vehicle="a0-00", target="t0", start=0, directions=b"", cost_s=1.0, lower_bound_s=1.0)
 
@@ -45,12 +55,7 @@ def followed() -> Followed:
 def test_positions_are_taken_oftener_than_they_are_sampled_and_the_last_is_the_newest() -> None:
     swarm = SwarmModel()
     watcher, heard = begun(swarm)
-    agent = swarm.bus("agent")
-    for tick in range(40):
-        report = fleet(100.0 * tick, ("a0-00", tick))
-        agent.publish(FLEET, report, region=0, author=report.author)
-        swarm.run(0.1)
-        watcher.listen(0.0)
+    drive(swarm, watcher, 40, 0.1)
     swarm.run(0.5)
     watcher.listen(0.0)
     told = [message.seq for message in heard if isinstance(message, Fleet)]
@@ -73,12 +78,7 @@ def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_other
 def test_what_is_said_last_is_recorded_also_if_it_was_not_due_yet() -> None:
     swarm = SwarmModel()
     watcher, heard = begun(swarm)
-    agent = swarm.bus("agent")
-    for tick in range(3):
-        report = fleet(100.0 * tick, ("a0-00", tick))
-        agent.publish(FLEET, report, region=0, author=report.author)
-        swarm.run(0.05)
-        watcher.listen(0.0)
+    drive(swarm, watcher, 3, 0.05)
     assert [message.seq for message in heard if isinstance(message, Fleet)] == [0]
     watcher.finish()
     assert [message.seq for message in heard if isinstance(message, Fleet)] == [0, 2]
