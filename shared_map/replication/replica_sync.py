@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 _JOIN = "map-join"
 _ENTER = "map-enter"
 _RESYNC = "map-resync:"
-"""Tags of what we ask: all sets, those of regions that we enter, and those that a digest showed to be missing."""
+"""Tags of queries: all sets, sets of regions that we enter, and sets that a digest showed to be missing."""
 _JOIN_TIMEOUT_S = 5.0
 _JOIN_TRIES = 5
 _JOIN_RETRY_NS = NS_PER_S // 2
@@ -82,13 +82,13 @@ class MapSync:
 
     The owning service calls `on_map_event` and `tick` before its own work, and `publish` with the result of
     `replica.write`. A replica with an author answers requests for its own sets and announces them in digests. A
-    keeper answers for all sets and announces those that it has written to disk.
+    keeper answers for all sets and announces the sets that it has written to disk.
 
     name         sender of digests; default: the replica's author; without one no digests are sent
     serves_all   answer for all authors
     committed    function that returns the contents of a full digest; default: the digest of the replica's own sets
     on_accepted  called with every set that is merged
-    on_digest    called with the author of every digest that is heard, and when
+    on_digest    called with the author of every received digest, and the time of its arrival
     near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
                  can matter there (`DigestInterest`)
     at_ticks     merge received sets at the next tick, all together, without waking a thread: for a service that
@@ -146,7 +146,7 @@ class MapSync:
         self._digest_interest = DigestInterest(self._name or "", self._digest_ns, near=near)
         self._listened_to: frozenset[str] | None = None
         self._asked_ns: dict[str, int] = {}  # author -> when its missing sets were asked for, until the ask ends
-        self._heard_ns: dict[str, int] = {}  # sender -> when its last digest came
+        self._received_ns: dict[str, int] = {}  # sender -> when its last digest came
 
     def start(self, now_ns: int) -> None:
         """Subscribes, serves, and requests all earlier statements."""
@@ -289,9 +289,9 @@ class MapSync:
         return sets
 
     def _admit(self, sets: Sequence[MarkSet], now_ns: int) -> None:
-        """Merges sets now, or later those of authors that exceed their quota."""
+        """Merges sets now; sets of authors that exceed their quota wait."""
         taken: list[MarkSet] = []
-        marks: dict[str, int] = {}  # author -> statements among those taken
+        marks: dict[str, int] = {}  # author -> number of its statements that are taken
         for each in sets:
             author = each.author
             stated = marks.get(author)
@@ -352,7 +352,7 @@ class MapSync:
         self._answer_some()
 
     def _answer_some(self) -> None:
-        """Answers those who ask for sets, by turns, until the work of this tick is done."""
+        """Answers queries for sets, by turns, until the work of this tick is done."""
         while self._answers and self._answers_left > 0:
             asked, bulk, found = self._answers.popleft()
             sets: list[MarkSet] = []
@@ -395,13 +395,13 @@ class MapSync:
             digest = replace(digest, held=held)
         if digest.author == self._name or not self._digests.add(digest, now_ns):
             return
-        if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
-            self._heard_ns[digest.author] = now_ns
+        if digest.author in self._received_ns or len(self._received_ns) < _MAX_NAMES:
+            self._received_ns[digest.author] = now_ns
         if is_keeper(digest.author) and digest.complete:
             self._digest_interest.keeper_spoke(digest.author, now_ns)
 
     def _choose_digests(self, now_ns: int) -> None:
-        """Listens to digests of those who may state something about what we hold."""
+        """Receives digests of authors which may make statements about regions that we hold."""
         before, chosen = self._listened_to, self._digest_interest.update(now_ns)
         if chosen == before:
             return
@@ -499,5 +499,5 @@ class MapSync:
         since_ns = self._digest_interest.since_ns(author)
         if since_ns is None:
             return False  # it may speak, we do not listen
-        heard_ns = max(self._heard_ns.get(author, since_ns), since_ns)
-        return author != self.replica.author and now_ns - heard_ns > 3 * self._digest_ns
+        received_ns = max(self._received_ns.get(author, since_ns), since_ns)
+        return author != self.replica.author and now_ns - received_ns > 3 * self._digest_ns

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from support import slow_twins as naive
 from support.planner_strategies import RULES, random_pace
@@ -27,7 +29,7 @@ def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
     return (rows - 1) * cost_grid.grid.cols + cols - 1
 
 
-def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
+def grown(pace: np.ndarray, target: int, rules: dict[str, Any]) -> CostToGoTree:
     ground = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig(**rules))
     ground.load(pace)
     tree = CostToGoTree(ground)
@@ -35,7 +37,7 @@ def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
     return tree
 
 
-def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict, rtol: float = 1e-5) -> None:
+def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict[str, Any], rtol: float = 1e-5) -> None:
     tree = grown(pace, target, rules)
     mine, parents = inner(tree, tree.cost), inner(tree, tree.parent)
     best = naive.cost_to_go(pace, target, **rules)

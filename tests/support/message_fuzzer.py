@@ -345,7 +345,7 @@ class MessageFuzzer:
         self._left = most_bytes
         with contextlib.suppress(ProtocolError, ValueError):
             payload = encode(self._made(kind))
-            return decode(payload, kind) if len(payload) <= most_bytes else None
+            return decode(payload, kind) if len(payload) <= most_bytes else None  # type: ignore[type-var]
         return None
 
 

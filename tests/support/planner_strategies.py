@@ -34,7 +34,7 @@ RULES: tuple[dict[str, Any], ...] = (
 
 def random_pace(rng: np.random.Generator, rows: int, cols: int, ratio: float, walls: float) -> NDArray[np.float32]:
     """Paces between 1 and `ratio`, log-uniform, with a share of lethal cells; the first passable cell is sure."""
-    pace = np.exp(rng.random((rows, cols)) * np.log(ratio)).astype(np.float32)
+    pace: NDArray[np.float32] = np.exp(rng.random((rows, cols)) * np.log(ratio)).astype(np.float32)
     pace[rng.random((rows, cols)) < walls] = np.inf
     if not np.isfinite(pace).any():
         pace[rng.integers(rows), rng.integers(cols)] = 1.0

@@ -93,7 +93,7 @@ def cost_to_go(
         into.append(there[allowed])
         costs.append(cost[allowed] + length_weight * length)
     graph = (np.concatenate(costs), (np.concatenate(into), np.concatenate(out)))
-    found: NDArray[np.float64] = dijkstra(csr_matrix(graph, shape=(pace.size, pace.size)), indices=target)
+    found: NDArray[np.float64] = dijkstra(csr_matrix(graph, shape=(pace.size, pace.size)), indices=target)  # type: ignore[call-overload]
     return found.reshape(pace.shape)
 
 

@@ -40,7 +40,7 @@ class Follower:
         self._at = 0
         self._turns: Sequence[int] = ()
         """For an any-angle route the indices of the cells in which it turns, its first and last included; and
-        those."""
+        these cells."""
         self._turn_cells: Sequence[int] = ()
         self._bounds: tuple[int, int, int, int] | None = None
         self.left = self.changes = self.version = 0
@@ -106,7 +106,7 @@ class Follower:
         """Returns the point where an any-angle route passes one of its next cells, as row and col: the midpoint of
         the segment within the cell. None if it is the middle of the cell.
 
-        A cell that the segment does not cross, whatever a planner says, is driven through its middle.
+        A cell that the segment does not cross, whatever a planner states, is driven through its middle.
         """
         index = self._find(cell) if self._turns else None
         if index is None:

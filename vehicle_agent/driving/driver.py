@@ -155,7 +155,7 @@ class Driver:
             self._waits.pop(vehicle.id, None)
             return False
         before, since_ns = self._waits.setdefault(vehicle.id, (awaits, now_ns))
-        if before != awaits:  # another, or one of those before it has gone on
+        if before != awaits:  # another vehicle, or a vehicle ahead has moved on
             self._waits[vehicle.id] = awaits, now_ns
         elif now_ns - since_ns > self.patience_ns:
             del self._waits[vehicle.id]

@@ -138,7 +138,7 @@ class PluginDynamics:
         self._guard = guard
         self._tick_s = 0.0
         self._were: dict[str, tuple[float, float]] = {}
-        """Vehicle -> speed and heading at the end of the last tick, of those which drove in it."""
+        """Vehicle -> speed and heading at the end of the last tick, of vehicles which drove in it."""
         self._are: dict[str, tuple[float, float]] = {}
         """The same of this tick."""
 

@@ -172,7 +172,7 @@ def together(motions: Sequence[Motion]) -> Rows:
 
 
 def roll(rows: Rows, paces: NDArray[np.floating], seconds: float) -> NDArray[np.bool_]:
-    """Drives those that reach no end of a stretch in this time; returns which.
+    """Drives the vehicles that reach no end of a stretch in this time; returns which.
 
     paces  s/m, by cell
     """

@@ -112,7 +112,7 @@ def test_zenohd_admits_the_processes_of_a_scenario_and_needs_one_with_certificat
     named = {name for each in config["access_control"]["subjects"] for name in each.get("cert_common_names", ())}
     assert named == set(certificate_names(load_scenario(scenario)))
     assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
-    assert run("zenohd", out, "--listen", "tcp/127.0.0.1:7447").exit_code == 0
+    assert run("zenohd", out, "--force", "--listen", "tcp/127.0.0.1:7447").exit_code == 0
     assert "access_control" not in json.loads(out.read_text())
 
 

@@ -208,7 +208,7 @@ def test_damage_that_comes_up_while_a_keeper_runs_is_noticed_at_the_row(tmp_path
 
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=r"cannot open .*map\.sqlite: File exists"):
+    with pytest.raises(StoreError, match=r"cannot write .*file: File exists"):
         KeeperStore(tmp_path / "file" / "map.sqlite")
 
 
