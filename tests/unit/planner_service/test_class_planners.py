@@ -92,11 +92,9 @@ _BATCHES = st.lists(st.tuples(st.sampled_from([0, 0, 1, 2, 3, 4]), _STATEMENTS),
 """Statements with the number of the class that they are for; of the fourth there is none."""
 
 
-@settings(max_examples=few(60), deadline=None)
+@settings(max_examples=few(60))
 @given(batches=_BATCHES, seed=st.integers(0, 1 << 30))
-def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(
-    batches: list[tuple[int, list[Any]]], seed: int
-) -> None:
+def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(batches, seed):
     _, terrain, classes = _made()
     in_turn, at_once = (ClassMaps(CostMap(terrain), classes, _NUMBERS) for _ in range(2))
     said: dict[int, dict[int, Any]] = {number: {} for number in range(5)}
@@ -190,9 +188,7 @@ def world() -> _World:
     return made
 
 
-def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(
-    world: _World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(world, monkeypatch):
     monkeypatch.setattr(class_planners, "UNUSED_NS", 5 * NS_PER_S)  # a minute of ticks would show no more
     assert world.trees() == ["ground"]
     reply = world.ask(CostRequest(cells=[world.target], vehicle_class="walker"))
@@ -203,9 +199,7 @@ def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(
     assert world.trees() == ["ground"]
 
 
-def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(
-    world: _World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(world, monkeypatch):
     monkeypatch.setattr(class_planners, "UNUSED_NS", NS_PER_S)
     tags = []
     for _ in range(2):

@@ -26,9 +26,5 @@ def test_a_route_that_is_cut_has_the_travel_time_of_the_whole(length_weight: flo
         np.testing.assert_allclose(short.gap, long.gap, rtol=1e-5)
     assert cut[2].remaining_s == whole[2].remaining_s == 0.0
     first = cut[0]
-    after = tree.routes([GRID.cell(*_end(first.start, first.directions))])[0]
+    after = tree.routes([walk(GRID, first.start, first.directions)[-1]])[0]
     np.testing.assert_allclose(first.remaining_s, after.cost_s, rtol=1e-5)
-
-
-def _end(start: int, directions: bytes) -> tuple[int, int]:
-    return divmod(walk(GRID, start, directions)[-1], GRID.cols)

@@ -18,9 +18,7 @@ GRID = GridSpec(20, 30, 10.0)
 
 
 @given(st.lists(st.tuples(st.integers(-(1 << 31), (1 << 32) - 1), st.sampled_from(RouteStatus))))
-def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(
-    asked: list[tuple[int, RouteStatus]],
-) -> None:
+def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(asked):
     followers = Followers(GRID, 10, 0)
     for n, (cell, status) in enumerate(asked):
         seconds = 1.0 if status is RouteStatus.OK else math.inf

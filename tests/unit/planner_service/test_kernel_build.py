@@ -44,9 +44,7 @@ max_speed_m_per_s = 5.0
 @pytest.mark.parametrize("directional", [False, True])
 @pytest.mark.parametrize("aloft", [0, 1, 2])
 @pytest.mark.parametrize("routes", ["grid", "pulled"])
-def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(
-    directional: bool, aloft: int, routes: str
-) -> None:
+def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(directional, aloft, routes):
     """By the terrains themselves, as planners come by their kernels."""
     given = scenario(directional=directional, aloft=aloft, routes=routes)
     needed = needed_kernels(given)
@@ -172,9 +170,7 @@ class Disk:
             self.there.add(self.coming.pop(0))
 
 
-def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_there(monkeypatch):
     disk = Disk(monkeypatch)
     needed = needed_kernels(scenario(aloft=1))
     disk.coming = [name_of(kernel) for kernel in needed.first]
@@ -207,9 +203,7 @@ def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.Monke
         (["mend", "arrivals"], [*filter(lambda kernel: name_of(kernel) in ("mend", "arrivals"), all_kernels())]),
     ],
 )
-def test_a_builder_by_hand_builds_what_is_named_or_all(
-    options: list[str], wanted: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_builder_by_hand_builds_what_is_named_or_all(options, wanted, monkeypatch):
     built: list[Any] = []
     monkeypatch.setattr(kernel_build, "build", built.extend)
     monkeypatch.setattr(kernel_build, "is_loaded", lambda _: False)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.scripted_planner import COLS, GRID, ROWS, World, pose
 
@@ -59,9 +59,7 @@ def test_map_changes_of_a_tick_are_taken_in_together(ready: World) -> None:
     ]
 
 
-def test_changes_wait_as_long_as_repairs_have_had_their_share_and_no_route_passes_them_meanwhile(
-    ready: World,
-) -> None:
+def test_changes_wait_as_long_as_repairs_have_had_their_share_and_no_route_passes_them_meanwhile(ready):
     ready.planner._push_ns = NS_PER_S // 5  # changes wait no longer, but for the budget: a tenth of a core
     ready.tree.answers = [Update("repair", GRID.window, 9, repair_ns=80_000_000)]
     ready.mark(1)
@@ -108,7 +106,6 @@ def test_marks_seen_while_growing_cost_one_more_tree_not_one_each(ready: World) 
     ready.tree.answers = [Update("none", wants_full=True)] * 4
     ready.mark(1)
     (grow,) = ready.tick()
-    assert isinstance(grow, Work)
     for cell in (10, 20, 29):
         ready.mark(cell)
         assert ready.tick() == []
@@ -124,7 +121,6 @@ def test_adoption_is_told_all_that_changed_since_the_snapshot_and_only_that(read
     ready.tree.answers = [Update("none", wants_full=True), Update("repair", Window(0, 0, 3, 3), 9)]
     ready.mark(0)
     (grow,) = ready.tick()
-    assert isinstance(grow, Work)
     ready.mark(GRID.cell(5, 5))
     ready.tick()
     ready.mark(GRID.cell(15, 15))
@@ -142,12 +138,10 @@ def test_a_growth_is_of_the_map_that_it_was_decided_on_whatever_changes_before_i
     ready.mark(1)
     (grow,) = ready.tick()
     ready.mark(2)
-    assert isinstance(grow, Work)
     assert grow.job().map_version == 1
     assert ready.map.version == 2
 
 
-@settings(deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: random.Random) -> None:
     world = World()

@@ -25,7 +25,6 @@ from swarm.wire.messages.planning import (
     CostRequest,
     PlannerStatus,
     PushedRoute,
-    RouteReply,
     RouteRequest,
     TargetPose,
 )
@@ -108,34 +107,6 @@ def test_a_target_whose_tracker_never_came_is_an_alarm_until_one_comes() -> None
     assert [each.kind for each in alarms.current() if each.over_ns is None] == []
 
 
-def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None:
-    pace = flat()
-    pace[:, 25] = np.inf
-    pace[20, 25] = pace[2, 25] = 0.1
-    swarm = Swarm(pace)
-    swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.run(0.5)
-    start = GRID.cell(20, 5)
-    before = swarm.ear.routes(start, GRID.cell(20, 45), vehicles=["cut", "clear"])
-    gate = GRID.cell(20, 25)
-    assert gate in walk(GRID, start, before.routes[0].directions)
-    for _ in range(12):
-        swarm.report(("cut", start), ("clear", GRID.cell(20, 45)))
-        swarm.run(0.1)
-    swarm.ear.heard = []
-    swarm.mark(gate)
-    swarm.run(0.2)
-    (pushed,) = swarm.ear.of(PushedRoute)
-    assert (pushed.vehicle, pushed.target) == ("cut", "t")
-    around = walk(GRID, pushed.route.start, pushed.route.directions)
-    assert gate not in around
-    assert GRID.cell(2, 25) in around
-    swarm.run(1)
-    stats = swarm.ear.last_stats()
-    assert stats.counts["marks_merged"] == 1
-    assert sum(stats.histograms["mark_to_tree_ms"].values()) == 1
-
-
 def test_after_a_reconnect_every_follower_is_pushed_its_route_as_one_before_may_have_been_lost() -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(20, 5)
@@ -211,11 +182,9 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
     watch.on_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
     planner.tick(0)
     whole = planner.answer(RouteRequest(cells=[198 * 200]), 0)
-    assert isinstance(whole, RouteReply)
     assert len(whole.routes[0].directions) > 20_000
     assert whole.routes[0].remaining_s == 0
     reply = planner.answer(RouteRequest(cells=[198 * 200] * MOST_ROUTES), 0)
-    assert isinstance(reply, RouteReply)
     assert all(route.remaining_s > 0 for route in reply.routes)
     assert len(encode(reply)) < ROUTE.answer_bytes
 

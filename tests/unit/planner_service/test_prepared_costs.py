@@ -67,9 +67,7 @@ def test_costs_of_another_terrain_are_never_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "another array"])
-def test_damaged_files_are_computed_again_and_that_is_said(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
-) -> None:
+def test_damaged_files_are_computed_again_and_that_is_said(tmp_path, caplog, damage):
     """Kernels check no index that they read from them."""
     terrain = mapped(tmp_path)
     good = PreparedCosts(tmp_path, terrain, CONFIG)

@@ -21,9 +21,7 @@ def test_the_example_does_what_it_says() -> None:
 
 
 @pytest.mark.parametrize("strategy", get_args(Strategy))
-def test_routes_are_driven_as_they_say_and_their_bounds_hold_while_target_and_map_change(
-    strategy: Strategy,
-) -> None:
+def test_routes_are_driven_as_they_say_and_their_bounds_hold_while_target_and_map_change(strategy):
     pace = random_pace(np.random.default_rng(5), 30, 40, 8.0, 0.15)
     finder = RouteFinder(pace, target=(15, 10), resolution_m=5.0, strategy=strategy, k_min=0)
     for col in range(11, 30):

@@ -61,9 +61,7 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
         (StrategyRow(OnMove.SCHEDULED_WINDOW, renews_within_budget=True), ["window", "window", "exact"] * 2),
     ],
 )
-def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
-    row: StrategyRow, expected: list[str]
-) -> None:
+def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(row, expected):
     exact_s = GRID.cells * MODEL_EXACT_NS_PER_CELL * 1e-9
     config = PlannerConfig(k_min=0, cpu_budget=exact_s / 2.5 * PlannerConfig().tick_hz)
     assert kinds_of_moves(config, row, len(expected)) == expected
@@ -169,9 +167,7 @@ def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, sai
 
 
 @pytest.mark.parametrize("took_ms", [[500], [1000], [1500], [5000], [5000, 1000, 4000]])
-def test_growths_that_took_long_as_they_were_cut_up_do_not_leave_a_large_tree_to_windows(
-    took_ms: list[int],
-) -> None:
+def test_growths_that_took_long_as_they_were_cut_up_do_not_leave_a_large_tree_to_windows(took_ms):
     times = GrowthTimes(GridSpec(4096, 4096, 10.0), PlannerConfig(cpu_budget=0.05, tick_hz=5.0), True, False, None)
     for each in took_ms:  # 5,000 where ten planners grow at once on a busy machine
         times.observe_full_ns(each * 1_000_000)
@@ -232,9 +228,7 @@ def test_a_large_tree_in_pieces_is_not_turned_into_one_with_all_costs_between_tw
     assert tree.update(pace, grid.cell(100, 102), [], 0).kind == "window"
 
 
-def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_all_costs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_all_costs(monkeypatch):
     tree, pace, grid = large_tree()
     grown = tree.full_job(grid.cell(100, 101))()  # asked for while the row in force was exact
     for _ in range(3):
@@ -247,9 +241,7 @@ def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_
 
 @pytest.mark.parametrize("tick_hz", [1.0, 5.0, 20.0])
 @pytest.mark.parametrize("cpu_budget", [0.05, 0.5, 1.0])
-def test_work_and_the_rest_after_it_keep_to_the_share_of_a_core_whatever_the_ticks(
-    tick_hz: float, cpu_budget: float
-) -> None:
+def test_work_and_the_rest_after_it_keep_to_the_share_of_a_core_whatever_the_ticks(tick_hz, cpu_budget):
     config = PlannerConfig(cpu_budget=cpu_budget, tick_hz=tick_hz)
     times = GrowthTimes(GridSpec(64, 64, 10.0), config, True, False, None)
     assert times.rest_ns(10_000_000) == pytest.approx(10_000_000 / cpu_budget, abs=1)

@@ -76,7 +76,7 @@ def test_far_from_the_target_strides_hold_where_windows_alone_drift() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 60))
-@settings(max_examples=few(60), deadline=None)
+@settings(max_examples=few(60))
 def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_wide(seed: int, steps: int) -> None:
     grid = GridSpec(256, 256, 1.0)
     schedule = WindowSchedule(grid, 8)
@@ -135,9 +135,7 @@ def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:
     assert found[10.0][1] > found[0.0][1]
 
 
-def test_on_a_large_map_a_forced_range_grows_as_far_as_the_vehicle_without_a_worker(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_on_a_large_map_a_forced_range_grows_as_far_as_the_vehicle_without_a_worker(monkeypatch):
     monkeypatch.setattr(growth_times, "INLINE_NS", 50_000)
     pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
     play = Play(pace, PlannerConfig(k_min=0, cpu_budget=1e-9), chosen_by=STAGES["rotate"])

@@ -11,9 +11,7 @@ from swarm.grid import GridSpec
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below(seed, monkeypatch):
     chance = np.random.default_rng(seed)
     pace = chance.uniform(0.02, 1.0, (24, 31)).astype(np.float32)
     pace[chance.random(pace.shape) < 0.2] = np.inf

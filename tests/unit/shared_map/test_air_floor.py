@@ -55,9 +55,7 @@ def slow_lift(floor: NDArray[np.float64], grade: float, resolution_m: float) -> 
 
 
 @given(ground(), st.sampled_from([0.02, 0.15, 1.0]), st.sampled_from([1.0, 30.0]))
-def test_a_lifted_floor_is_that_of_its_slow_twin_and_no_step_is_steeper(
-    heights: NDArray[np.float32], grade: float, resolution_m: float
-) -> None:
+def test_a_lifted_floor_is_that_of_its_slow_twin_and_no_step_is_steeper(heights, grade, resolution_m):
     floor = clearance_floor(heights, 60.0)
     lifted = lifted_floor(floor, grade, resolution_m)
     np.testing.assert_allclose(lifted, slow_lift(floor, grade, resolution_m), rtol=2e-7)
@@ -72,10 +70,8 @@ def test_a_lifted_floor_is_that_of_its_slow_twin_and_no_step_is_steeper(
 
 
 @given(ground(), st.integers(0, 2**32), st.sampled_from([5.0, 60.0]))
-@settings(max_examples=few(60), deadline=None)
-def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres_too(
-    heights: NDArray[np.float32], seed: int, clearance_m: float
-) -> None:
+@settings(max_examples=few(60))
+def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres_too(heights, seed, clearance_m):
     grid = GridSpec(*heights.shape, 30.0)
     closed = np.random.default_rng(seed).random(heights.shape) < 0.1
     flown = air_ground(grid, heights, AirConfig(clearance_m=clearance_m), closed=closed)

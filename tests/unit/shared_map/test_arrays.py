@@ -35,7 +35,6 @@ def test_a_mark_leaves_the_file_and_every_other_process_as_they_were(tmp_path: P
     save_prepared(tmp_path, made, pace)
     files = {path: path.read_bytes() for path in tmp_path.glob("*.npy")}
     terrain = load_prepared(tmp_path)
-    assert terrain is not None
     cost_map = CostMap(terrain)
     mark(cost_map, 3 * 400 + 4)
     assert np.isinf(cost_map.pace_s_per_m[3, 4])

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.height_models import written
+from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher import fetched_terrain
@@ -18,13 +19,12 @@ from shared_map.keeper.base_map_server import LAYERS, BaseMapServer, describe, p
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.bus.bus import AskEnded, Bus, Event, Replied
+from swarm.bus.bus import Bus, Event, Replied
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BaseMap, BaseMapRequest, BaseMapTile
-from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
 SCENARIO = Scenario(
@@ -53,9 +53,7 @@ def same(one: Terrain, other: Terrain) -> bool:
 
 
 @given(st.permutations(pieces()), st.integers(0, 5))
-def test_a_terrain_in_pieces_in_any_order_and_twice_is_the_same_terrain(
-    parts: list[BaseMapTile], again: int
-) -> None:
+def test_a_terrain_in_pieces_in_any_order_and_twice_is_the_same_terrain(parts, again):
     copy = copied()
     for tile in parts:
         assert copy.take(tile)
@@ -86,9 +84,7 @@ def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
         ({"region": 1}, "expected|digest"),
     ],
 )
-def test_a_false_piece_is_refused_in_a_sentence_and_the_true_one_still_taken(
-    change: dict[str, object], says: str
-) -> None:
+def test_a_false_piece_is_refused_in_a_sentence_and_the_true_one_still_taken(change, says):
     copy = copied()
     true = pack(TERRAIN, "ground", 0)
     with pytest.raises(ProtocolError, match=says):
@@ -218,8 +214,6 @@ def test_a_keeper_refuses_what_is_no_piece_of_its_map(request_: BaseMapRequest, 
     network, events = Network(BaseMapServer(TERRAIN, "0")), list[Event]()
     network.ask(BASE_TILES, request_, events.append, tag="t", keeper="0")
     (ended,) = events
-    assert isinstance(ended, AskEnded)
-    assert ended.failure is not None
     assert says in ended.failure
 
 
@@ -234,9 +228,7 @@ def test_every_keeper_answers_for_its_terrain() -> None:
     assert sorted(each.keeper for each in found if isinstance(each, BaseMap)) == ["k1", "k2"]
 
 
-def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(tmp_path, monkeypatch):
     scenario = msgspec.structs.replace(SCENARIO, terrain=TerrainConfig(source="missing.tif"))
     fetched: list[str] = []
 
@@ -246,10 +238,7 @@ def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(
 
     monkeypatch.setattr(fetched_terrain, "open_bus", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(fetched_terrain, "fetch_base_map", fetch)
-    info = RunInfo(
-        run_id="r", role="keeper", id="0", incarnation=1, scenario="s", terrain=TERRAIN.digest, rows=300, cols=520,
-        resolution_m=30.0, started_ns=1,
-    )  # fmt: skip
+    info = run_info(TERRAIN.grid, role="keeper", id="0", terrain=TERRAIN.digest)
     for changed, expected in ((False, 1), (False, 1), (True, 2)):
         if changed:
             whole = bytearray((tmp_path / "pace.npy").read_bytes())

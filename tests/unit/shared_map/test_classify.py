@@ -67,7 +67,6 @@ def test_rules_agree_with_the_labels_of_davos(davos: tuple[Source, Labels]) -> N
 
 def test_learning_from_labels_holds_on_polygons_it_has_not_seen(davos: tuple[Source, Labels]) -> None:
     source, labels = davos
-    assert source.photo is not None
     true, predicted = held_out(source.photo, source.elevation_m, 10.0, labels.classes, labels.groups)
     table = confusion(true, predicted)
     assert np.trace(table) / table.sum() > 0.7

@@ -7,16 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.map_strategies import (
-    AUTHORS,
-    GRID,
-    ZONES,
-    Composite,
-    held_winners,
-    mark_sets,
-    naive_winners,
-    set_of,
-)
+from support.map_strategies import AUTHORS, GRID, ZONES, Composite, held_winners, mark_sets, naive_winners, set_of
 from support.swarm_model import LossyLinks, SwarmModel
 
 from shared_map.keeper.compaction import CompactionPlan, compact
@@ -246,33 +237,6 @@ def test_a_tile_is_due_when_an_author_dies_or_is_alive_after_all_or_an_earlier_o
 
 
 # --- services -----------------------------------------------------------------------------------------------
-
-
-def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
-    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
-    stores = [KeeperStore(":memory:") for _ in range(2)]
-    keepers = [swarm.keeper(f"k{n}", store) for n, store in enumerate(stores)]
-    listener = swarm.listener("p")
-    swarm.run(6)
-    cells = np.arange(0, GRID.cells, 9)
-    for incarnation in range(12):
-        name = f"a1.{incarnation + 1}"
-        author = swarm.writer(name)
-        swarm.run(1)
-        author.sync.publish(author.replica.write(cells, [LETHAL, CLEAR][incarnation % 2], 0.0, swarm.now_ns))
-        swarm.run(1)
-        swarm.kill(name)
-    winners = held_winners(author.replica)
-    swarm.run(20)
-    late = swarm.listener("late")
-    swarm.run(2)
-    for service in (*keepers, listener, late):
-        assert held_winners(service.replica) == winners
-        assert service.replica.held.fingerprint() == keepers[0].replica.held.fingerprint()
-        assert service.replica.held.capacity.marks == len(cells)
-        assert service.replica.held.capacity.sets == GRID.tiles
-    for store in stores:
-        assert len(list(store.load())) == GRID.tiles
 
 
 def test_an_author_that_was_only_cut_off_says_all_again() -> None:

@@ -17,10 +17,7 @@ from swarm.runtime.membership import check_same_run
 from swarm.runtime.role_setup import RoleSetup
 
 SCENARIO = """
-[terrain]
-source = "synthetic"
-rows = 40
-cols = 50
+terrain = { source = "synthetic", rows = 40, cols = 50 }
 [[cost.zones]]
 kind = "forbidden"
 polygon_m = [[0, 0], [200, 0], [200, 200], [0, 200]]

@@ -25,9 +25,7 @@ def terrain(radius_m: float = 0.0, seed: int = 1) -> Terrain:
     return terrain_of_pace(pace, 10.0, vehicle_radius_m=radius_m)
 
 
-def marks(
-    *statements: tuple[int, MarkKind, float],
-) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.float32]]:
+def marks(*statements):
     cells, kinds, paces = zip(*statements, strict=True)
     return np.array(cells, np.uint32), np.array(kinds, np.uint8), np.array(paces, np.float32)
 
@@ -58,11 +56,9 @@ one_statement = st.tuples(
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 4.0, 6.0, 16.0, 33.0])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(batches=st.lists(st.lists(one_statement, max_size=12), max_size=6))
-def test_any_sequence_of_marks_gives_the_composite_made_from_scratch(
-    radius_m: float, batches: list[list[tuple[int, MarkKind, float]]]
-) -> None:
+def test_any_sequence_of_marks_gives_the_composite_made_from_scratch(radius_m, batches):
     prior = terrain(radius_m)
     cost_map = CostMap(prior)
     known: dict[int, tuple[MarkKind, float]] = {}
@@ -126,7 +122,6 @@ a_window = st.builds(
 )
 
 
-@settings(deadline=None)
 @given(old=st.lists(a_window, max_size=30), new=st.lists(a_window, max_size=60))
 def test_merged_windows_are_the_least_that_cover_all_and_do_not_touch(old: list[Window], new: list[Window]) -> None:
     others = merged(old)

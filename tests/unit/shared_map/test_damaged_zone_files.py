@@ -116,16 +116,14 @@ def closed_by(file: str, kind: str) -> np.ndarray:
     return np.asarray(pace != np.float32(0.1))
 
 
-@settings(max_examples=few(400), deadline=None)
+@settings(max_examples=few(400))
 @given(
     shapes(),
     st.sampled_from(sorted(DAMAGES)),
     st.sampled_from(["forbidden", "water", "factor", "keep_in"]),
     st.integers(),
 )
-def test_a_damaged_feature_closes_its_ground_or_ends_the_start(
-    tmp_path_factory: pytest.TempPathFactory, drawn: list[Any], name: str, kind: str, seed: int
-) -> None:
+def test_a_damaged_feature_closes_its_ground_or_ends_the_start(tmp_path_factory, drawn, name, kind, seed):
     chance, path = random.Random(seed), tmp_path_factory.mktemp("damage") / "a.geojson"
     if kind == "keep_in":
         drawn = [shape for shape in drawn if shape.geom_type != "LineString"]

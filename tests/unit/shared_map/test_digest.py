@@ -4,7 +4,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shared_map.replication.digest import Ledger, PendingDigests, fingerprint, parts_of
@@ -33,7 +33,6 @@ def test_equal_holdings_give_equal_bytes_whatever_the_order(held: Rows, random: 
     assert fingerprint(a) == fingerprint(b)
 
 
-@settings(deadline=None)
 @given(rows, rows)
 def test_missing_and_ahead_name_exactly_what_is_newer(ours: Rows, theirs: Rows) -> None:
     ledger = ledger_of(ours)
@@ -71,9 +70,7 @@ tables = st.dictionaries(
 
 
 @given(tables, tables, st.integers(100, 400))
-def test_the_parts_of_a_digest_name_each_set_once_and_between_them_cover_everything(
-    ours: dict[str, set[int]], theirs: dict[str, set[int]], most_bytes: int
-) -> None:
+def test_the_parts_of_a_digest_name_each_set_once_and_between_them_cover_everything(ours, theirs, most_bytes):
     """Parts show the same to be missing on their side as the whole digest does."""
     ledger, kept = Ledger(), Ledger()
     for filled, table in ((ledger, ours), (kept, theirs)):
@@ -102,12 +99,9 @@ def test_the_parts_of_a_digest_name_each_set_once_and_between_them_cover_everyth
     assert len(lacking) == len(set(lacking))
 
 
-def rows_of(many: int) -> bytes:
-    return np.array([(tile, 1, 1) for tile in range(many)], DIGEST_ROW).tobytes()
-
-
 def digest_of(sender: str, authors: int = 1, rows: int = 1, **fields: Any) -> Digest:
-    held = {f"{sender}{n or ''}": rows_of(rows) for n in range(authors)}
+    stated = np.array([(tile, 1, 1) for tile in range(rows)], DIGEST_ROW).tobytes()
+    held = {f"{sender}{n or ''}": stated for n in range(authors)}
     return Digest(author=sender, role="agent", held=held, **fields)
 
 

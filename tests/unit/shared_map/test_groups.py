@@ -34,9 +34,7 @@ policies = st.fixed_dictionaries({name: st.tuples(lists, lists) for name in NAME
 
 
 @given(policies, st.sampled_from(NAMES), st.sampled_from(NAMES))
-def test_a_group_is_heard_where_the_reader_reads_it_and_it_writes_to_the_reader(
-    policy: dict[str, tuple[list[str], list[str]]], reader: str, writer: str
-) -> None:
+def test_a_group_is_heard_where_the_reader_reads_it_and_it_writes_to_the_reader(policy, reader, writer):
     heard = readable_groups(scenario_of(policy), reader)
     reads, writes = policy[reader][0], policy[writer][1]
     allowed = reader == writer or (("*" in reads or writer in reads) and ("*" in writes or reader in writes))
@@ -50,24 +48,14 @@ def test_everybody_hears_everybody_unless_told_otherwise() -> None:
 
 
 def test_the_planner_of_a_target_hears_whom_any_group_hears_that_chases_it() -> None:
-    text = """
-[[targets]]
-name = "t"
-count = 2
-[[groups]]
-name = "red"
-reads = []
-targets = ["t0"]
-[[groups]]
-name = "blue"
-reads = ["grey"]
-targets = ["t0", "t1"]
-[[groups]]
-name = "grey"
-reads = []
-targets = ["t1"]
-"""
-    scenario = parse_scenario(text)
+    scenario = parse_scenario("""
+        targets = [{ name = "t", count = 2 }]
+        groups = [
+            { name = "red", reads = [], targets = ["t0"] },
+            { name = "blue", reads = ["grey"], targets = ["t0", "t1"] },
+            { name = "grey", reads = [], targets = ["t1"] },
+        ]
+        """)
     assert readable_for_target(scenario, "t0") == {"red", "blue", "grey"}
     assert readable_for_target(scenario, "t1") == {"blue", "grey"}
     book = OrderBook()
@@ -90,9 +78,7 @@ def writer(group: str) -> MapReplica:
     st.lists(st.tuples(st.sampled_from(NAMES), st.integers(0, GRID.cells - 1)), max_size=25),
     st.randoms(use_true_random=False),
 )
-def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(
-    read: set[str], said: list[tuple[str, int]], chance: object
-) -> None:
+def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(read, said, chance):
     writers = {name: writer(name) for name in NAMES}
     heard: list[MarkSet] = []
     for now_ns, (name, cell) in enumerate(said):
@@ -132,22 +118,12 @@ PRIOR = [
 ]
 TRUTH = [PRIOR[0], "#............#....#", *PRIOR[2:]]
 TWO_GROUPS = """
-[[targets]]
-name = "t"
-walk = "still"
-[[groups]]
-name = "red"
-vehicles = 1
-cells = [[1, 10]]
-writes = {writes}
-[[groups]]
-name = "blue"
-vehicles = 1
-cells = [[1, 2]]
-[vehicles]
-per_agent = 1
-sense_range_m = 30.0
-capture_range_m = 10.0
+targets = [{{ name = "t", walk = "still" }}]
+groups = [
+    {{ name = "red", vehicles = 1, cells = [[1, 10]], writes = {writes} }},
+    {{ name = "blue", vehicles = 1, cells = [[1, 2]] }},
+]
+vehicles = {{ per_agent = 1, sense_range_m = 30.0, capture_range_m = 10.0 }}
 """
 
 

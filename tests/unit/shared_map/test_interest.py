@@ -34,9 +34,7 @@ steps = st.lists(st.one_of(regions, st.tuples(st.sampled_from(["a.0", "b.0", "mi
 
 
 @given(steps)
-def test_within_its_regions_it_equals_one_that_holds_all(
-    happened: list[frozenset[int] | tuple[str, tuple[int, MarkKind]]],
-) -> None:
+def test_within_its_regions_it_equals_one_that_holds_all(happened):
     near_map, all_map, own_map = CostMap(TERRAIN), CostMap(TERRAIN), CostMap(TERRAIN)
     near = MapReplica(GRID, near_map, author="mine", publish_hz=1000.0)
     everything = MapReplica(GRID, all_map)
@@ -83,9 +81,7 @@ NEAR = of_file(
 )
 
 
-def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read() -> (
-    None
-):
+def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read():
     grid, bus = GridSpec(8192, 8192, 1.0), mock.Mock()
     sync = MapSync(MapReplica(grid), bus, lambda event: None, MapConfig(), "agent", near=True)
     sync.enter(frozenset(range(grid.regions)))

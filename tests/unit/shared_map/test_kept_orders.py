@@ -12,7 +12,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import Event, Heard
+from swarm.bus.bus import Event
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -51,7 +51,6 @@ def test_an_acknowledged_order_is_on_the_disk(tmp_path: Path) -> None:
     with KeeperStore(tmp_path / "map.sqlite") as store:
         world.keeper("k", store, 2)
         (order,) = world.give() or ()
-        assert isinstance(order, Order)
         assert (order.subject, order.off) == ("pause", False)
 
 
@@ -76,7 +75,6 @@ def test_a_store_that_cannot_be_written_acknowledges_nothing() -> None:
     world.keeper("k", store)
     store._db.execute("PRAGMA query_only = 1")
     refusal = world.give(subject="pause")
-    assert isinstance(refusal, str)
     assert "cannot write the store" in refusal
     assert world.give() == []
     store._db.execute("PRAGMA query_only = 0")
@@ -88,7 +86,6 @@ def test_a_target_is_put_on_passable_ground_of_the_terrain_only() -> None:
     world.keeper("k", KeeperStore(":memory:"))
     assert world.give(subject="target", name="x", row=3, col=4, new=True) == "target x: [3, 4] is lethal"
     outside = world.give(subject="target", name="x", row=-1, col=4, new=True)
-    assert isinstance(outside, str)
     assert "is not in 20 x 30 cells" in outside
     assert isinstance(world.give(subject="target", name="x", row=3, col=5, new=True), list)
 
@@ -112,7 +109,6 @@ def test_a_target_is_put_at_a_place(place: str) -> None:
     world.keeper("k", KeeperStore(":memory:"))
     order = decode(encode(GiveOrder(subject="target", name="x", at=place, new=True)), GiveOrder)
     (given,) = world.give(subject=order.subject, name=order.name, at=order.at, new=order.new) or ()
-    assert isinstance(given, Order)
     assert given.cell == 95
     refusal = world.give(subject="target", name="y", at="47.5,9.0", new=True)
     assert "target y: at is '47.5,9.0', outside the terrain: latitude 46.9" in str(refusal)
@@ -138,8 +134,6 @@ def test_acknowledged_goals_are_on_the_disk_and_so_is_what_the_vehicle_has_reach
     with KeeperStore(path) as store:
         world.keeper("k", store)
         given = send(world, vehicle="a0-00", places=["cell:5,6", "cell:7,8"], then="chase")
-        assert isinstance(given, Goals)
-        assert given.given is not None
         world.kill("k.1")
     with KeeperStore(path) as store:
         assert store.goals() == [given.given]
@@ -169,16 +163,12 @@ def test_an_agent_hears_its_own_goals_alone_and_keepers_share_all() -> None:
     assert stores[0].goals() == stores[1].goals()
     assert [goals.name for goals in stores[0].goals()] == ["a0-00", "a1-00", "a1-01"]
     told = heard[-1]
-    assert isinstance(told, Heard)
-    assert isinstance(told.message, Goals)
     assert [goals.name for goals in told.message.goals] == ["a0-00"]
     assert told.message.shared == [(5 * 30 + 6, 2)]  # of all agents, as the vehicles need room there
     send(world, "l", vehicle="a1-00", off=True)
     world.run(1.5)
     assert stores[0].goals() == stores[1].goals()
     told = heard[-1]
-    assert isinstance(told, Heard)
-    assert isinstance(told.message, Goals)
     assert told.message.shared == []
 
 
@@ -196,6 +186,5 @@ def test_an_impossible_goal_is_refused_in_a_sentence(order: dict[str, Any], word
     store = KeeperStore(":memory:")
     world.keeper("k", store)
     refused = send(world, **order)
-    assert isinstance(refused, str)
     assert words in refused
     assert store.goals() == []

@@ -67,9 +67,7 @@ def test_words_are_read_as_they_were_written(said: dict[int, Measurement]) -> No
 
 
 @given(st.lists(SAID, min_size=4, max_size=8), SAID)
-def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(
-    honest: list[Measurement], lie: Measurement
-) -> None:
+def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(honest, lie):
     honest = [each._replace(cells=5 + each.cells % 1000) for each in honest]
     steps = log_steps([*honest, lie._replace(cells=max(lie.cells, 5))])
     alone = [round(each.mean / 6246) for each in honest]
@@ -83,9 +81,7 @@ def test_before_five_a_liar_has_a_bounded_share(honest: list[Measurement], lie: 
 
 
 @given(st.integers(30, 400), SAID)
-def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(
-    cells: int, said: Measurement
-) -> None:
+def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(cells, said):
     few = said._replace(cells=1, mean=max(-ONE, min(ONE, said.mean)), variance=0)
     known = THRICE._replace(cells=cells)
     assert log_steps([known, few]) >= log_steps([known]) - 2
@@ -93,9 +89,7 @@ def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(
 
 @FEW
 @given(st.lists(WORDS, min_size=2, max_size=30), st.integers(0, NS_PER_S))
-def test_however_often_an_author_changes_its_mind_the_map_changes_once_in_five_seconds(
-    words: list[dict[int, Measurement]], every_ns: int
-) -> None:
+def test_however_often_an_author_changes_its_mind_the_map_changes_once_in_five_seconds(words, every_ns):
     replica, cost_map = replica_of(None, GROUND)
     sets = sets_of("all.a.1", *words)
     at_ns = 100 * NS_PER_S
@@ -202,9 +196,7 @@ def test_only_what_is_significant_is_learned(cells: int) -> None:
 
 
 @given(st.lists(st.integers(-ONE, ONE), min_size=4, max_size=60), st.data())
-def test_what_lies_on_less_than_a_quarter_of_the_cells_does_not_tell_of_their_kind(
-    typical: list[int], data: st.DataObject
-) -> None:
+def test_what_lies_on_less_than_a_quarter_of_the_cells_does_not_tell_of_their_kind(typical, data):
     few = data.draw(st.lists(st.integers(-MOST, MOST), max_size=(len(typical) - 1) // 3))
     middles = []
     for order in (typical + few, data.draw(st.permutations(typical + few))):

@@ -48,9 +48,7 @@ def test_every_tile_is_in_exactly_one_region() -> None:
         (set_of("a", 3, 0, {8 * 32: (LETHAL, 0, 1)}), "a cell of tile 3 lies outside the grid"),
     ],
 )
-def test_a_set_that_is_no_part_of_the_grid_is_told_apart_by_its_values_alone(
-    mark_set: MarkSet, reason: str
-) -> None:
+def test_a_set_that_is_no_part_of_the_grid_is_told_apart_by_its_values_alone(mark_set, reason):
     assert (fault(mark_set, GRID) or "").startswith(reason)
 
 
@@ -67,9 +65,7 @@ def test_a_stamp_beyond_time_is_no_mark() -> None:
 
 
 @pytest.mark.parametrize("few", [-1, 10**9])
-def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zone_over_both(
-    few: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zone_over_both(few, monkeypatch):
     monkeypatch.setattr(merge_module, "_FEW", few)
     first, second = set_of("a", 0, 0, {5: (PACE, 2.0, 7)}), set_of("b", 0, 0, {5: (PACE, 3.0, 7)})
     zone = set_of(zone_author("z"), 0, 0, {5: (PACE, 4.0, 1)})
@@ -79,9 +75,7 @@ def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zon
 
 
 @given(mark_sets(), st.none() | mark_sets(), st.lists(mark_sets(), max_size=3))
-def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
-    new: MarkSet, old: MarkSet | None, more: list[MarkSet]
-) -> None:
+def test_the_difference_that_a_set_makes_is_that_between_before_and_after(new, old, more):
     others = list({each.author: each for each in more if each.author != new.author}.values())
     own = [] if old is None else [msgspec.structs.replace(old, author=new.author)]
     held = sorted([*others, *own], key=_author)

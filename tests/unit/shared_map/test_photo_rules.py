@@ -6,12 +6,7 @@ import pytest
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover import photo_rules
 from shared_map.importers.cover.classify import class_readings
-from shared_map.importers.cover.photo_rules import (
-    CLASS_OF_READINGS,
-    EXPOSURES,
-    Features,
-    ground_readings,
-)
+from shared_map.importers.cover.photo_rules import CLASS_OF_READINGS, EXPOSURES, Features, ground_readings
 from shared_map.importers.cover.photos import Photo
 from shared_map.importers.terrain_sources import Source, with_photo
 from shared_map.terrain.pace_layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace

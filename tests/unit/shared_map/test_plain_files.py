@@ -140,9 +140,7 @@ def test_a_bad_map_is_refused_with_a_sentence(tmp_path: Path, text: str, words: 
         load(tmp_path / "a.map", text)
 
 
-def ros(
-    folder: Path, yaml: str = YAML, image: bytes = b"P5\n# made by hand\n3 2\n255\n\xfe\x00\xcd\xfe\xfe\x00"
-) -> Source:
+def ros(folder, yaml=YAML, image=b"P5\n# made by hand\n3 2\n255\n\xfe\x00\xcd\xfe\xfe\x00"):
     (folder / "m.pgm").write_bytes(image)
     return load(folder / "m.yaml", yaml)
 

@@ -31,9 +31,7 @@ cost = {{ max_slope_deg = 40.0, vehicle_radius_m = 9.0 }}
 
 
 @pytest.mark.parametrize("directional", ["false", "true"])
-def test_what_is_prepared_is_what_would_be_made(
-    tmp_path: Path, directional: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_prepared_is_what_would_be_made(tmp_path, directional, monkeypatch):
     scenario = parse_scenario(_TEXT.format(speed=1.5, directional=directional))
     terrain, truth = prepare(tmp_path, scenario)
     made = class_grounds(scenario, terrain, truth)
@@ -67,9 +65,7 @@ def test_a_folder_of_another_class_is_none(tmp_path: Path) -> None:
     assert 1 / 1.5 <= float(walker.truth.min()) < 1.0
 
 
-def test_a_launcher_makes_a_damaged_folder_again_and_another_process_says_it_in_one_sentence(
-    tmp_path: Path,
-) -> None:
+def test_a_launcher_makes_a_damaged_folder_again_and_another_process_says_it_in_one_sentence(tmp_path):
     scenario = parse_scenario(_TEXT.format(speed=1.5, directional="false"))
     terrain, truth = prepare(tmp_path, scenario)
     prepare_classes(tmp_path, scenario, terrain, truth)

@@ -7,17 +7,14 @@ from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Presence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Fleet, VehicleState
+from swarm.wire.messages.vehicles import VehicleState
 
 GRID = GridSpec(600, 600, 10.0)
 LEASE_NS = 2 * NS_PER_S
 Place = tuple[str, float, float]
 
 
-def fleet(
-    *vehicles: Place, author: str = "a0.1", seq: int = 1, region: int = 0, group: str = "all",
-    state: VehicleState = VehicleState.FOLLOWING, stamp_ns: int = 5,
-) -> Fleet:  # fmt: skip
+def fleet(*vehicles, author="a0.1", seq=1, region=0, group="all", state=VehicleState.FOLLOWING, stamp_ns=5):
     cells = [int(south // 10) * GRID.cols + int(east // 10) for _, east, south in vehicles]
     return fleet_of(
         [id for id, _, _ in vehicles], cells=cells, east_m=[east for _, east, _ in vehicles],
@@ -72,26 +69,12 @@ def test_only_the_groups_that_are_read_are_there() -> None:
 
 CORRIDOR = ["." * 24] * 5
 SCENARIO = """
-[[targets]]
-name = "t"
-walk = "still"
-[[groups]]
-name = "chasers"
-targets = ["t"]
-vehicles = 1
-cells = [[2, 0]]
-[[groups]]
-name = "parked"
-vehicles = 1
-targets = ["s"]
-cells = [[2, 12]]
-[[targets]]
-name = "s"
-walk = "still"
-[vehicles]
-per_agent = 1
-sense_range_m = 30.0
-capture_range_m = 10.0
+targets = [{ name = "t", walk = "still" }, { name = "s", walk = "still" }]
+groups = [
+    { name = "chasers", targets = ["t"], vehicles = 1, cells = [[2, 0]] },
+    { name = "parked", targets = ["s"], vehicles = 1, cells = [[2, 12]] },
+]
+vehicles = { per_agent = 1, sense_range_m = 30.0, capture_range_m = 10.0 }
 """
 
 

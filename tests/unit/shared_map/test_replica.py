@@ -161,9 +161,7 @@ def ending(author: str, cell: int, stamp_ns: int, until_ns: int, kind: MarkKind 
     ),
     st.data(),
 )
-def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show(
-    sets: list[MarkSet], data: st.DataObject
-) -> None:
+def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show(sets, data):
     composites = []
     for _ in range(2):
         replica, composite = replica_of([])

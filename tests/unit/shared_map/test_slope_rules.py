@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from shared_map.terrain.pace_layers import terrain_pace
-from shared_map.terrain.slope_rules import (
-    SLOPE_RULES,
-    directional_factor,
-    slope_factor,
-)
+from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
@@ -117,7 +113,7 @@ def test_the_default_rule_is_the_same_bit_for_bit() -> None:
     grade=st.floats(0, 1e4, width=32),
     factor=st.sampled_from([1e-9, 1.0, 1e9]),
 )
-@settings(max_examples=few(60), deadline=None)
+@settings(max_examples=few(60))
 def test_no_pace_leaves_the_bounds_of_marks(rule: str, flat: float, grade: float, factor: float) -> None:
     cost = ruled(rule, max_slope_deg=90, flat_speed_m_per_s=flat, class_factor={"rock": factor})
     pace = terrain_pace(np.array([[grade, np.nan]], np.float32), np.array([[3, 3]], np.uint8), cost)

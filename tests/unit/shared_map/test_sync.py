@@ -101,9 +101,7 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
 
 
 @pytest.mark.parametrize("part_bytes", [200, replica_sync._PART_BYTES])
-def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it(
-    part_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it(part_bytes, monkeypatch):
     """The keeper's digest goes out whole, or in parts of three rows."""
     monkeypatch.setattr(replica_sync, "_PART_BYTES", part_bytes)
     links = LossyLinks(3)
@@ -193,7 +191,6 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
     [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
 
     def answer(event: object) -> None:
-        assert isinstance(event, Asked)
         event.answer(lies, region="-", tile="-", author="liar")
         event.answer(truth, region="-", tile="-", author="liar")
         event.end()

@@ -59,17 +59,13 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
-def test_the_terrain_of_another_scenario_is_never_taken(
-    tmp_path: Path, built: list[Scenario], other: Scenario
-) -> None:
+def test_the_terrain_of_another_scenario_is_never_taken(tmp_path, built, other):
     prepare(tmp_path / "one", SMALL)
     prepare(tmp_path / "two", other)
     assert built == [SMALL, other]
 
 
-def test_the_terrain_of_other_code_is_never_taken(
-    tmp_path: Path, built: list[Scenario], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_terrain_of_other_code_is_never_taken(tmp_path, built, monkeypatch):
     prepare(tmp_path / "one", SMALL)
     monkeypatch.setattr(store, "source_digest", lambda *_: "another")
     prepare(tmp_path / "two", SMALL)
@@ -87,9 +83,7 @@ def test_the_code_is_all_that_makes_terrain(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["pace.npy", "terrain.json", "sums.json"])
 @pytest.mark.parametrize("damage", ["a byte", "cut", "gone", "not ours"])
-def test_a_damaged_terrain_is_made_anew_and_that_is_said(
-    tmp_path: Path, cache: Path, built: list[Scenario], caplog: pytest.LogCaptureFixture, name: str, damage: str
-) -> None:
+def test_a_damaged_terrain_is_made_anew_and_that_is_said(tmp_path, cache, built, caplog, name, damage):
     first, _ = prepare(tmp_path / "one", SMALL)
     digest = first.digest
     (folder,) = cache.iterdir()
@@ -112,9 +106,7 @@ def test_a_damaged_terrain_is_made_anew_and_that_is_said(
     assert len(built) == 2, "it is kept again"
 
 
-def test_what_is_kept_is_bounded_and_the_longest_unused_goes_first(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_kept_is_bounded_and_the_longest_unused_goes_first(tmp_path, cache, monkeypatch):
     scenarios = [msgspec.structs.replace(SMALL, seed=seed) for seed in (1, 2, 3)]
     for age, scenario in zip((300, 200), scenarios, strict=False):
         prepare(tmp_path / str(scenario.seed), scenario)

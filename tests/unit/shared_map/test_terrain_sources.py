@@ -305,9 +305,7 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), BAD, ids=[words for _, words in BAD])
-def test_a_bad_raster_is_refused_with_a_sentence(
-    tmp_path: Path, make: Callable[[Path], dict[str, Any]], words: str
-) -> None:
+def test_a_bad_raster_is_refused_with_a_sentence(tmp_path, make, words):
     with pytest.raises(TerrainError, match=words) as caught:
         load(**make(tmp_path))
     assert "\n" not in str(caught.value)

@@ -24,11 +24,9 @@ from shared_map.importers.water_and_voids import level_ground, undeclared_voids
 # --- level ground -------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=few(15), deadline=None)
+@settings(max_examples=few(15))
 @given(st.integers(0, 10_000), st.floats(40, 600), st.floats(0.05, 0.7))
-def test_the_sea_is_found_whatever_share_it_has_and_dry_hills_are_not_taken(
-    seed: int, relief_m: float, share: float
-) -> None:
+def test_the_sea_is_found_whatever_share_it_has_and_dry_hills_are_not_taken(seed, relief_m, share):
     ground = hills(seed, relief_m)
     level_m = np.quantile(ground, share)
     sea = ground <= level_m
@@ -156,13 +154,13 @@ def test_water_is_the_same_on_coarser_cells(name: str, how: str, factor: float) 
 
 @pytest.mark.parametrize("how", ["bilinear", "cubic", "lanczos"])
 def test_a_survey_is_recovered_from_a_file_that_was_made_finer(how: str) -> None:
-    heights_m = model_of("lakes, decimetres").heights_m
+    heights_m = model_of("lakes, decimetres").heights_m[:200, :200]
     for factor in (1.3, 2.7):
         recovered, row, col = surveyed(resampled(heights_m, factor, how))
         off_m = np.abs(recovered - heights_m[3:-3, 3:-3])
         assert off_m.max() < 0.2
         assert (off_m > 0.05).mean() < 0.001, "beside the border"
-        assert (row[-1], col[-1]) == (377, 377)
+        assert (row[-1], col[-1]) == (193, 193)
     assert surveyed(heights_m)[0] is heights_m
 
 
@@ -245,9 +243,7 @@ def test_a_code_among_like_heights_is_ground() -> None:
 
 @pytest.mark.parametrize("resolution_m", [None, 13.0, 45.0])
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
-def test_water_of_a_file_is_lethal_at_every_cell_size(
-    tmp_path: Path, resolution_m: float | None, dtype: str
-) -> None:
+def test_water_of_a_file_is_lethal_at_every_cell_size(tmp_path, resolution_m, dtype):
     ground = np.maximum(hills(8, 900) - 300, 0)
     sea = ground == 0
     source = load(written(tmp_path / "coast.tif", ground, dtype), resolution_m=resolution_m)

@@ -34,7 +34,7 @@ def blobs(draw: st.DrawFn) -> Any:
     return shapely.Polygon(outer, [hole])
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(blobs(), st.sampled_from(["EPSG:4326", "EPSG:32632", "EPSG:3857"]))
 def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_they_touch(
     tmp_path_factory: pytest.TempPathFactory, blob: Any, crs: str
@@ -52,14 +52,12 @@ def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_t
     assert np.isfinite(closed[beyond]).all()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     st.lists(st.tuples(st.floats(-10, 60), st.floats(-10, 50)), min_size=2, max_size=6, unique=True),
     st.integers(5, 900).map(lambda tenths: tenths / 10),
 )
-def test_lines_are_as_wide_as_they_are_and_never_broken(
-    tmp_path_factory: pytest.TempPathFactory, corners: list[tuple[float, float]], width_m: float
-) -> None:
+def test_lines_are_as_wide_as_they_are_and_never_broken(tmp_path_factory, corners, width_m):
     line = shapely.LineString(corners)
     if not line.intersects(shapely.box(0, 0, UTM.cols, UTM.rows)):
         return
@@ -317,15 +315,13 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
         painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     st.lists(st.floats(8, 42), min_size=3, max_size=7),
     st.lists(st.tuples(st.floats(0, 50), st.floats(0, 40)), min_size=2, max_size=6, unique=True),
     st.sampled_from([0.5, 4.0, 15.0, 60.0]),
 )
-def test_no_road_crosses_a_river_without_a_bridge(
-    tmp_path_factory: pytest.TempPathFactory, bends: list[float], roads: list[tuple[float, float]], width_m: float
-) -> None:
+def test_no_road_crosses_a_river_without_a_bridge(tmp_path_factory, bends, roads, width_m):
     rows = np.linspace(-2, UTM.rows + 2, len(bends))
     river = shapely.LineString(np.stack([bends, rows], axis=1))
     way = shapely.LineString([(-3, 20), *roads, (53, 20)])
@@ -336,7 +332,7 @@ def test_no_road_crosses_a_river_without_a_bridge(
     assert not np.intersect1d(parts[:, 0], parts[:, -1]).any()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     st.floats(-0.7, 0.7),
     st.floats(20, 30),
@@ -345,9 +341,7 @@ def test_no_road_crosses_a_river_without_a_bridge(
     st.sampled_from([1.0, 8.0, 20.0, 70.0]),
 )
 @example(lean=0.0, col=20.0, row=19.0, turn=0.0, width_m=1.0)
-def test_a_bridge_as_long_as_its_river_is_wide_joins_both_banks(
-    tmp_path_factory: pytest.TempPathFactory, lean: float, col: float, row: float, turn: float, width_m: float
-) -> None:
+def test_a_bridge_as_long_as_its_river_is_wide_joins_both_banks(tmp_path_factory, lean, col, row, turn, width_m):
     """Roads which meet the river at 45 degrees or more."""
     river = shapely.LineString([(col - 60 * lean, row - 60), (col + 60 * lean, row + 60)])
     slope = np.tan((turn - 0.5) * (np.pi / 2 - 2 * abs(np.arctan(lean))) * 0.9)

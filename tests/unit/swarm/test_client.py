@@ -21,7 +21,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from swarm.bus.bus import Heard, LinkChanged
+from swarm.bus.bus import LinkChanged
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
 from swarm.client.connected_swarm import agreed
 from swarm.client.observer import marked
@@ -44,12 +44,7 @@ class Obstacles(list[Obstacle]):
     """All puts on BODY."""
 
     def __init__(self, world: SwarmModel) -> None:
-        world.bus("ear-of-obstacles").subscribe(OBSTACLE, self._hear)
-
-    def _hear(self, event: Any) -> None:
-        assert isinstance(event, Heard)
-        assert isinstance(event.message, Obstacle)
-        self.append(event.message)
+        world.bus("ear-of-obstacles").subscribe(OBSTACLE, lambda event: self.append(event.message))
 
 
 @pytest.fixture
@@ -85,9 +80,7 @@ def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_le
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), NOWHERE)
-def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(
-    world: Swarm, x_m: float, y_m: float
-) -> None:
+def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(world, x_m, y_m):
     obstacles, program = Obstacles(world), Program(world)
     with program.swarm as swarm:
         rover, target = swarm.vehicle("rover"), swarm.target("t9")
@@ -127,9 +120,7 @@ def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) ->
         make("one")
 
 
-def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_thread(
-    world: Swarm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_thread(world, monkeypatch):
     program = Program(world)
     add = program.session.add
 
@@ -375,7 +366,7 @@ stated = st.tuples(
 )
 
 
-@settings(max_examples=few(200), deadline=None)
+@settings(max_examples=few(200))
 @given(st.lists(stated, max_size=12), st.integers(0, 50))
 def test_what_an_observer_shows_as_marked_is_what_a_replica_holds(words: Any, now_ns: int) -> None:
     authors = {name: OwnMarks(name, name.partition(".")[0], MAP_GRID) for name in AUTHORS}
@@ -410,9 +401,7 @@ def test_a_target_that_a_program_tracks_is_followed_by_its_planner() -> None:
         assert world.ear.routes(GRID.cell(30, 30)).target_cell == GRID.cell(9, 10)
 
 
-def test_of_two_trackers_both_are_told_whose_poses_count_and_the_second_takes_over_when_the_first_leaves(
-    world: Swarm,
-) -> None:
+def test_of_two_trackers_both_are_told_whose_poses_count_and_the_second_takes_over_when_the_first_leaves(world):
     one, other, watcher = Program(world, "one"), Program(world, "other"), Program(world, "watcher")
     watching = watcher.swarm.observer()
     first = one.swarm.target("x", tracker="radar")
@@ -490,9 +479,7 @@ def test_an_observer_sees_the_vehicles_of_an_agent_until_it_is_silent(world: Swa
 
 
 @pytest.mark.parametrize(("targets", "given"), [(None, ([], True)), ([], ([], False)), (["t"], (["t"], False))])
-def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(
-    world: Swarm, monkeypatch: pytest.MonkeyPatch, targets: list[str] | None, given: tuple[list[str], bool]
-) -> None:
+def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(world, monkeypatch, targets, given):
     orders, told = Program(world).swarm.orders(), []
     monkeypatch.setattr(orders, "_give", lambda **order: told.append((order["targets"], order["off"])))
     orders.chase("red", targets)
@@ -573,7 +560,7 @@ def test_a_callback_that_fails_ends_nothing_and_one_that_would_wait_for_ever_is_
 # --- values -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=few(200), deadline=None)
+@settings(max_examples=few(200))
 @given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 10.0, 90.0]), st.data())
 def test_the_middle_of_every_cell_is_in_that_cell(rows: int, cols: int, resolution_m: float, data: Any) -> None:
     frame = Frame(GridSpec(rows, cols, resolution_m, 432_100.5, 5_400_000.25, "EPSG:32632"))

@@ -56,7 +56,7 @@ def test_without_numpy_every_message_is_read_as_with_it() -> None:
     assert [line.split()[0] for line in done.stdout.splitlines()] == payloads, done.stderr
 
 
-@settings(max_examples=few(100), deadline=None)
+@settings(max_examples=few(100))
 @given(st.lists(routes, max_size=5))
 def test_routes_read_as_lists_are_those_read_as_arrays(some: list[object]) -> None:
     columns: Routes = RouteBatch.of(some).columns()  # type: ignore[arg-type]

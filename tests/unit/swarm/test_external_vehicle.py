@@ -9,7 +9,6 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
 from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
-from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.shards import Shards
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table
@@ -26,9 +25,7 @@ def leader_of(**of: object) -> Leader:
     return Leader(SHARDS, SHARDS.leader(0, 6), 6, table, {"a0": ["a0-00"], "a1": ["a1-00"], "a2": ["a2-00"]})
 
 
-def entering(
-    name: str, cell: int, seq: int = 1, ahead: list[int] | None = None, generation: int = 1 << 32
-) -> HostState:
+def entering(name, cell, seq=1, ahead=None, generation=1 << 32):
     stand = Stand(f"{name}-00", cell, cell, Held(), ahead or [cell], [], 0, 0)
     return HostState(shard=0, agent=name, generation=generation, seq=seq, knows=(0, 0), vehicles=[stand])
 
@@ -45,7 +42,6 @@ def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
 def talk(external: ExternalVehicle, leader: Leader, now_ns: int = 0) -> None:
     """Passes messages between the external vehicle and the leader as if they were on file."""
     for action in external.tick(now_ns):
-        assert isinstance(action, Tell)
         leader.take_host_state(action.standing, now_ns)
     table = leader.tick(now_ns)
     if table is not None:
@@ -169,7 +165,6 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
         for told in removal.tick(now_ns):
             leader.take_host_state(told.standing, now_ns)
         table = leader.tick(now_ns)
-        assert table is not None
         for granted in leader.granted(table, now_ns):
             removal.hear_granted(granted, now_ns)
             external.hear_granted(granted, now_ns)

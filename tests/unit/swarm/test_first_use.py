@@ -33,9 +33,7 @@ def test_a_loop_that_loads_a_module_fails_in_tests_and_one_that_uses_a_loaded_on
         __import__(module)
 
 
-def test_a_live_loop_that_loads_a_module_counts_and_logs_it(
-    module: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_live_loop_that_loads_a_module_counts_and_logs_it(module, monkeypatch, caplog):
     monkeypatch.setattr(first_use, "refused", False)
     counters = Counters()
     with in_loop(counters):

@@ -54,9 +54,7 @@ vitals = st.builds(
 
 
 @given(told=st.lists(vitals, min_size=1, max_size=6), last=vitals, cut=st.integers(0, SLOT_BYTES))
-def test_a_reader_sees_a_whole_record_wherever_the_writer_was_killed(
-    told: list[Vitals], last: Vitals, cut: int
-) -> None:
+def test_a_reader_sees_a_whole_record_wherever_the_writer_was_killed(told, last, cut):
     memory = Memory()
     board = Board(memory)
     rising = [each._replace(stamp_ns=n + 1) for n, each in enumerate([*told, last])]
@@ -104,6 +102,21 @@ class Sleepy:
     def stop(self, now_ns: int) -> None: ...
 
 
+@contextlib.contextmanager
+def running(service: Sleepy, health: Health) -> Iterator[None]:
+    """A loop on a thread, which ends even if its tick hangs."""
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50, health=health)
+    thread = threading.Thread(target=process.run)
+    thread.start()
+    try:
+        yield
+    finally:
+        service.hang.clear()
+        service.wake.set()
+        process.stop()
+        thread.join(30)
+
+
 def until(board: Board, holds) -> Vitals:
     """The record of a board once a condition holds."""
     deadline_s = time.monotonic() + 30
@@ -117,10 +130,7 @@ def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.Monke
     monkeypatch.setattr(health_module, "HUNG_S", 0.5)
     service, health = Sleepy(), Health()
     assert health.board.read().phase is Phase.STARTS
-    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50, health=health)
-    thread = threading.Thread(target=process.run)
-    thread.start()
-    try:
+    with running(service, health):
         found = until(health.board, lambda each: each.phase is Phase.RUNS)
         assert found.lacks == ("a bed",)
         service.needs = []
@@ -130,10 +140,6 @@ def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.Monke
         service.hang.clear()
         service.wake.set()
         until(health.board, lambda each: not each.hangs(time.monotonic_ns()))
-    finally:
-        service.wake.set()
-        process.stop()
-        thread.join(30)
     assert health.board.read().phase is Phase.ENDS
     assert not health.board.read().hangs(1 << 62), "what ends does not turn, and does not hang"
 
@@ -160,10 +166,7 @@ def test_systemd_is_told_when_a_loop_is_up_turns_and_ends(manager: socket.socket
     }
     service, health = Sleepy(), Health(supervisor=supervisor_of(environment))
     assert told(manager) == ["STATUS=its start"]
-    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50, health=health)
-    thread = threading.Thread(target=process.run)
-    thread.start()
-    try:
+    with running(service, health):
         assert told(manager) == ["STATUS=waits for a bed"]
         assert told(manager) == ["READY=1", "WATCHDOG=1"]
         for _ in range(3):
@@ -175,11 +178,6 @@ def test_systemd_is_told_when_a_loop_is_up_turns_and_ends(manager: socket.socket
         service.hang.set()
         manager.settimeout(3 * limit_us / 1e6)
         assert falls_silent(manager)
-    finally:
-        service.hang.clear()
-        service.wake.set()
-        process.stop()
-        thread.join(30)
     manager.settimeout(10)
     while (words := told(manager)) == ["WATCHDOG=1"]:
         pass

@@ -2,17 +2,7 @@
 
 import msgspec
 import pytest
-from support.shard_tables import (
-    GRID,
-    MEMBERS,
-    SHARDS,
-    S,
-    entries,
-    granted_of,
-    hear,
-    holdings_of,
-    table_of,
-)
+from support.shard_tables import GRID, MEMBERS, SHARDS, S, entries, granted_of, hear, holdings_of, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.right_of_way.holdings import Wish

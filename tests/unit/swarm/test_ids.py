@@ -32,9 +32,7 @@ def test_the_ids_of_the_largest_simulated_swarm_are_matched_once_each(pattern: P
     assert pattern.matched == 10_000
 
 
-def test_a_sender_of_ever_new_ids_makes_no_process_know_more_than_there_is_room_for(
-    pattern: Pattern, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sender_of_ever_new_ids_makes_no_process_know_more_than_there_is_room_for(pattern, monkeypatch):
     monkeypatch.setattr(fields, "_MAX_KNOWN_IDS", 10)
     for n in range(100):
         fields.check_id("vehicle", f"v{n}")

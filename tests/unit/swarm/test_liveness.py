@@ -76,9 +76,7 @@ numbers = st.tuples(st.integers(0, 3), st.integers(0, 5))
 
 
 @given(st.lists(numbers, min_size=1), st.randoms(use_true_random=False))
-def test_without_a_silence_the_highest_number_counts_in_whatever_order_they_come(
-    values: list[tuple[int, int]], chance: random.Random
-) -> None:
+def test_without_a_silence_the_highest_number_counts_in_whatever_order_they_come(values, chance):
     newest, last = Newest(), None
     chance.shuffle(values)
     for number in values:
@@ -88,9 +86,7 @@ def test_without_a_silence_the_highest_number_counts_in_whatever_order_they_come
 
 
 @given(st.lists(st.tuples(st.integers(0, (1 << 62) - 1), st.integers(0, (1 << 62) - 1)), max_size=20))
-def test_after_a_silence_a_sender_that_goes_on_is_followed_whatever_was_heard_before(
-    lies: list[tuple[int, int]],
-) -> None:
+def test_after_a_silence_a_sender_that_goes_on_is_followed_whatever_was_heard_before(lies):
     newest, step_ns = Newest(), SILENCE_NS // 10
     for number in lies:
         newest.is_news("t", number, 0)

@@ -5,7 +5,7 @@ import pytest
 from support.makers import run_info
 from support.swarm_model import SwarmModel
 
-from swarm.bus.bus import Event, Heard, LinkChanged
+from swarm.bus.bus import Event, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -154,16 +154,6 @@ def test_counters_are_told_once_a_second_and_at_the_end():
     assert last.counts["marks"] == 3
     assert last.counts["messages_out"] >= 3
     assert sum(last.histograms["tick_ms"].values()) == 1
-
-
-def test_a_note_reaches_whoever_watches():
-    world, heard = SwarmModel(), []
-    node = Node(world)
-    world.bus("watcher").subscribe(NOTE, heard.append)
-    node.member.note(5, "closure", "road closed", cell=9)
-    world.settle()
-    assert [type(event) for event in heard] == [Heard]
-    assert (heard[0].message.text, heard[0].message.cell) == ("road closed", 9)
 
 
 def test_the_same_run_from_anywhere_is_the_same_run():

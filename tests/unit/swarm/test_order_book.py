@@ -1,6 +1,5 @@
 """The book of orders: the newest about each subject, whatever the order of arrival; what cannot be is refused."""
 
-import random
 from typing import Any
 
 import pytest
@@ -22,21 +21,9 @@ from swarm.runtime.order_book import (
 from swarm.wire.messages.orders import GiveOrder, Order
 
 SCENARIO = parse_scenario("""
-[[targets]]
-name = "t"
-count = 2
-[[targets]]
-name = "real"
-walk = "external"
-[[groups]]
-name = "red"
-vehicles = 3
-targets = ["t0"]
-[[groups]]
-name = "blue"
-vehicles = 3
-[vehicles]
-per_agent = 3
+targets = [{ name = "t", count = 2 }, { name = "real", walk = "external" }]
+groups = [{ name = "red", vehicles = 3, targets = ["t0"] }, { name = "blue", vehicles = 3 }]
+vehicles = { per_agent = 3 }
 """)
 VEHICLES = [id for plan in plan_agents(SCENARIO) for id in plan.vehicle_ids]
 NOW = 1_000
@@ -51,9 +38,7 @@ orders = st.builds(
 
 
 @given(st.lists(orders, max_size=12), st.randoms(use_true_random=False))
-def test_books_that_heard_the_same_are_the_same_whatever_the_order(
-    said: list[Order], chance: random.Random
-) -> None:
+def test_books_that_heard_the_same_are_the_same_whatever_the_order(said, chance):
     one, other = OrderBook(), OrderBook()
     one.merge(said, NOW)
     again = said * 2
@@ -155,7 +140,6 @@ def test_every_setting_that_may_change_is_one_of_the_scenario_and_within_its_bou
 )
 def test_what_cannot_be_ordered_is_refused_in_a_sentence(fields: dict[str, Any], says: str) -> None:
     refusal = Keeper().give(**fields)
-    assert refusal is not None
     assert says in refusal
 
 
@@ -179,14 +163,12 @@ def test_the_last_target_stays() -> None:
     for name in ("t0", "real"):
         assert keeper.give(subject="target", name=name, off=True) is None
     refusal = keeper.give(subject="target", name="t1", off=True)
-    assert refusal is not None
     assert "is the last one" in refusal
 
 
 def test_no_target_is_added_where_no_process_moves_targets() -> None:
     tracked = parse_scenario('[[targets]]\nname = "real"\nwalk = "external"')
     refusal = judged(GiveOrder(subject="target", name="x", cell=1, new=True), OrderBook(), tracked, [], NOW)
-    assert isinstance(refusal, str)
     assert "all of its scenario have trackers" in refusal
 
 
@@ -197,7 +179,6 @@ def test_a_book_is_bounded_and_no_stamp_is_beyond_reach() -> None:
     assert len(book.merge(many, NOW)) == len(book) == MOST_ORDERS
     assert book.merge([Order(subject="vehicle", name="v0", stamp_ns=2, off=True)], NOW) != []
     refusal = judged(GiveOrder(subject="set", name="time_scale", value=2.0), book, SCENARIO, VEHICLES, NOW)
-    assert isinstance(refusal, str)
     assert "at most" in refusal
     pause = judged(GiveOrder(subject="pause"), book, SCENARIO, VEHICLES, NOW)
     assert isinstance(pause, Order), "there is always room for a pause"
@@ -211,9 +192,7 @@ def test_every_order_has_words(order: Order) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 2 * FRESH_NS)), max_size=20), st.integers(0, FRESH_NS))
-def test_a_copy_of_an_order_counts_never_again_whenever_it_comes(
-    given: list[tuple[int, int]], since_ns: int
-) -> None:
+def test_a_copy_of_an_order_counts_never_again_whenever_it_comes(given, since_ns):
     """Also at a keeper that has started again since, and has forgotten which orders counted."""
     stamps_ns = [since_ns + n * FRESH_NS // 2 for n in range(5)]
     fresh, counted, now_ns = FreshOrders(since_ns), [], since_ns

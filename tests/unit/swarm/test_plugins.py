@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
@@ -95,9 +95,7 @@ def test_options_become_a_struct_or_stay_a_table_and_what_is_made_already_is_tak
         ("eyes:Blind", {}, "has no method look, found Blind"),
     ],
 )
-def test_what_cannot_be_found_or_made_or_does_not_fit_is_refused_in_one_sentence(
-    name: str, options: dict[str, object], sentence: str, folder: Path
-) -> None:
+def test_what_cannot_be_found_or_made_or_does_not_fit_is_refused_in_one_sentence(name, options, sentence, folder):
     with pytest.raises(ConfigError) as refused:
         find_plugin(sensor(name, **options), str(folder)).make(None)
     assert sentence.replace("{folder}", str(folder)) in str(refused.value)
@@ -248,7 +246,6 @@ def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
     assert found == [3]
 
 
-@settings(deadline=None)
 @given(st.from_regex(r"[\w.+:-]{0,20}", fullmatch=True))
 def test_whatever_a_scenario_names_is_found_or_refused_in_one_sentence(name: str) -> None:
     if name in PLUGIN_KINDS["sensor"].built_in:

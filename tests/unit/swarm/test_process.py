@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.bus.bus import Event, Heard, WorkDone
@@ -67,7 +67,6 @@ def test_a_tick_is_late_which_comes_more_than_half_a_period_after_it_was_due_or_
     assert service.counters.counts["ticks_dropped"] == (took_ms - 100) // 100
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 60), st.sampled_from(["a", "t", "scout-", "t0.r"]))
 def test_ticks_of_processes_with_successive_ids_lie_spread_over_the_period(first, count, name):
     phases = sorted(tick_phase(f"{name}{first + index}") for index in range(count))
@@ -147,7 +146,6 @@ def test_a_worker_gives_its_result_back_as_an_event():
     worker = ThreadWorker("w", inbox)
     worker.submit("grow", lambda: 42, inbox.post)
     done = inbox.take(5.0)
-    assert isinstance(done, WorkDone)
     assert (done.tag, done.result) == ("grow", 42)
     assert 0 <= done.took_ns < NS_PER_S
     worker.submit("fail", lambda: 1 // 0, inbox.post)
@@ -165,7 +163,6 @@ def test_the_first_job_of_a_worker_is_as_urgent_as_its_process_and_later_ones_gi
     for _ in range(3):
         worker.submit("j", lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), inbox.post)
         done = inbox.take(5.0)
-        assert isinstance(done, WorkDone)
         found.append(done.result)
     worker.close()
     later = min(ours + 5, 19)
@@ -222,44 +219,6 @@ def test_the_clock_never_runs_backwards():
     assert times == sorted(times)
 
 
-IDLE = """
-from swarm.bus.bus import *
-from swarm.clock import MonotonicClock
-from swarm.runtime.process import Inbox, Process
-from swarm.runtime.stats import Counters
-
-class Idle:
-    counters = Counters()
-    def start(self, now_ns): print("up", flush=True)
-    def handle(self, event, now_ns): pass
-    def tick(self, now_ns): pass
-    def stop(self, now_ns):
-        print("stopped", flush=True)
-
-process = Process(Idle(), Inbox(), MonotonicClock(), tick_hz=0.001)
-process.stop_on_signals()
-process.run()
-"""
-
-
-def idle() -> subprocess.Popen[bytes]:
-    process = subprocess.Popen([sys.executable, "-c", IDLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"up\n"
-    return process
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_loop_in_good_order(number):
-    process = idle()
-    for _ in range(50):  # impatient until it ends
-        process.send_signal(number)
-        process.send_signal(signal.SIGTERM)
-        time.sleep(0.002)
-    out, _ = process.communicate(timeout=20)
-    assert out == b"stopped\n"
-    assert process.returncode == 0
-
-
 WORKING = """
 import hashlib, threading
 from swarm.clock import MonotonicClock
@@ -280,16 +239,20 @@ class Working:
     def tick(self, now_ns): pass
     def stop(self, now_ns): print("stopped", flush=True)
 
-process = Process(Working(), inbox, clock, tick_hz=5)
+process = Process(Working(), inbox, clock, tick_hz=0.001)
 process.stop_on_signals()
 process.run()
 worker.close()
 """
 
 
-def test_a_stop_waits_for_no_kernel():
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_loop_in_good_order_and_waits_for_neither_a_tick_nor_a_kernel(number):
     process = subprocess.Popen([sys.executable, "-c", WORKING], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"up\n"
-    process.send_signal(signal.SIGTERM)
+    for _ in range(50):  # impatient until it ends
+        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.002)
     out, _ = process.communicate(timeout=30)
     assert (out, process.returncode) == (b"stopped\n", 0)

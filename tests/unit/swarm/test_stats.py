@@ -82,9 +82,7 @@ def test_counters_count_gauge_and_observe():
 
 
 @given(st.lists(st.floats() | st.sampled_from([0.0, -1.0, 1.0, 1.02, 1e-300]), max_size=16))
-def test_values_added_together_are_counted_as_one_by_one_the_positive_ones_first_and_in_order(
-    values: list[float],
-) -> None:
+def test_values_added_together_are_counted_as_one_by_one_the_positive_ones_first_and_in_order(values):
     together = Histogram()
     together.add_all(np.array(values, np.float64))
     finite = sorted(filter(math.isfinite, values), key=lambda value: (value <= 0, value))

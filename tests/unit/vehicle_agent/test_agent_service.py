@@ -189,20 +189,6 @@ def test_the_first_to_start_does_not_wait_for_anybody() -> None:
     world.assert_lawful()
 
 
-def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
-    world = AgentWorld(scenario(3, [(10, 2), (0, 0), (19, 0)], per_agent=1), pace_of(OPEN)).begin(t=(10, 18))
-    world.run(4.0)
-    world.cut(world.buses["agent-a0"])
-    world.run(1.0)
-    held = world.agents["a0"].agent.holdings.path("a0-00")[-1]
-    world.run(10.0)
-    row, column = world.where()["a0-00"]
-    assert (row * 20 + column, column < 18) == (held, True)
-    world.heal(world.buses["agent-a0"])
-    world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=30)
-    world.assert_lawful()
-
-
 # --- where they start ---------------------------------------------------------------------------------------
 
 

@@ -11,26 +11,12 @@ from vehicle_agent.start_cells import spawn_cells
 
 TWO_WAYS = """
 seed = {seed}
-[[targets]]
-name = "west"
-walk = "still"
-[[targets]]
-name = "east"
-walk = "still"
-[[groups]]
-name = "eastbound"
-vehicles = {count}
-cells = {west_cells}
-targets = ["east"]
-[[groups]]
-name = "westbound"
-vehicles = {count}
-cells = {east_cells}
-targets = ["west"]
-[vehicles]
-per_agent = {per_agent}
-sense_range_m = 30.0
-capture_range_m = {capture}
+targets = [{{ name = "west", walk = "still" }}, {{ name = "east", walk = "still" }}]
+groups = [
+    {{ name = "eastbound", vehicles = {count}, cells = {west_cells}, targets = ["east"] }},
+    {{ name = "westbound", vehicles = {count}, cells = {east_cells}, targets = ["west"] }},
+]
+vehicles = {{ per_agent = {per_agent}, sense_range_m = 30.0, capture_range_m = {capture} }}
 """
 
 
@@ -84,7 +70,9 @@ def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
     chance = random.Random(seed)
     text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')
     world = AgentWorld(text, pace_of(maze(seed)), links=LossyLinks(seed, dropped=0.05, repeated=0.1, jitter_ms=150))
-    homes = sorted(cell for spawns in spawn_cells_of(world).values() for cell in spawns.values())
+    grounds = class_grounds(world.scenario, world.terrain, world.truth)
+    spawns = spawn_cells(world.scenario, world.terrain.grid, grounds)
+    homes = sorted(cell for cells in spawns.values() for cell in cells.values())
     places = [world.terrain.grid.row_col(cell) for cell in homes]
     for target in world.scenario.target_ids:
         world.put_target(target, *chance.choice(places))
@@ -104,9 +92,3 @@ def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
     assert captures > 30
     assert longest_s < 50
     world.assert_lawful()
-
-
-def spawn_cells_of(world: AgentWorld) -> dict[str, dict[str, int]]:
-    return spawn_cells(
-        world.scenario, world.terrain.grid, class_grounds(world.scenario, world.terrain, world.truth)
-    )

@@ -11,10 +11,10 @@ from support.bus_world import answer_of
 from planner_service.places_service import PlacesService
 from planner_service.planning_process import Planning
 from shared_map.keeper.mark_store import KeeperStore
-from swarm.bus.bus import Event, Heard
+from swarm.bus.bus import Event
 from swarm.bus.scheduler import InlineWorker
 from swarm.wire.messages import Message
-from swarm.wire.messages.orders import GiveOrder, GoalState, GoalStates, SendVehicle, ZoneOrder
+from swarm.wire.messages.orders import GiveOrder, GoalState, SendVehicle, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, SEND_VEHICLE, ZONES, Topic
 
@@ -29,26 +29,16 @@ class SentWorld(AgentWorld):
         super().__init__(text, pace_of(picture))
         self.store = KeeperStore(":memory:")
         self.keeper("k", self.store)
-        self.generations = 0
-        self.start_places()
+        setup = self.setup("places", "all")
+        worker = InlineWorker(self.scheduler)
+        self.start("places", lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)))
         self.progress: dict[str, GoalState] = {}
         self.person = self.bus("person")
         self.person.subscribe(GOAL_STATES, self._told)
         self.begin(t=(1, 1))
         self.until(lambda: len(self.vehicles()) == self.scenario.vehicle_count, within_s=20)
 
-    def start_places(self) -> None:
-        self.generations += 1
-        setup = self.setup("places", "all", self.generations)
-        worker = InlineWorker(self.scheduler)
-        self.start(
-            "places",
-            lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)),
-        )
-
     def _told(self, event: Event) -> None:
-        assert isinstance(event, Heard)
-        assert isinstance(event.message, GoalStates)
         self.progress.update({each.name: each for each in event.message.states})
 
     def send(self, vehicle: str, *places: tuple[int, int], **fields: Any) -> None:
@@ -158,25 +148,3 @@ def test_a_better_way_that_opens_is_taken_on_the_way() -> None:
     assert (10, 5) in crossed
     routes = [each for each in world.followed[begun:] if each.vehicle == "a0-00"]
     assert len(routes) <= 3, "a route that is the rest of the one before is not begun anew"
-
-
-def test_goals_and_progress_survive_the_agent_the_keeper_and_the_planner_of_places() -> None:
-    world = SentWorld(scenario(2, [(5, 5), (5, 7)]), OPEN)
-    world.send("a0-00", (5, 15), (15, 15), (15, 5), then="chase")
-    world.until(lambda: world.progress.get("a0-00") is not None and world.progress["a0-00"].done == 1, within_s=30)
-    world.run(2.0)
-    world.crash_agent("a0")
-    world.kill("k.1")
-    world.keeper("k", world.store, 2)
-    world.run(1.0)
-    world.progress.clear()
-    world.start_agent("a0")
-    world.until(lambda: "a0-00" in world.progress, within_s=10)
-    assert world.progress["a0-00"].done >= 1
-    world.kill("places")
-    world.until(lambda: world.states_of_goals()["blocked"] == 1, within_s=60)
-    assert world.progress["a0-00"].reason == "no process plans routes to places"
-    world.start_places()
-    world.until(lambda: world.states_of_goals() == {"completed": 1}, within_s=60)
-    world.until(lambda: all(vehicle.target == "t" for vehicle in world.vehicles()), within_s=10)
-    world.assert_lawful()

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -26,10 +26,7 @@ def worlds(draw: st.DrawFn) -> tuple[NDArray[np.float64], list[int]]:
 
 
 @given(worlds())
-@settings(deadline=None)
-def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reach(
-    world: tuple[NDArray[np.float64], list[int]],
-) -> None:
+def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reach(world):
     costs_s, current = world
     targets, vehicles = costs_s.shape
     chosen = spread(costs_s, current)
@@ -45,10 +42,7 @@ def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reac
 
 
 @given(worlds())
-@settings(deadline=None)
-def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
-    world: tuple[NDArray[np.float64], list[int]],
-) -> None:
+def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(world):
     """Stability: where another target is cheaper for a vehicle, those that go for it reach it at no higher cost."""
     costs_s, current = world
     costs_s = costs_s.copy()
@@ -66,10 +60,7 @@ def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
 
 
 @given(worlds(), st.sampled_from(sorted(ASSIGNERS)))
-@settings(deadline=None)
-def test_no_share_that_others_fill_keeps_a_vehicle_from_the_targets_it_can_reach_and_targets_soon_stay(
-    world: tuple[NDArray[np.float64], list[int]], name: str
-) -> None:
+def test_no_share_that_others_fill_keeps_a_vehicle_from_the_targets_it_can_reach_and_targets_soon_stay(world, name):
     """Restrictions are random: of a target that a vehicle may not chase its agent knows no cost."""
     costs_s, current = world
     targets = [f"t{n}" for n in range(len(costs_s))]
@@ -111,10 +102,7 @@ answers = st.one_of(
 
 
 @given(worlds(), answers)
-@settings(deadline=None)
-def test_whatever_a_plugin_assigns_vehicles_go_only_where_they_have_a_route(
-    world: tuple[NDArray[np.float64], list[int]], answer: object
-) -> None:
+def test_whatever_a_plugin_assigns_vehicles_go_only_where_they_have_a_route(world, answer):
     costs_s, current = world
     given_s = costs_s.copy()
     told: list[str] = []

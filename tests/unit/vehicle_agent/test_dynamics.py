@@ -97,11 +97,8 @@ def test_a_plugin_is_told_how_far_its_vehicle_may_drive_and_how_it_turns() -> No
 speeds = st.one_of(st.floats(), st.integers(), st.none(), st.booleans(), st.text(max_size=3))
 
 
-@settings(deadline=None)
 @given(st.lists(speeds, min_size=1, max_size=40), st.integers(1, 6))
-def test_whatever_is_said_no_vehicle_is_faster_than_the_ground_or_leaves_its_path(
-    said: list[Any], granted: int
-) -> None:
+def test_whatever_is_said_no_vehicle_is_faster_than_the_ground_or_leaves_its_path(said, granted):
     answers = iter(said)
     dynamics, told, _ = driven_by(lambda stretch: next(answers))
     motion = Motion(GRID, 0)
@@ -124,12 +121,9 @@ WIDE = GridSpec(12, 12, 10.0)
     st.one_of(st.none(), st.floats(5.0, 720.0)),
     st.integers(1, 6),
 )
-def test_a_class_speeds_up_brakes_and_turns_no_quicker_than_it_can_and_arrives(
-    steps: list[int], accel: float, turn_rate: float | None, granted: int
-) -> None:
+def test_a_class_speeds_up_brakes_and_turns_no_quicker_than_it_can_and_arrives(steps, accel, turn_rate, granted):
     own = ClassConfig(name="truck", accel_m_per_s2=accel, turn_rate_deg_per_s=turn_rate)
     dynamics = own_dynamics(own, DynamicsWorld("a0", WIDE, 1))
-    assert dynamics is not None
     cells = [WIDE.cell(6, 6)]
     for step in steps:
         around = dict(WIDE.neighbours(cells[-1]))
@@ -171,7 +165,6 @@ def heading_of(tail: int, head: int) -> float:
 @pytest.mark.parametrize("accel", [0.5, 2.0, 50.0])
 def test_a_class_brakes_to_a_stop_where_its_cells_end(accel: float) -> None:
     dynamics = own_dynamics(ClassConfig(name="truck", accel_m_per_s2=accel), DynamicsWorld("a0", GRID, 1))
-    assert dynamics is not None
     motion, path, speeds = Motion(GRID, 0), list(range(20)), [0.0]
     while len(path) > 1 or not motion.at_rest:
         drive(dynamics, motion, path, 1)

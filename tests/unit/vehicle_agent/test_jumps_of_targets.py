@@ -38,9 +38,7 @@ histories = st.sets(st.integers(0, TICKS - 1), max_size=TICKS)
 
 
 @given(st.integers(1, 25), histories)
-def test_of_few_targets_each_jump_is_followed_by_a_request_within_half_a_second(
-    targets: int, jumps: set[int]
-) -> None:
+def test_of_few_targets_each_jump_is_followed_by_a_request_within_half_a_second(targets, jumps):
     asks = asks_of(targets, jumps)
     soon = round(SOON_S / TICK_S)
     for jump in jumps:

@@ -16,9 +16,7 @@ sizes = st.just((-1, -1)) | st.tuples(st.integers(0, 9), st.integers(0, 9))
     st.lists(st.tuples(numbers, numbers, sizes), max_size=6),
     st.lists(st.tuples(numbers, numbers, st.integers(1, 6), st.integers(1, 6)), max_size=6),
 )
-def test_a_box_meets_windows_with_which_it_shares_a_cell(
-    given_boxes: list[tuple[int, int, tuple[int, int]]], windows: list[tuple[int, int, int, int]]
-) -> None:
+def test_a_box_meets_windows_with_which_it_shares_a_cell(given_boxes, windows):
     boxes = [(row, col, row + south, col + east) for row, col, (south, east) in given_boxes]
     changed = [Window(row, col, row + rows, col + cols) for row, col, rows, cols in windows]
 

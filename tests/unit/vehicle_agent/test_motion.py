@@ -22,9 +22,7 @@ ACTS = st.lists(
 
 
 @given(ACTS, st.floats(0.05, 2.0))
-def test_a_vehicle_is_in_its_tail_until_it_is_driven_to_the_border(
-    acts: list[tuple[str, float]], pace_s_per_m: float
-):
+def test_a_vehicle_is_in_its_tail_until_it_is_driven_to_the_border(acts, pace_s_per_m):
     motion = Motion(GRID, 12)
     for act, value in acts:
         if act == "set out" and motion.at_rest:

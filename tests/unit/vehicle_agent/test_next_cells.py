@@ -39,10 +39,8 @@ def steering_on(climb: Climb | None, pace: np.ndarray = LEVEL, corners: bool = F
 
 
 @given(st.integers(0, 1 << 32), st.floats(0.0, 0.4), st.booleans(), st.booleans())
-@settings(max_examples=few(60), deadline=None)
-def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(
-    seed: int, share: float, corners: bool, level: bool
-) -> None:
+@settings(max_examples=few(60))
+def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed, share, corners, level):
     chance = random.Random(seed)
     heights = np.array([chance.gauss(0, 2) for _ in range(GRID.cells)]).reshape(8, 8)
     pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
@@ -128,7 +126,7 @@ def test_vehicles_drive_up_and_down_as_long_as_the_planner_says(start: int, targ
 
 
 @given(st.integers(0, 1 << 32), st.sampled_from([0.0, 0.5, 1.5, 3.0]))
-@settings(max_examples=few(60), deadline=None)
+@settings(max_examples=few(60))
 def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, relief_m: float) -> None:
     """Up a steep slope a route winds beside cells of its own that are too steep, or too expensive, to go to at
     once; on level ground it winds around corners."""
@@ -159,7 +157,7 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
 
 
 @given(st.integers(0, 1 << 32), st.booleans())
-@settings(max_examples=few(60), deadline=None)
+@settings(max_examples=few(60))
 def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int, near: bool) -> None:
     rng = np.random.default_rng(seed)
     climb = climb_on(rng.normal(0, 2.0, (8, 8)))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shared_map.terrain.step_climb import Climb, climb_of
+from shared_map.terrain.step_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
@@ -81,9 +81,7 @@ def test_an_obstacle_that_leaps_keeps_both_places_closed_and_is_named(obstacles:
     assert closed(obstacles) == {(30, 30)}
 
 
-def test_two_senders_under_one_id_are_two_obstacles_and_one_that_was_started_again_is_not(
-    obstacles: Obstacles,
-) -> None:
+def test_two_senders_under_one_id_are_two_obstacles_and_one_that_was_started_again_is_not(obstacles):
     obstacles.take_report(obstacle(5.5, 5.5, incarnation=1), NOW)
     obstacles.take_report(obstacle(30.5, 30.5, incarnation=2), NOW + 1)
     obstacles.take_report(obstacle(30.5, 30.5, incarnation=2, seq=2), NOW + 2)
@@ -158,9 +156,7 @@ def test_a_stopped_process_forgets_no_obstacle_in_the_time_in_which_it_did_not_l
     assert not obstacles.is_deaf
 
 
-def test_whoever_has_just_begun_to_listen_drives_when_every_obstacle_has_had_time_to_speak(
-    obstacles: Obstacles,
-) -> None:
+def test_whoever_has_just_begun_to_listen_drives_when_every_obstacle_has_had_time_to_speak(obstacles):
     assert not obstacles.is_deaf
     obstacles.listen_anew(NOW)
     for tick in range(10):
@@ -194,9 +190,7 @@ def vehicle_on(route: list[int]) -> Vehicle:
     return vehicle
 
 
-def drive_around(
-    obstacles: Obstacles, pace: np.ndarray, ticks: int = 60, climb: Climb | None = None
-) -> tuple[Vehicle, Detours]:
+def drive_around(obstacles, pace, ticks=60, climb=None):
     route = [GRID.cell(20, col) for col in range(5, 35)]
     vehicle = vehicle_on(route)
     detours = Detours(GRID, pace, steering(obstacles, pace).steps, obstacles, climb)
@@ -238,9 +232,7 @@ def test_a_long_way_around_is_found_over_several_ticks(obstacles: Obstacles) -> 
     assert GRID.cell(0, 20) in vehicle.route.ahead()
 
 
-def test_where_there_is_no_way_around_it_is_looked_for_after_pauses_that_double(
-    obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_there_is_no_way_around_it_is_looked_for_after_pauses_that_double(obstacles, monkeypatch):
     ended_ns: list[int] = []
     end = Detours._end
     monkeypatch.setattr(Detours, "_end", lambda *what: (ended_ns.append(what[-1]), end(*what)))

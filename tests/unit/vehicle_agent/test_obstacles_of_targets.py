@@ -14,13 +14,8 @@ from vehicle_agent.obstacles import Obstacles, TargetObstacles
 GRID = GridSpec(20, 20, 10.0)
 NOW = 10**18
 TEXT = """
-[[targets]]
-name = "t"
-obstacle_radius_m = {radius}
-[[targets]]
-name = "soft"
-[vehicles]
-capture_range_m = 30
+targets = [{{ name = "t", obstacle_radius_m = {radius} }}, {{ name = "soft" }}]
+vehicles = {{ capture_range_m = 30 }}
 """
 
 

@@ -5,9 +5,7 @@ from collections.abc import Callable
 
 from hypothesis import given
 from hypothesis import strategies as st
-from support.shard_tables import (
-    GRID,
-)
+from support.shard_tables import GRID
 
 from vehicle_agent.traffic.pibt import Mover, Round
 

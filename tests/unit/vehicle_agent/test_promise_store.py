@@ -66,9 +66,7 @@ def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int
     third.close()
 
 
-def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_the_disk(tmp_path, monkeypatch):
     syncs: list[int] = []
     store = FilePromiseStore(tmp_path / "promises-a0")
     monkeypatch.setattr(os, "fdatasync", syncs.append)
@@ -101,7 +99,6 @@ def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path)
     for _ in range(few(12)):
         command = [sys.executable, "-c", _PROMISES, str(tmp_path / "promises-a0")]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as agent:
-            assert agent.stdout is not None
             for _ in range(chance.randrange(1, 60)):
                 acknowledged = int(agent.stdout.readline())
             time.sleep(chance.uniform(0, 0.003))
@@ -156,9 +153,7 @@ def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest
     again.close()
 
 
-def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(tmp_path, monkeypatch):
     monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
     store = FilePromiseStore(tmp_path / "promises-a0")
     for shard in range(300):
@@ -224,9 +219,7 @@ def test_an_agent_knows_the_names_which_are_revoked_beside_its_certificate(tmp_p
     assert store.revoked() == ["tracker.t", "agent.all.a0"]
 
 
-def test_members_are_told_of_an_agent_whose_certificate_is_revoked_and_of_its_next_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_members_are_told_of_an_agent_whose_certificate_is_revoked_and_of_its_next_one(monkeypatch):
     names: list[str] = ["planner.t0"]
     told: list[str] = []
     monkeypatch.setattr(PromiseStore, "revoked", lambda self: list(names))

@@ -69,9 +69,7 @@ paces = st.sampled_from([0.1, 0.2, math.inf])
 
 
 @given(*(st.lists(paces, min_size=81, max_size=81) for _ in range(3)))
-def test_after_the_marks_are_applied_nothing_differs_any_more(
-    true: list[float], mapped: list[float], prior: list[float]
-) -> None:
+def test_after_the_marks_are_applied_nothing_differs_any_more(true, mapped, prior):
     truth, ground, before = (np.array(values, np.float32).reshape(9, 9) for values in (true, mapped, prior))
     sight = Sight(np.arange(81), truth.reshape(-1))
     findings = compare(sight, ground, before)

@@ -2,14 +2,7 @@
 
 import msgspec
 from msgspec.structs import replace
-from support.shard_tables import (
-    MEMBERS,
-    SHARDS,
-    S,
-    near_members,
-    standing,
-    table_of,
-)
+from support.shard_tables import MEMBERS, SHARDS, S, near_members, standing, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.wire.fields import MOST_IDS
@@ -55,7 +48,6 @@ def leader_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
     member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
-    assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2), 2 * S)
     (_, table) = member.tick(2 * S)
@@ -130,7 +122,6 @@ def test_an_epoch_has_one_leader_only_though_a_promise_comes_twice() -> None:
     member = member_of()
     member.hear_host_state(standing("a1", [(9, 0, 1)], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
-    assert isinstance(save, Save)
     member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
     assert member.leader is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
@@ -156,17 +147,14 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
-    assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
     wants = [Stand("a0-00", 9, 9, Held.of([(9, 0, 1)]), [], [18, 10], 2, 0)]
     member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
-    assert isinstance(table, Table)
     stored = Stored(shard=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
     for too_old in (msgspec.structs.replace(stored, seq=0), msgspec.structs.replace(stored, epoch=0)):
         assert member.hear_stored(too_old, 2 * S) == []
     (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
-    assert isinstance(granted, Granted)
     assert (granted.host, granted.stamp, granted.heard) == ("a0", table.stamp, 2)
     assert [*granted.grants["a0-00"].cells] == [9, 10]
     assert granted.occupied == [18]

@@ -49,9 +49,7 @@ class Sized(Process):
 class Mixed(TrafficWorld):
     """Some agents have shards of another size; none is called a stranger."""
 
-    def __init__(
-        self, seed: int, agents: int, per_agent: int, side: int, others: set[str], other_side: int
-    ) -> None:
+    def __init__(self, seed, agents, per_agent, side, others, other_side):
         self.others, self.other_side = others, other_side
         super().__init__(seed, agents, per_agent, 24, side, Faults())
 
@@ -120,7 +118,6 @@ def test_an_agent_with_a_wrong_size_that_nobody_built_on_may_start_again_with_th
     spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1", "a2"))}
     wrong = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {})
     (own,) = wrong.begin(5)
-    assert isinstance(own, OwnRecord)
     assert RightOfWay("a0", Shards(GRID, list(spawns), SMALL), spawns, own, {}).own.shard_cells == SMALL
 
 

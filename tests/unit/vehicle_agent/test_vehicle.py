@@ -152,9 +152,7 @@ def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(vehicle: Vehi
         (Vehicle.target_jumped, Reason.JUMPED),
     ],
 )
-def test_whoever_needs_another_route_asks_and_drives_its_own_on(
-    follower: Vehicle, happen: Callable[[Vehicle, int], None], reason: Reason
-) -> None:
+def test_whoever_needs_another_route_asks_and_drives_its_own_on(follower, happen, reason):
     happen(follower, 2 * S)
     assert follower.route_request(3 * S) is reason
     assert (follower.route.left, follower.state) == (3, VehicleState.FOLLOWING)
