@@ -471,7 +471,7 @@ class Planner:
             "target": self.target,
             "incarnation": self._incarnation,
             "map_version": max(self.tree.map_version, 0),
-            "tree_age_ms": self._age_ms(now_ns),
+            "tree_age_ms": math.inf if self._exact_ns is None else (now_ns - self._exact_ns) / 1e6,
             "pose_age_s": self._watch.age_s(now_ns),
             "tracker_lost": self._watch.lost(now_ns),
         }
@@ -487,9 +487,6 @@ class Planner:
             return request.cells
         inside = self._grid.inside(request.row, request.col)
         return [*request.cells, self._grid.cell(request.row, request.col) if inside else -1]
-
-    def _age_ms(self, now_ns: int) -> float:
-        return math.inf if self._exact_ns is None else (now_ns - self._exact_ns) / 1e6
 
     # --- published without a query
     # -----------------------------------------------------------------------------------

@@ -359,7 +359,7 @@ class PlannerService(PlanningProcess):
         return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map
 
     def stop(self, now_ns: int) -> None:
-        self._candidacy.stop()
+        self._candidacy.stop(now_ns)
         for _, event in self._held:
             self._refuse(event, f"{event.topic.name}: the planner ends")
         if self._planner.leads:

@@ -94,10 +94,6 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _gap_mean(value: CertifiedGap | None) -> str:
-    return NONE if value is None else percent(value.mean)
-
-
 def _gap(value: CertifiedGap | Mapping[str, float | None]) -> str:
     return gap_text(value.fields() if isinstance(value, CertifiedGap) else value)
 
@@ -159,7 +155,7 @@ TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
     Fact("nearest_m", "nearest", distance, "Distance of the nearest vehicle."),
     Fact("captures", "captures", count, "How often it was caught."),
     Fact(
-        "certified_gap", "certified gap", _gap_mean,
+        "certified_gap", "certified gap", lambda gap: NONE if gap is None else percent(gap.mean),
         "How far above the optimum the routes to it can be at most, in the mean.", of="gap",
     ),
     Fact("re_plans", "re-plans", count, "How often its tree was grown or repaired.", of="growths"),

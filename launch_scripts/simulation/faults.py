@@ -204,9 +204,10 @@ class FaultyLinks:
     def connected(self, source: str, destination: str, now_ns: int) -> bool:
         at_s = (now_ns - self._began_ns) / NS_PER_S
         return not any(
-            _apart(each, source, destination) and self.noticed(each) and self._known_cut(each, at_s)
+            _apart(each, source, destination) and self.noticed(each)
             for each in self._plan.partitions
             if OBSERVER not in (source, destination)
+            and each.from_s + self._lease_s <= at_s < each.until_s + RELINK_S
         )
 
     def any_cut(self, at_s: float) -> bool:
@@ -222,9 +223,6 @@ class FaultyLinks:
         back_s = partition.until_s + (RELINK_S if self.noticed(partition) else 0.0)
         half_open = partition.one_way and at_s < min(partition.from_s + self._lease_s, partition.until_s)
         return partition.from_s <= at_s < back_s and (outwards or not half_open)
-
-    def _known_cut(self, partition: Partition, at_s: float) -> bool:
-        return partition.from_s + self._lease_s <= at_s < partition.until_s + RELINK_S
 
 
 def _apart(partition: Partition, source: str, destination: str) -> bool:

@@ -92,7 +92,7 @@ class ZenohAnswerer:
                 raise self._fault
             request = intake.request(topic, query, self._asked, self._parameters)
         except ProtocolError as error:
-            intake.drop(key, error)
+            intake.drop(topic.name, key, error)
             self.refuse(f"{topic.name}: {error}")
             self.end()
             return None
@@ -397,7 +397,7 @@ class ZenohBus:
                 message = decode_either(payload, topic.message, topic.bulk)
                 named = self.intake.fields(topic, key)
             except ProtocolError as error:
-                self.intake.drop(key, error)
+                self.intake.drop(topic.name, key, error)
                 return
             replies += 1
             self.intake.received(payload)
@@ -433,7 +433,7 @@ class ZenohBus:
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
-                self.intake.drop(str(sample.key_expr), error)
+                self.intake.drop("alive", str(sample.key_expr), error)
                 return
             if peer in self._own_peers:
                 return  # our own token falls with the link, though we live

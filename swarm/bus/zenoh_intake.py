@@ -167,9 +167,8 @@ def timeout_of(stated: str) -> float:
 log = logging.getLogger(__name__)
 
 _LOG_AGAIN_S = 60.0
-"""A key whose payloads are dropped is logged again after this."""
-_LOGGED_KEYS = 10_000
-"""Most keys whose last log is remembered: a hostile sender may use a new one each time."""
+"""Dropped payloads of one kind are logged again after this. A kind is a topic and a counter, never a key: a hostile
+sender may use a new one each time."""
 
 
 class Intake:
@@ -185,8 +184,8 @@ class Intake:
         self.counts = new_counts()
         self._counting = threading.Lock()
         """Held to add to `counts`."""
-        self._logged_s: dict[str, float] = {}
-        """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
+        self._logged_s: dict[tuple[str, str], float] = {}
+        """Topic and counter -> when such a dropped payload was last logged, by the monotonic clock."""
 
     def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
@@ -196,7 +195,7 @@ class Intake:
             message = decode(packed, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
-            self.drop(key, error)
+            self.drop(topic.name, key, error)
             return None
         return Heard(topic, named, message)
 
@@ -208,7 +207,7 @@ class Intake:
         accepted: list[tuple[str, Message]] = []
         for key, message in zip(keys, decoded, strict=True):
             if isinstance(message, ProtocolError):
-                self.drop(key, message)
+                self.drop(topic.name, key, message)
             else:
                 accepted.append((self.below(key), message))
         return accepted
@@ -237,7 +236,7 @@ class Intake:
             try:
                 payload = self._checked(topic, key, sample, payload)
             except ProtocolError as error:
-                self.drop(key, error)
+                self.drop(topic.name, key, error)
             else:
                 yield key, payload
 
@@ -295,12 +294,14 @@ class Intake:
             self.counts["messages_in"] += len(payloads)
             self.counts["bytes_in"] += sum(map(len, payloads))
 
-    def drop(self, key: str, error: ProtocolError) -> None:
+    def drop(self, name: str, key: str, error: ProtocolError) -> None:
+        """Counts a payload which is rejected, and logs the first of its kind in a minute.
+
+        name  of the topic, or what else it belongs to
+        """
+        kind, now_s = (name, counter_of(error)), time.monotonic()
         with self._counting:
-            self.counts[counter_of(error)] += 1
-        key, now_s = key[:200], time.monotonic()
-        if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
-            if len(self._logged_s) > _LOGGED_KEYS:
-                self._logged_s.clear()
-            self._logged_s[key] = now_s
-            log.warning("dropped a payload on %s: %s", key, error)
+            self.counts[kind[1]] += 1
+        if now_s - self._logged_s.get(kind, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
+            self._logged_s[kind] = now_s
+            log.warning("dropped a payload on %s: %s; more like it are only counted for a minute", key[:200], error)

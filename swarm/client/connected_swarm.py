@@ -7,11 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from swarm.bus.bus import AskEnded, Bus, Replied
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.own_reports import Target
 from swarm.client.route import Route
@@ -20,17 +22,17 @@ from swarm.client.terrain_frame import Frame, Point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
-from swarm.runtime.operator import Acknowledged, Operator, checked
-from swarm.wire.access import OPERATOR
-from swarm.wire.messages import WIRE_VERSION
+from swarm.runtime.operator import Acknowledged, Operator, checked, replies_to
+from swarm.wire.access import OPERATOR, Authenticator
+from swarm.wire.messages import WIRE_VERSION, Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, SendVehicle, Then, VehicleGoals, Zone, ZoneOrder
 from swarm.wire.messages.planning import GROUND, POSE_LEASE_S, PlaceRouteReply, PlaceRouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import PLACE_ROUTE, asker_of
+from swarm.wire.topics import PLACE_ROUTE, RUN, asker_of
 from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
-    from swarm.bus.bus import Bus
+    from swarm.bus.zenoh_bus import ZenohBus
     from swarm.right_of_way.external_session import ExternalSession
     from swarm.runtime.inbox import Inbox
 
@@ -371,7 +373,7 @@ def connect(
         clock = MonotonicClock()
         run, ahead_ns = _run(bus, inbox, began_s + timeout_s, f"{namespace!r} at {endpoint}", clock)
         session = Session(bus, run, clock, inbox.post, ahead_ns)
-        session.trust = lambda: bus.trust(authenticator_of(network, run.run_id))
+        session.trust = lambda: _trust(bus, authenticator_of(network, run.run_id))
     except BaseException:
         bus.close()
         raise
@@ -392,10 +394,6 @@ def connect(
 def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tuple[RunInfo, int]:
     """The run of a namespace, as a process with a grid describes it, and by how many ns the clocks of its processes
     are ahead of ours. Raises BusError, RunMismatchError."""
-    from swarm.bus.bus import AskEnded, Replied
-    from swarm.wire.messages import Nothing
-    from swarm.wire.topics import RUN
-
     while True:
         answers: list[tuple[RunInfo, int]] = []
         bus.ask(RUN, Nothing(), inbox.post, tag="run", timeout_s=_ASK_S)
@@ -410,6 +408,15 @@ def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tu
         if time.monotonic() > until_s:
             raise BusError(f"no process of a swarm answers in namespace {where}: is one running there?")
         time.sleep(0.1)
+
+
+def _trust(bus: ZenohBus, authenticator: Authenticator | None) -> None:
+    """Gives a bus the secret of its run. Raises ConfigError if no process of the run answers with that secret."""
+    bus.trust(authenticator)
+    proof = replace(RUN, free=("ask",))  # an answer to it needs the code of the run
+    if authenticator is not None and not replies_to(bus, proof, Nothing(), _ASK_S)[0]:
+        bus.trust(None)
+        raise ConfigError("no process of the run answers with this user's secret: only its user marks and orders")
 
 
 def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo, int] | None:

@@ -322,7 +322,8 @@ class Vehicle(Reported):
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS
         if self._asking:
             return
-        ran_out = before is not None and (not before.ok or (before.remaining_s > 0 and self._near_end(before)))
+        near_end = before is not None and before.remaining_s > 0 and self.cell in before.cells[-_NEAR_END_CELLS:]
+        ran_out = before is not None and (not before.ok or near_end)
         from_here: dict[str, Any] = {
             "cells": [self.cell],
             "vehicles": [self.id],
@@ -347,9 +348,6 @@ class Vehicle(Reported):
                     self._take(done.result()[0])
 
         asked.add_done_callback(finish)
-
-    def _near_end(self, route: Route) -> bool:
-        return self.cell in route.cells[-_NEAR_END_CELLS:]
 
     def _take(self, reply: RouteReply | PlaceRouteReply | PushedRoute) -> None:
         """Takes a received route, and reports it if it differs from the last one."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.liveness import job_of, ranked_id, split_rank
+from swarm.liveness import Newest, job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
+from swarm.runtime.order_book import FRESH_NS
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.processes import Heartbeat
 from swarm.wire.topics import LEAD
@@ -52,6 +53,7 @@ class Leadership:
     - A candidate that receives a worse-ranked leader takes over once it has been ready for `SETTLED_NS`, or for a
       lease if that one is not ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
+    - A heartbeat counts once: one that was copied, and is repeated with its code, holds no candidate back.
 
     All periods are measured on a clock that counts at most half a lease between two ticks. While this process
     stalls, heartbeats of others wait unread, and no process is considered dead because of that.
@@ -77,6 +79,7 @@ class Leadership:
         """Time from which on this candidate has been ready while a worse one leads; None if it is not so."""
         self._others: dict[tuple[int, int], _Other] = {}
         """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
+        self._newest = Newest(silence_ns=FRESH_NS)
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
         """Takes the heartbeat of another candidate."""
@@ -86,10 +89,13 @@ class Leadership:
             return
         if key not in self._others and len(self._others) >= _MOST_OTHERS:
             return
+        if stamp_ns := heartbeat.stamp_ns:
+            fresh = abs(now_ns - stamp_ns) < FRESH_NS
+            if not (fresh and self._newest.is_news(key, (0, stamp_ns), now_ns)):
+                return
         heard_ns = self._awake_ns + self._counted(now_ns)
         before = self._others.get(key)
-        order = _order(heartbeat.ready, rank, heartbeat.incarnation)
-        self._others[key] = _Other(order, heartbeat.leads, heard_ns)
+        self._others[key] = _Other(_order(heartbeat.ready, rank, heartbeat.incarnation), heartbeat.leads, heard_ns)
         if heartbeat.leads:
             self._led_ns = heard_ns
         elif before is not None and before.leads:
@@ -186,7 +192,7 @@ class Candidacy:
             self._due_ns = (
                 now_ns + HEARTBEAT_NS - HEARTBEAT_NS // 10
             )  # ticks of the same period come a little early or late
-            self._heartbeat(ready, leads)
+            self._heartbeat(ready, leads, now_ns)
         return leads
 
     def tell(self, member: Member, now_ns: int) -> None:
@@ -197,12 +203,14 @@ class Candidacy:
         log.info("%s", text)
         member.note(now_ns, "leader", text)
 
-    def stop(self) -> None:
+    def stop(self, now_ns: int) -> None:
         """Makes another take over immediately."""
         if self._standbys:
-            self._heartbeat(False, False)
+            self._heartbeat(False, False, now_ns)
 
-    def _heartbeat(self, ready: bool, leads: bool) -> None:
+    def _heartbeat(self, ready: bool, leads: bool, now_ns: int) -> None:
         setup = self._setup
-        heartbeat = Heartbeat(role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads)
+        heartbeat = Heartbeat(
+            role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads, stamp_ns=now_ns
+        )
         self._bus.publish(LEAD, heartbeat, role=setup.role, id=setup.id)

@@ -141,16 +141,10 @@ class Tracking:
 
     def _forget_one(self, now_ns: int) -> None:
         """The one that ended first, else the youngest."""
-        ended = [
-            (generation.until_ns, key)
-            for key, generation in self._generations.items()
-            if now_ns >= generation.until_ns
-        ]
-        if ended:
-            del self._generations[min(ended, key=lambda each: each[0])[1]]
-            return
-        youngest = max(self._generations, key=lambda key: _age_order(self._generations[key]))
-        del self._generations[youngest]
+        known = self._generations
+        ended = [key for key, generation in known.items() if now_ns >= generation.until_ns]
+        first = min(ended, key=lambda key: known[key].until_ns, default=None)
+        del known[max(known, key=lambda key: _age_order(known[key])) if first is None else first]
 
 
 class Trackings:

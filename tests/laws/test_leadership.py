@@ -252,19 +252,19 @@ def test_who_stalls_takes_nobody_for_dead_because_of_that() -> None:
     assert world.changes == before
 
 
+def heartbeat(generation: int, leads: bool, stamp_ns: int = 0) -> Heartbeat:
+    return Heartbeat(role="planner", id="t0", incarnation=generation, ready=True, leads=leads, stamp_ns=stamp_ns)
+
+
 def test_of_two_generations_of_one_process_the_younger_leads() -> None:
     older, younger = (Leadership("t0", generation, alone=False, period_ns=HEARTBEAT_NS) for generation in (1, 2))
-
-    def heartbeat(core: Leadership, generation: int) -> Heartbeat:
-        return Heartbeat(role="planner", id="t0", incarnation=generation, ready=True, leads=core.leads)
-
     for n in range(60):
         now_ns = n * HEARTBEAT_NS
         older.tick(True, now_ns)
         if n >= 10:
             younger.tick(True, now_ns)
-            older.on_heartbeat(heartbeat(younger, 2), now_ns)
-            younger.on_heartbeat(heartbeat(older, 1), now_ns)
+            older.on_heartbeat(heartbeat(2, younger.leads), now_ns)
+            younger.on_heartbeat(heartbeat(1, older.leads), now_ns)
         elif n == 9:
             assert older.leads
     assert younger.leads
@@ -273,25 +273,33 @@ def test_of_two_generations_of_one_process_the_younger_leads() -> None:
 
 def test_strangers_without_end_take_no_memory_and_one_lie_holds_for_a_lease_only() -> None:
     core = Leadership("t0.r1", 1, alone=False, period_ns=HEARTBEAT_NS)
-    for n in range(20):
-        core.tick(True, n * HEARTBEAT_NS)
-    assert core.leads
+    assert [core.tick(True, n * HEARTBEAT_NS) for n in range(20)][-1]
     for generation in range(1000):
-        core.on_heartbeat(
-            Heartbeat(role="planner", id="t0", incarnation=generation, ready=True, leads=True), 19 * HEARTBEAT_NS
-        )
+        core.on_heartbeat(heartbeat(generation, True), 19 * HEARTBEAT_NS)
     assert len(core._others) <= 64
     assert not core.tick(True, 20 * HEARTBEAT_NS)
-    leads = [core.tick(True, n * HEARTBEAT_NS) for n in range(21, 30)]
-    assert leads[-1]
+    assert [core.tick(True, n * HEARTBEAT_NS) for n in range(21, 30)][-1]
     assert core._others == {}
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_copied_heartbeats_of_the_dead_hold_nobody_back_later_than_a_minute_after_its_start(heard: bool) -> None:
+    core, chance, death_ns = (
+        Leadership("t0.r1", 1, alone=False, period_ns=HEARTBEAT_NS),
+        random.Random(1),
+        8 * NS_PER_S,
+    )
+    for now_ns in range(HEARTBEAT_NS if heard else death_ns, 90 * NS_PER_S, HEARTBEAT_NS):
+        core.tick(True, now_ns)
+        copied_ns = chance.randrange(HEARTBEAT_NS, death_ns, HEARTBEAT_NS)
+        core.on_heartbeat(heartbeat(1, True, now_ns if now_ns < death_ns else copied_ns), now_ns)
+        assert core.leads or not heard or now_ns < death_ns + SOON_NS
+    assert core.leads
 
 
 def test_a_process_without_standbys_leads_from_its_start() -> None:
     core = Leadership("t0", 1, alone=True, period_ns=HEARTBEAT_NS)
-    assert core.leads
-    assert core.tick(False, 0)
-    assert core.tick(False, 10 * NS_PER_S)
+    assert [core.leads, core.tick(False, 0), core.tick(False, 10 * NS_PER_S)] == [True, True, True]
 
 
 def test_an_id_tells_job_and_rank() -> None:

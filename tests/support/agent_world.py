@@ -213,9 +213,6 @@ class AgentWorld(SwarmModel):
         self.planners[target] = FakePlanner(self, target, incarnation)
         return self.planners[target]
 
-    def stop_planner(self, target: str) -> None:
-        self.planners.pop(target).bus.close()
-
     def start_agent(self, id: str) -> AgentService:
         setup = self.setup("agent", id, self.now_ns)
         self.stores.setdefault(id, PromiseStore(len(self.stores) + 1))

@@ -253,10 +253,6 @@ class Orders:
             seq += 1
         self.newest = max(self.newest, seq)
 
-    def generations_of(self, host: str) -> set[int]:
-        """Returns the fenced generations of a host."""
-        return {generation for name, generation in self.fenced if name == host}
-
     def end(self, host: str, generation: int) -> bool:
         """A generation that was replaced states that it drives no more. Returns whether that opens cells."""
         opens = (host, generation) in self.fenced

@@ -181,7 +181,7 @@ class Leader:
         if is_far_ahead(standing.generation, generation):
             self.refused.append(f"{host} names a generation that is implausibly far ahead: {standing.generation}")
             return
-        fenced = self._orders.generations_of(host)
+        fenced = {each for name, each in self._orders.fenced if name == host}
         if (
             standing.generation != generation
             and len(fenced) >= GENERATIONS_KEPT

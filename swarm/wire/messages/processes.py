@@ -112,14 +112,15 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
-    """State of one of several processes with one job, such as a target's planner and its standbys. `ready`: it can
-    do the job. `leads`: it does."""
+    """State of a candidate for one job, such as a planner or a standby: `ready` for it; `leads`. Only a newer
+    `stamp_ns` counts."""
 
     role: Id
     id: Id
     incarnation: Incarnation
     ready: bool
     leads: bool
+    stamp_ns: StampNs = 0
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):

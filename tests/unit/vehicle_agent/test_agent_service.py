@@ -146,7 +146,7 @@ def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() ->
 def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
     world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN)).begin(t=(10, 15))
     world.run(3.0)
-    world.stop_planner("t")
+    world.planners.pop("t").bus.close()
     world.run(0.5)
     assert world.all_in(VehicleState.LOST)
     before = world.where()["a0-00"][1]
