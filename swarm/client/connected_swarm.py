@@ -414,7 +414,8 @@ def _trust(bus: ZenohBus, authenticator: Authenticator | None) -> None:
     """Gives a bus the secret of its run. Raises ConfigError if no process of the run answers with that secret."""
     bus.trust(authenticator)
     proof = replace(RUN, free=("ask",))  # an answer to it needs the code of the run
-    if authenticator is not None and not replies_to(bus, proof, Nothing(), _ASK_S)[0]:
+    proofs = (replies_to(bus, proof, Nothing(), _ASK_S, role=role)[0] for role in ("agent", "planner", "keeper"))
+    if authenticator is not None and not any(proofs):
         bus.trust(None)
         raise ConfigError("no process of the run answers with this user's secret: only its user marks and orders")
 
