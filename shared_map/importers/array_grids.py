@@ -12,7 +12,7 @@ import math
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -23,7 +23,6 @@ from PIL import Image
 from rasterio import CRS
 from rasterio.transform import from_origin
 
-from shared_map.array_files import Floats
 from shared_map.importers.georeference import METRES, check_size
 from shared_map.importers.raster_files import LONGEST_REASON, Numbers
 from swarm.config.explain import explain
@@ -40,22 +39,6 @@ MAX_STEP = 1e7
 """Metres or degrees: a quarter of the way around the Earth."""
 SCALE_FACTOR = 9.0
 """ROS `scale` mode: pace grows by up to this many times between free and occupied."""
-
-
-class LevelMap(NamedTuple):
-    """A map without heights.
-
-    factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown
-    step_m       side of a cell; 0 if the file does not say
-    west, north  outer corner of cell (0, 0), in metres
-    note         the format found, for people
-    """
-
-    factor: Floats
-    step_m: float
-    west: float
-    north: float
-    note: str
 
 
 # --- numpy's archives ---------------------------------------------------------------------------------------
@@ -136,8 +119,8 @@ class _ShortReads(io.FileIO):
 # --- maps without heights -----------------------------------------------------------------------------------
 
 
-def read_map(path: Path) -> LevelMap:
-    """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot. Its `factor` is 1 or inf.
+def read_map(path: Path) -> Numbers:
+    """MovingAI grid map: paces relative to open ground, which are 1 on `.` `G` `S` and inf on `@` `O` `T` `W`.
 
     Raises
     ------
@@ -162,13 +145,13 @@ def read_map(path: Path) -> LevelMap:
     for row, line in enumerate(filter(str.strip, lines), 1):
         if row > rows or len(line) != cols:
             raise TerrainError(f"terrain {path}, line {row + 4}: {len(line)} cells; expected {rows} rows of {cols}")
-        factor[row - 1] = letters[np.frombuffer(line.encode("ascii"), np.uint8)]
+        factor[row - 1] = letters[np.frombuffer(line.encode("ascii", "replace"), np.uint8)]
         if (unknown := np.isnan(factor[row - 1])).any():
             col = int(unknown.argmax())
             raise TerrainError(f"terrain {path}, line {row + 4}, column {col + 1}: {line[col]!r} is no ground")
     if row < rows:
         raise TerrainError(f"terrain {path} has {row} rows; its header says {rows}")
-    return LevelMap(factor, 0.0, 0.0, 0.0, f"MovingAI map of type {kind}")
+    return Numbers(factor, notes=(f"MovingAI map of type {kind}",))
 
 
 class _RosMap(Struct, frozen=True):
@@ -183,11 +166,12 @@ class _RosMap(Struct, frozen=True):
     negate: bool = False
 
 
-def read_ros(path: Path) -> LevelMap:
+def read_ros(path: Path) -> Numbers:
     """ROS map_server: a yaml that names an image, its resolution, origin and thresholds.
 
-    Its `factor` is 1 on free, inf on occupied cells. Between the thresholds it is NaN in the mode `trinary`, and
-    rises from 1 to 1 + `SCALE_FACTOR` in the modes `scale` and `raw`; in `raw`, values above 100 are NaN.
+    Paces relative to open ground are 1 on free, inf on occupied cells. Between the thresholds they are NaN in the
+    mode `trinary`, and rise from 1 to 1 + `SCALE_FACTOR` in the modes `scale` and `raw`; in `raw`, values above 100
+    are NaN.
 
     Raises
     ------
@@ -221,8 +205,8 @@ def read_ros(path: Path) -> LevelMap:
         factor[between] = np.float32(1) + np.float32(SCALE_FACTOR) * share
     factor[known & (taken > occupied)] = np.inf
     north = south + pixels.shape[0] * found.resolution
-    note = f"ROS map, mode {found.mode}, {np.isnan(factor).mean():.1%} unknown"
-    return LevelMap(factor, found.resolution, west, north, note)
+    place = from_origin(west, north, found.resolution, found.resolution)
+    return Numbers(factor, place, notes=(f"ROS map, mode {found.mode}, {np.isnan(factor).mean():.1%} unknown",))
 
 
 def _grey(path: Path) -> tuple[NDArray[np.float32], int]:

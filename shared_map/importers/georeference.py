@@ -263,8 +263,6 @@ def plan_grid(
         If the georeference is damaged, has neither metres nor degrees, is too near a pole or too wide for one flat
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
-    if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
-        raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
     if not crs.is_geographic and not crs.is_projected and not is_local(crs):
         raise TerrainError(
             f"{what} is in {crs_name(crs)}, without metres or degrees: reproject it, or set terrain.crs"

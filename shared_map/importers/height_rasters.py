@@ -180,7 +180,7 @@ def _heights(
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:
     """Returns (factor, offset) from stored values to metres, and notes for people."""
     notes = []
-    factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    factor, offset = float(dataset.scales[0]), float(dataset.offsets[0])
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
     axes = [

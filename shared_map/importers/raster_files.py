@@ -34,6 +34,7 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _FORMATS = tomllib.loads((Path(__file__).parent / "formats.toml").read_text(encoding="utf-8"))
+_OTHERS = _FORMATS.pop("others")
 _DRIVERS = {first.encode("latin-1"): key for key, row in _FORMATS.items() for first in row.get("begins", ())}
 DRIVERS_BY_ENDING = {ending: key for key, row in _FORMATS.items() for ending in row.get("endings", ())}
 _NAMELESS, _ZIPPED = (
@@ -117,12 +118,15 @@ def opened(path: Path, what: str, *, exact: bool = True) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            # A .vrt names other files: none of them may be somewhere on the network.
+            # A .vrt names other files: none of them may be somewhere on the network. A number beyond the range of
+            # float32 is read as infinite.
             with (
+                np.errstate(over="ignore"),
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
                 contextlib.ExitStack() as files,
             ):
                 dataset = _georeferenced(path, what, files)
+                _check_numbers(dataset, f"{what} {path}")
                 packed = dataset.tags(ns="IMAGE_STRUCTURE")
                 if exact and (
                     dataset.driver in _LOSSY or packed.get("COMPRESSION", "").rpartition(" ")[2] in _LOSSY
@@ -160,6 +164,15 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     if dataset.transform.is_identity and dataset.gcps[0]:
         return files.enter_context(WarpedVRT(dataset))
     return dataset
+
+
+def _check_numbers(dataset: Any, what: str) -> None:
+    """Raises TerrainError if a number by which pixels are placed or scaled is none: GDAL computes with it."""
+    placed = dataset.transform
+    if placed.determinant == 0 or not np.isfinite(list(placed)[:6]).all():
+        raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
+    if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
+        raise TerrainError(f"{what} has a scale of {dataset.scales[0]:g}, expected finite numbers other than 0")
 
 
 def _plain(path: Path, what: str) -> Numbers:
@@ -223,8 +236,7 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
     if count < numbers.size:
         raise TerrainError(f"{what} has {count} numbers; {expected}")
     if dataset.nodata is not None:
-        with np.errstate(over="ignore"):  # one beyond the range of float32 is read as infinite
-            numbers[numbers == np.float32(dataset.nodata)] = np.nan
+        numbers[numbers == np.float32(dataset.nodata)] = np.nan
     grid = numbers.reshape(dataset.height, dataset.width)
     return grid[::-1] if dataset.driver == "GSAG" else grid  # Surfer begins in the south
 
@@ -326,7 +338,7 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
 
     Raises TerrainError if there are several such files, or they are larger than the kind allows.
     """
-    length = check_file(path, kind)
+    length = check_file(path, kind, what)
     # GDAL opens what lies beside a file, too, such as its .prj: it would wait at a pipe for ever.
     for beside in path.parent.glob(f"{glob.escape(path.stem)}.*"):
         if beside.exists() and not (beside.is_file() or beside.is_dir()):
@@ -358,6 +370,8 @@ def _driver(head: bytes, ending: str, what: str) -> str:
     begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
     found = next(begun, _NAMELESS.get(ending))
     if found is None:
+        if other := other_format(head):
+            raise TerrainError(f"{what} {other}")
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
         raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
     return found
@@ -378,8 +392,9 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
             continue
         source = path.parent / (node.text or "").strip()
-        head, _, _ = beginning(source, (), FileKind.VIRTUAL_RASTER, what)
-        _driver(head, source.suffix.lower(), f"{what}: {source}")  # GDAL knows other kinds, also of the network
+        named = f"{what}: {source}"
+        head, _, _ = beginning(source, (), FileKind.VIRTUAL_RASTER, named)
+        _driver(head, source.suffix.lower(), named)  # GDAL knows other kinds, also of the network
         if b"<VRTDataset" in head:  # anywhere, for GDAL
             if depth >= _DEEPEST:
                 raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
@@ -404,6 +419,13 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     except ValueError:
         return 1.0  # GDAL states the fault
     return max(painted / cells, 1.0)
+
+
+def other_format(head: bytes) -> str:
+    """Name of a known format which is not read, and what helps, by the first bytes; empty if it is none."""
+    text = head.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+    found = ((name, how) for name, (begins, how) in _OTHERS.items() if re.search(begins, text, re.IGNORECASE))
+    return next((f"is {name}; it is not read; {how}" for name, how in found), "")
 
 
 # --- read ---------------------------------------------------------------------------------------------------

@@ -144,9 +144,7 @@ def _repeated(heights_m: Floats) -> NDArray[np.intp]:
 def _resampling_of(heights_m: Floats) -> _Resampling | None:
     """The filter which made the columns of a file finer; None if there was none."""
     count, width = heights_m.shape
-    if min(count, width) < _TRIED_CELLS:
-        return None
-    if np.isnan(heights_m[0, 0]):  # no cell has a height
+    if min(count, width) < _TRIED_CELLS or np.isnan(heights_m[0, 0]):  # no cell has a height
         return None
     lines = heights_m[:, np.linspace(0, width - 1, _LINES + 2).astype(int)[1:-1]].astype(np.float64)
     for factor in _factors(heights_m):
@@ -201,7 +199,8 @@ def _factors(heights_m: Floats) -> list[float]:
     at, shown = find_peaks(peaks, height=_PEAK * np.median(peaks[peaks > 0]), distance=4 * _PEAK_APART)
     highest = per_cell[at[np.argsort(shown["peak_heights"])[-_PEAKS:]]]
     found = {2.0, *(times / often for each in highest for often in (each, 1 - each) for times in (1, 2, 3))}
-    return sorted((each for each in found if _LEAST_FACTOR <= each <= _MOST_FACTOR), reverse=True)
+    most = min(_MOST_FACTOR, len(heights_m) / (3 * _REACH))  # something is left between the ends
+    return sorted((each for each in found if _LEAST_FACTOR <= each <= most), reverse=True)
 
 
 def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Resampling | None:
@@ -228,7 +227,7 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
         begin = min(max(start - (wider - cells) // 2, 0), count - wider)
         found, start, cells = found.moved(begin - start), begin, wider
     half = _Resampling(found.step, found.first + 0.5, kernel)
-    if found.step * _LEAST_FACTOR > 1 or _error(some, found) > _SURE * _error(some, half):
+    if found.step * _LEAST_FACTOR > 1 or not _error(some, found) < _SURE * _error(some, half):
         return None
     return found.moved(-start)
 
@@ -291,9 +290,9 @@ class _Sums:
 
 def _error(lines: _Doubles, by: _Resampling) -> float:
     """Mean difference of lines from what a filter makes of the survey that fits best."""
-    if not by.step < 1:
+    if not 2 * _REACH / len(lines) < by.step < 1:
         return math.inf
     sums = _Sums(len(lines), by)
     lines = lines - lines.mean(axis=0)
-    edge = round(_REACH / by.step)
+    edge = int(_REACH / by.step)
     return float(np.abs(lines - sums.summed(sums.solved(lines)))[edge:-edge].mean())

@@ -151,19 +151,23 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
+    from rasterio.transform import from_origin
+
     from shared_map.importers.array_grids import read_map, read_ros
 
     found = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
-    resolution_m = found.step_m or config.resolution_m or 1.0
+    side_m = config.resolution_m or 1.0
+    place = found.transform or from_origin(0.0, 0.0, side_m, side_m)
+    resolution_m = float(place.a)
     if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
         raise TerrainError(
             f"terrain {path} cannot be resampled without closing gaps; leave terrain.resolution_m out"
         )
-    factor = found.factor
+    factor = found.numbers
     factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
-    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, found.west, found.north)
+    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, place.c, place.f)
     level = np.zeros(factor.shape, np.float32)
-    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=(str(path), found.note))
+    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=(str(path), *found.notes))
 
 
 _LEVEL = (".map", ".yaml", ".yml")

@@ -86,10 +86,8 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     LevelGround
         Of patches that a rounding of heights does not explain.
     """
-    with np.errstate(invalid="ignore"):
-        known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
-    if not known.all():
-        elevation_m = np.where(known, elevation_m, np.float32(np.nan))
+    elevation_m = elevation_m.copy()
+    voids_of(elevation_m)
     heights_m, row, col = surveyed(elevation_m)
     mask, patches, level = _at_one_scale(np.ascontiguousarray(heights_m))
     finer = elevation_m.size / heights_m.size
@@ -319,8 +317,6 @@ def undeclared_voids(
 
 def without(heights: Floats, voids: Sequence[float]) -> Floats:
     """Heights as stored, with NaN for each value that stands for no height."""
-    if not voids:
-        return heights
     return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
 
 

@@ -6,6 +6,7 @@ points that do not come row by row.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,11 +19,12 @@ from rasterio.transform import from_origin
 
 from shared_map.importers.georeference import check_size
 from shared_map.importers.raster_files import Numbers
-from swarm.config.input_files import MAX_LINE_BYTES, FileKind, check_bytes, size
+from swarm.config.input_files import FileKind, read_lines
 from swarm.errors import TerrainError
 
 _KIND = FileKind.POINTS
-_CHUNK_BYTES = 4 << 20
+_LINES, _LONGEST = 10_000, 4096
+"""Lines that are read at once, and bytes of the longest: 40 MB."""
 _MOST_STEPS = 1 << 20
 """More places along one axis are no grid."""
 _SAME = 1e-6
@@ -84,10 +86,9 @@ def read_text_grid(path: Path, what: str) -> Numbers:
     Raises
     ------
     TerrainError
-        If a line holds what is no number, or the points lie on no regular grid. Raises OSError, and
-        UnicodeDecodeError where it is no text.
+        If the file cannot be read or is no text, a line holds what is no number, or the points lie on no regular
+        grid.
     """
-    check_bytes(path, _KIND)
     return _points(_layout(path, what))
 
 
@@ -114,19 +115,11 @@ def _layout(path: Path, what: str) -> _Layout:
 
 
 def _lines(path: Path) -> Iterator[dict[int, str]]:
-    """Number -> line of those that are neither empty nor a comment, piece by piece."""
-    number, rest, last = 1, b"", False
-    with path.open("rb") as file:
-        while not last:
-            piece = file.read(_CHUNK_BYTES)
-            last = not piece
-            whole, newline, rest = (rest + piece + b"\n" * last).rpartition(b"\n")
-            if len(rest) > MAX_LINE_BYTES:
-                raise _KIND.refusal(path, f"a line is longer than {size(MAX_LINE_BYTES)}")
-            lines = whole.decode("utf-8-sig" if number == 1 else "utf-8").split("\n") if newline else []
-            stripped = {n: line.strip(" \r") for n, line in enumerate(lines, number)}
-            yield {n: line for n, line in stripped.items() if line and not line.startswith("#")}
-            number += len(lines)
+    """Number -> line of those that are neither empty nor a comment, some at a time."""
+    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, _KIND, _LONGEST), 1))
+    kept = ((n, line) for n, line in stripped if line and not line.startswith("#"))
+    while lines := dict(itertools.islice(kept, _LINES)):
+        yield lines
 
 
 def _numbers(layout: _Layout) -> Iterator[Points]:

@@ -57,32 +57,32 @@ class FileKind(Enum):
         self.most_bytes = most_bytes
         self.error = error
 
-    def refusal(self, path: Path, why: str) -> SwarmError:
-        """The error which says that a file cannot be read."""
-        return self.error(f"cannot read {self.what} {path}: {why}")
+    def refusal(self, path: Path, why: str, what: str = "") -> SwarmError:
+        """The error which says that a file cannot be read; `what` names it and its place, else its kind does."""
+        return self.error(f"cannot read {what or f'{self.what} {path}'}: {why}")
 
     def unreadable(self, path: Path, error: OSError) -> SwarmError:
         return self.refusal(path, error.strerror or str(error))
 
 
-def check_file(path: Path, kind: FileKind) -> int:
-    """Bytes of a file. Raises the kind's error if it is no file, or cannot be looked at."""
+def check_file(path: Path, kind: FileKind, what: str = "") -> int:
+    """Bytes of a file. Raises the kind's error, which names `what`, if it is no file, or cannot be looked at."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise kind.refusal(path, why) from error
+        raise kind.refusal(path, why, what) from error
     if not stat.S_ISREG(found.st_mode):
-        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
-        raise kind.refusal(path, f"it is {what}, not a file")
+        found_is = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
+        raise kind.refusal(path, f"it is {found_is}, not a file", what)
     return found.st_size
 
 
-def check_bytes(path: Path, kind: FileKind) -> int:
+def check_bytes(path: Path, kind: FileKind, what: str = "") -> int:
     """Bytes of a file. Raises the kind's error as `check_file` does, and if it is larger than is read."""
-    count = check_file(path, kind)
+    count = check_file(path, kind, what)
     if count > kind.most_bytes:
-        raise kind.refusal(path, f"it has {size(count)}; at most {size(kind.most_bytes)} are read")
+        raise kind.refusal(path, f"it has {size(count)}; at most {size(kind.most_bytes)} are read", what)
     return count
 
 
@@ -108,21 +108,21 @@ def read_text(path: Path, kind: FileKind, encoding: str = "utf-8") -> str:
         ) from error
 
 
-def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
-    """The lines of a text in ASCII, without their ends, one after the other: only one is held."""
+def read_lines(path: Path, kind: FileKind, longest: int = MAX_LINE_BYTES) -> Iterator[str]:
+    """The lines of a text in UTF-8, without their ends, one after the other: only one is held."""
     check_bytes(path, kind)
     try:
         with path.open("rb") as file:
             number = 0
-            while line := file.readline(MAX_LINE_BYTES + 1):
+            while line := file.readline(longest + 1):
                 number += 1
-                if len(line) > MAX_LINE_BYTES:
-                    raise kind.refusal(path, f"line {number} is longer than {size(MAX_LINE_BYTES)}")
-                yield line.decode("ascii").rstrip("\r\n")
+                if len(line) > longest:
+                    raise kind.refusal(path, f"line {number} is longer than {size(longest)}")
+                yield line.decode("utf-8-sig" if number == 1 else "utf-8").rstrip("\r\n")
     except OSError as error:
         raise kind.unreadable(path, error) from error
     except UnicodeDecodeError as error:
-        raise kind.error(f"{kind.what} {path} is not text: line {number} is not ASCII") from error
+        raise kind.error(f"{kind.what} {path} is not text: line {number} is not UTF-8") from error
 
 
 def size(count: int) -> str:

@@ -98,7 +98,7 @@ def from_file(path: Path) -> Pace:
         case ".map":
             from shared_map.importers.array_grids import read_map
 
-            pace = read_map(path).factor
+            pace = read_map(path).numbers
         case _:
             from shared_map.terrain.terrain import build_terrain
             from swarm.config.ground import TerrainConfig

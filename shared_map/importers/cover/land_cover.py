@@ -158,8 +158,8 @@ def _notes_on(
     total = int(cells.sum())
     there = np.flatnonzero(cells)
     strange = [code for code in there.tolist() if states[code] == 1]
-    if strange and not cells[states == 0].any():
-        found = f"none of its codes on the terrain ({some(strange)}) is in the table, {table.title}"
+    if not cells[states == 0].any():
+        found = f"none of its codes on the terrain ({some(strange) or 'no data'}) is in the table, {table.title}"
         raise TerrainError(f"{what}: {found}; terrain.cover_codes names another")
     most = sorted((code for code in there.tolist() if states[code] == 0), key=lambda code: -cells[code])
     names = {code: f"{code} {table.grounds[code].name}".strip() for code in most[:_LISTED_CODES]}

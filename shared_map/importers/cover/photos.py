@@ -81,31 +81,35 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
 def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
     dataset, grid = placed.dataset, placed.grid
     indexes, palette = _colour_bands(dataset)
-    low, high = _stretch(dataset, indexes, notes)
+    low, high = (0.0, 0.0) if palette is not None else _stretch(dataset, indexes, notes)
     if len(indexes) == 1 and palette is None:
         notes.append("the photo is grey: without colour, what covers the ground is a guess")
 
-    def colours(raw: Floats) -> Bytes:
+    def colours(raw: Floats) -> tuple[Bytes, Bools]:
+        """(colours, black where there are none; where there are any)."""
+        seen = np.asarray(np.isfinite(raw).all(axis=0), np.bool_)
+        raw = np.where(seen, raw, np.float32(0))
         if high > low:
             raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
-        stored = raw.astype(np.uint8)
-        rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
-        return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
+        if palette is not None:
+            looked_up = palette.take(raw[0].astype(np.intp), axis=0, mode="wrap")
+            return looked_up[..., :3] * seen[..., None], seen & (looked_up[..., 3] > 0)
+        return np.moveaxis(raw.astype(np.uint8), 0, -1) * seen[..., None], seen
 
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
     how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
     for rows, raw in placed.on_grid(how, indexes, "reading photo", progress):
-        seen[rows] = ~np.isnan(raw).any(axis=0)
-        rgb[rows] = colours(np.nan_to_num(raw)) * seen[rows, :, None]
+        rgb[rows], seen[rows] = colours(raw)
     if not seen.any():
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
     # Looked for in the file's own pixels: between two colours of a legend an interpolation makes others.
     middle = middle_of(dataset, _MOST_SIDE)
-    own = np.nan_to_num(dataset.read(indexes, window=middle).astype(np.float32))
-    other = why_not_true_colour(colours(own), dataset.dataset_mask(window=middle) > 0)
+    own, shows = colours(dataset.read(indexes, window=middle).astype(np.float32))
+    own = np.broadcast_to(own, (*shows.shape, 3))
+    other = why_not_true_colour(own, shows & (dataset.dataset_mask(window=middle) > 0))
     return Photo(rgb, seen, tuple(notes), other)
 
 
@@ -116,9 +120,8 @@ def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
     if all(colour in meanings for colour in wanted):
         return [meanings.index(colour) + 1 for colour in wanted], None
     if meanings[0] == ColorInterp.palette:
-        table = np.zeros((256, 3), np.uint8)
-        for value, colour in dataset.colormap(1).items():
-            table[value] = colour[:3]
+        table = np.zeros((1 << 16, 4), np.uint8)
+        table[list(dataset.colormap(1))] = list(dataset.colormap(1).values())
         return [1], table
     return ([1, 2, 3] if dataset.count >= 3 else [1]), None
 
@@ -128,7 +131,7 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
     sample = sampled(dataset, tuple(indexes), _STRETCHED_CELLS).compressed().astype(np.float64)
-    sample = sample[np.isfinite(sample) & (sample != 0)]
+    sample = sample[(np.abs(sample) <= np.finfo(np.float32).max) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(sample, (2, 98)))
@@ -154,7 +157,7 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
     same = (rgb[1:, 1:] == rgb[:-1, 1:]).all(axis=2) & (rgb[1:, 1:] == rgb[1:, :-1]).all(axis=2)
     red, green, blue = np.moveaxis(rgb.astype(np.int32), -1, 0)
     count = np.unique((red << 16 | green << 8 | blue)[seen]).size
-    if 1 < count <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
+    if 1 < count <= _LEGEND_COLOURS and same.sum() > _LEGEND_SAME * same.size:
         return f"a drawn map: it has {count} colours, in areas"
     lit = seen & (red + green + blue > _DARK)
     false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit

@@ -20,7 +20,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from shared_map.importers.georeference import system_named
-from shared_map.importers.raster_files import beginning, number_of
+from shared_map.importers.raster_files import beginning, number_of, other_format
 from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 
@@ -46,12 +46,9 @@ _SQLITE, _APPLICATION = b"SQLite format 3\0", slice(68, 70)
 """Beginning of a database, and where it says to which application it belongs: GP10, GP11 or GPKG."""
 
 
-def kind_of(head: bytes, what: str) -> Kind | None:
-    """The format of a file by its first bytes. Raises TerrainError if it is one that must be converted."""
-    if head.startswith(_SQLITE):
-        if head[_APPLICATION] != b"GP":
-            how = "it is not read; `ogr2ogr -f GPKG out.gpkg FILE` converts it"
-            raise TerrainError(f"{what} is SQLite, but no GeoPackage, perhaps SpatiaLite; {how}")
+def kind_of(head: bytes) -> Kind | None:
+    """The format of a file by its first bytes; None if it is not read."""
+    if head.startswith(_SQLITE) and head[_APPLICATION] == b"GP":
         return Kind("GPKG")
     head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     found = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
@@ -65,7 +62,7 @@ IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".f
 def is_vector(path: Path) -> bool:
     """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
     with contextlib.suppress(OSError, TerrainError):
-        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0], "") is not None
+        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0]) is not None
     return False
 
 
@@ -142,6 +139,7 @@ class _Document(Struct, frozen=True):
 _document = msgspec.json.Decoder(_Document)
 _feature = msgspec.json.Decoder(Feature | Geometry)
 _lines = msgspec.json.Decoder(msgspec.Raw)
+_LOOKED_AT = 4096
 _RECORD = b"\x1e"
 """The sign before each feature of a GeoJSON text sequence."""
 
@@ -183,6 +181,8 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
             features.append(msgspec.Raw(msgspec.json.encode(feature)))
         return _collection(features, document.name or name, document.crs)
     except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
+        if other := other_format(data[:_LOOKED_AT]):
+            raise TerrainError(f"{what} {other}") from error
         at = f"feature number {number} cannot be used: " if number else ""
         raise TerrainError(f"{what} is damaged: {at}{error}; repair or remove it") from error
 

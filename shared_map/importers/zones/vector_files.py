@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 from pyogrio.raw import read
 
-from shared_map.importers.raster_files import LONGEST_REASON, beginning
+from shared_map.importers.raster_files import LONGEST_REASON, beginning, other_format
 from shared_map.importers.zones.shape_texts import IN_ARCHIVES, Kind, checked_json, checked_xml, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
@@ -196,15 +196,17 @@ def _refused(what: str) -> Iterator[None]:
 def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     """Returns GDAL's name for a file, whose text is checked, or its content as GeoJSON. Raises TerrainError on a
     file of another kind."""
-    check_bytes(path, FileKind.VECTORS)
+    check_bytes(path, FileKind.VECTORS, what)
     try:
         head, member, length = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
-    kind = kind_of(head, what)
+    kind = kind_of(head)
     if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
+        if other := other_format(head):
+            raise TerrainError(f"{what} {other}")
         raise TerrainError(
             f"{what} is neither GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor"
             " .waypoints, nor a .zip of one; `ogr2ogr -f GPKG out.gpkg FILE` converts most others"

@@ -96,7 +96,7 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
         # The nearest cell counts, or the mean where cells of the grid are half as large again.
         stored = placed.on_grid("average" if placed.grows else "nearest")
         values = np.concatenate([rows for _, rows in stored])
-        values = values * np.float32(dataset.scales[0] or 1.0) + np.float32(dataset.offsets[0] or 0.0)
+        values = values * np.float32(dataset.scales[0]) + np.float32(dataset.offsets[0])
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]

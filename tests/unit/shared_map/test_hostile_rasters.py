@@ -1,6 +1,5 @@
 """Rasters that would have ended in a traceback, at a web server, in a wait for ever, or as a lake that is none."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +24,6 @@ def test_a_slope_too_gentle_to_see_between_two_cells_is_no_lake() -> None:
     assert not level_ground(slope).mask.any()
     slope[60:100, 60:100] = slope.min() - 1
     assert np.count_nonzero(level_ground(slope).mask) == 1600
-
-
-@pytest.mark.parametrize("code", [np.inf, -np.inf, -3.4e38])
-def test_what_is_no_height_is_no_lake_and_no_warning(code: float) -> None:
-    heights = HEIGHTS.copy()
-    heights[5:20, 5:20] = code
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert level_ground(heights).patches == ()
 
 
 def test_a_file_of_one_code_only_has_no_heights() -> None:

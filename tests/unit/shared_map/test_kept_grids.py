@@ -1,8 +1,8 @@
 """A grid comes in as it was written: every format, every cell size, every door."""
 
 import os
-import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from support.height_models import written
 from support.zone_shapes import painted
 
 from shared_map.importers.terrain_sources import Source, load_source
+from shared_map.importers.zones.zone_files import burn_zone
 from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -30,8 +31,8 @@ HEIGHTS = (300 + 8 * np.sin(np.arange(12) / 3)[:, None] + np.cos(np.arange(15) /
 ROWS, COLS = HEIGHTS.shape
 
 
-def load(path: Path, **settings: Any) -> Source:
-    return load_source(TerrainConfig(source=str(path), **settings), seed=1)
+def load(source: str | Path, **settings: Any) -> Source:
+    return load_source(TerrainConfig(source=str(source), **settings), seed=1)
 
 
 def rows_of(heights: np.ndarray) -> str:
@@ -189,31 +190,51 @@ def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
     assert "the file states depths; heights are their negatives" in source.notes
 
 
-KINDS = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
-KINDS += ["complex_int16", "complex64", "complex128"]
+REAL = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
+COMPLEX = ["complex_int16", "complex64", "complex128"]
+NOTHING = "no heights at all|shows nothing of the terrain|none of its codes|no value on the|holds -inf"
+ODD: dict[str, tuple[dict[str, Any], str]] = {
+    **{kind: ({"dtype": kind}, "") for kind in REAL},
+    **{kind: ({"dtype": kind}, rf"holds complex numbers \({kind}\), expected real ones") for kind in COMPLEX},
+    "cells of no size": ({"transform": rasterio.Affine(np.nan, 0, WEST, 0, -10, NORTH)}, "pixels without a size"),
+    **{f"scale {scale}": ({"scales": (scale,)}, f"a scale of {scale}, expected") for scale in (0, np.nan, np.inf)},
+    **{f"half {value}": ({"dtype": "float64", "filled": value}, "") for value in (np.nan, np.inf, 1e300)},
+    **{f"all {value}": ({"dtype": "float64", "filled": value}, NOTHING) for value in (np.nan, -np.inf)},
+}
+"""Raster of one band -> what its refusal says at every door; empty if it is read."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("door", ["source", "photo", "cover"])
-def test_numbers_of_every_kind_are_read_or_refused_at_every_door(tmp_path: Path, kind: str, door: str) -> None:
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("door", ["source", "photo", "cover", "friction"])
+def test_numbers_of_every_kind_are_read_or_refused_at_every_door(tmp_path: Path, name: str, door: str) -> None:
+    made, words = ODD[name]
+    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, 10, 10)}
+    made = {"dtype": "int16", "scales": (1.0,), "filled": 1.0, **place, **made}
+    numbers = np.arange(ROWS * COLS, dtype=np.float64).reshape(ROWS, COLS) % 90 + 1
+    numbers[:, : COLS // (1 if name.startswith("all") else 2)] = made.pop("filled")
+    scales, file, dem = made.pop("scales"), tmp_path / "other.tif", tmp_path / "dem.tif"
+    write_raster(dem, 10.0)
+    with rasterio.open(file, "w", height=ROWS, width=COLS, count=1, **made) as dataset:
+        dataset.write(numbers.astype("complex64" if name in COMPLEX else made["dtype"]), 1)
+        dataset.scales = scales
+    settings = {"photo": {}, "source": {}, "cover": {"cover_codes": str(tmp_path / "codes.csv")}}
+    (tmp_path / "codes.csv").write_text("code,class\n" + "".join(f"{code},grass\n" for code in range(1, 91)))
+    with pytest.raises(TerrainError, match=words) if words else nullcontext():
+        if door == "friction":
+            burn_zone(ZoneConfig(kind="factor", file=str(file)), load(dem).grid, "zone")
+        else:
+            files = {"source": str(dem), door: str(file), **settings[door]}
+            assert load(**files).grid.shape == HEIGHTS.shape
+
+
+def test_colours_are_looked_up_in_a_palette_of_any_length(tmp_path: Path) -> None:
     write_raster(tmp_path / "dem.tif", 10.0)
-    numbers = (np.arange(ROWS * COLS).reshape(ROWS, COLS) % 90 + 1).astype(np.int16)
-    with rasterio.open(
-        tmp_path / "other.tif", "w", height=ROWS, width=COLS, count=1, dtype=kind, crs=UTM,
-        transform=from_origin(WEST, NORTH, 10, 10),
-    ) as file:  # fmt: skip
-        file.write(numbers.astype("complex64" if kind.startswith("complex") else kind), 1)
-    path = tmp_path / ("other.tif" if door == "source" else "dem.tif")
-    settings = {} if door == "source" else {door: str(tmp_path / "other.tif")}
-    if door == "cover":
-        settings["cover_codes"] = str(tmp_path / "codes.csv")
-        (tmp_path / "codes.csv").write_text("code,class\n" + "".join(f"{code},grass\n" for code in range(1, 91)))
-    if kind.startswith("complex"):
-        with pytest.raises(TerrainError, match=f"holds complex numbers \\({kind}\\), expected real ones"):
-            load(path, **settings)
-    else:
-        with warnings.catch_warnings(action="ignore"):
-            assert load(path, **settings).grid.shape == HEIGHTS.shape
+    place = {"crs": UTM, "transform": from_origin(WEST, NORTH, 10, 10)}
+    file = written(tmp_path / "a.tif", np.full(HEIGHTS.shape, 300), "uint16", **place)
+    with rasterio.open(file, "r+") as dataset:
+        dataset.write_colormap(1, {300: (90, 80, 70, 255)})
+    np.testing.assert_array_equal(load(tmp_path / "dem.tif", photo=str(file)).photo[..., 1], 80)
 
 
 @pytest.mark.parametrize("ending", ["pgm", "png", "bmp"])

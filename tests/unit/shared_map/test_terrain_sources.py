@@ -104,23 +104,16 @@ def test_scale_and_offset_are_applied_and_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
 def test_voids_nan_and_infinite_cells_are_voids_counted_and_said(tmp_path: Path, dtype: str) -> None:
     values = heights().astype(dtype)
-    values[5:10, 5:10] = -9999
+    values[5:10] = -9999
     if dtype == "float32":
         values[20, 20], values[20, 22], values[20, 24] = np.nan, np.inf, -3.4e38
     source = load(write(tmp_path / "a.tif", values, nodata=-9999))
-    count = 28 if dtype == "float32" else 25
+    count = 253 if dtype == "float32" else 250
     assert np.isnan(source.elevation_m).sum() == count
-    assert said(source, f"{count} voids")
+    assert said(source, "of the cells) are lethal; crop the file, or set terrain.nodata = 'fill'")
+    assert not np.isnan(load(tmp_path / "a.tif", nodata="fill").elevation_m).any()
     terrain = build_terrain(Scenario(terrain=TerrainConfig(source=str(tmp_path / "a.tif"))))
     assert (np.isinf(terrain.pace_s_per_m) == np.isnan(source.elevation_m)).all()
-
-
-def test_54_percent_voids_are_lethal_with_a_hint(tmp_path: Path) -> None:
-    values = heights(50, 50)
-    values[:27] = -9999
-    path = write(tmp_path / "a.tif", values, nodata=-9999)
-    assert said(load(path), "54.0% of the cells) are lethal; crop the file, or set terrain.nodata = 'fill'")
-    assert not np.isnan(load(path, nodata="fill").elevation_m).any()
 
 
 def test_a_photo_on_another_grid_is_brought_onto_the_elevations(tmp_path: Path) -> None:
@@ -244,7 +237,6 @@ def two_variables(folder: Path) -> dict[str, Any]:
 NOISE = np.random.default_rng(1).normal(size=(400, 400)).astype(np.float32)
 PHOTO = np.zeros((3, 9, 9), np.uint8)
 FEET = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'
-NOT_A_NUMBER = np.full((3, 40, 50), np.nan, np.float32)
 DEGREES = {
     "all": (from_origin(-180, 90, 7.2, 4.5), "EPSG:4326"),
     "beyond": (from_origin(9, 91, 0.1, 0.1), "EPSG:4326"),
@@ -254,19 +246,13 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: dem(f, None, *DEGREES["pole"]), "around latitude 89.98, where degrees of longitude have no width"),
     (lambda f: dem(f, None, *DEGREES["all"]), "no flat grid is true over more than 12; crop it"),
     (lambda f: dem(f, None, *DEGREES["beyond"]), "to 91; its georeference is damaged"),
-    (lambda f: dem(f, heights().astype(np.complex64)), "holds complex numbers"),
     (lambda f: dem(f, crs=None), r"does not say in which coordinate system.*set terrain\.crs"),
     (lambda f: dem(f, crs=FEET), r"without metres or degrees.*set terrain\.crs"),
     (lambda f: dem(f, crs=None) | {"crs": "EPSG:banana"}, "'EPSG:banana' is no coordinate system"),
     (lambda f: dem(f) | {"resolution_m": 5000.0}, "no cell of 5000 m fits"),
     (lambda f: dem(f) | {"labels": "labels.toml"}, "needs a photo"),
-    (lambda f: dem(f, np.full((9, 9), np.nan, np.float32)), "no heights at all"),
-    (
-        lambda f: dem(f, np.zeros((3, 40, 50), np.uint8)),
-        r"3 bands of uint8, expected one of elevation.*terrain\.photo",
-    ),
+    (lambda f: dem(f, PHOTO), r"3 bands of uint8, expected one of elevation.*terrain\.photo"),
     (lambda f: with_photo(f, np.zeros((3, 40, 50), np.uint8), nodata=0), "p.tif shows nothing of the terrain"),
-    (lambda f: with_photo(f, NOT_A_NUMBER), "p.tif shows nothing of the terrain"),
     (lambda f: with_photo(f, PHOTO, from_origin(6e5, 52e5, 10, 10)), "does not overlap .*: it covers x 600000"),
     (lambda f: with_photo(f, PHOTO, Affine.identity(), None), "georeference both, or make them the same size"),
     (lambda f: cut(f, heights(400, 400)), "truncated or no raster"),
@@ -277,8 +263,8 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: text(f, "a.qqq"), ".qqq is unknown; give .tif.*gdal_translate"),
     (lambda f: {"source": f / "nowhere.tif"}, r"cannot read terrain .*nowhere\.tif: No such file"),
     (lambda f: {"source": f}, "is a folder"),
-    (lambda f: vrt(f, "http://127.0.0.1:9/a.tif"), "cannot read raster .*No such file"),
-    (lambda f: vrt(f, "/vsicurl/a.tif"), "cannot read raster .*No such file"),
+    (lambda f: vrt(f, "http://127.0.0.1:9/a.tif"), r"cannot read .*vrt: .*a\.tif: No such file"),
+    (lambda f: vrt(f, "/vsicurl/a.tif"), r"cannot read .*vrt: /vsicurl/a\.tif: No such file"),
     (lambda f: vrt(f, fifo(f)), "it is a device or pipe"),
     (lambda f: vrt(f, "a.vrt"), "more than 4 deep"),
     (lambda f: vrt(f, dem(f)["source"].name, 40), "paints its pixels 40 times over"),

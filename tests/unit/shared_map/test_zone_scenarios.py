@@ -52,7 +52,7 @@ def test_a_terrain_changes_with_its_files_and_not_with_where_they_lie(tmp_path: 
     assert kept_key(first) is None
     (tmp_path / "a" / "area.geojson").unlink()
     assert missing_files(first) == [str(tmp_path / "a" / "area.geojson")]
-    with pytest.raises(TerrainError, match=r"cannot read zone .*area\.geojson: No such file"):
+    with pytest.raises(TerrainError, match=r"^cannot read cost\.zones\[0\]: .*area\.geojson: No such file"):
         build_terrain(first)
 
 
