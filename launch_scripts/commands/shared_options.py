@@ -37,7 +37,8 @@ _UNITS_S = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0
 def duration(*names: str, least_s: float, most_s: float = MOST_SECONDS) -> Any:
     """An option which is a duration: a number of seconds, or with a unit."""
 
-    def parse(text: str) -> float:
+    def parse(given: str | float) -> float:
+        text = str(given)  # a default comes as a number
         number = text.rstrip("smindh ")
         with suppress(ValueError, KeyError):
             if least_s <= (found_s := float(number) * _UNITS_S[text.removeprefix(number).strip()]) <= most_s:

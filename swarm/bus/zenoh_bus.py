@@ -164,7 +164,7 @@ def open_bus(
     authenticator  makes and checks the codes of messages
     """
     endpoints = network.listen if mode == "router" else network.connect
-    warned = False
+    warned, kept_open = False, 0
     while True:
         if patient:
             wait_for_router(endpoints)
@@ -173,7 +173,9 @@ def open_bus(
             bus.proves_names = network.tls is not None
             return bus
         except zenoh.ZError as error:
-            if not patient or any(map(keeps_open, endpoints)):
+            # A router that came up during one attempt answers the next.
+            kept_open = kept_open + 1 if any(map(keeps_open, endpoints)) else 0
+            if not patient or kept_open > 1:
                 raise _why_not(error, network, mode) from error
             if not warned:
                 log.warning("no router behind %s yet: waiting for one (Ctrl-C ends this)", ", ".join(endpoints))

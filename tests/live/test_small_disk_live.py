@@ -72,7 +72,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
             swarm.terminate()
             swarm.wait(timeout=20)
     said = lines_of(out)
-    assert any(line.startswith("12 of 12 vehicles routed, ") and "no collision." in line for line in said)
+    assert any(line.startswith("12 of 12 vehicles routed, ") and "no collisions." in line for line in said)
     assert "restarts 2" in said
     assert "Traceback" not in out.read_text()
     assert all("Traceback" not in path.read_text() for path in run_dir.glob("*.log*"))

@@ -142,4 +142,4 @@ def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
     assert "FAILED small seed 3" in out
     assert "it broke" in out
     assert "failed: swarm simulate small --seeds 3:4" in out
-    assert "1 of 1 seeds broke a law" in out
+    assert "1 of 1 seed broke a law" in out

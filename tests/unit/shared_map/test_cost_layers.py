@@ -49,7 +49,7 @@ class Writes(Factor):
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    (tmp_path / "pace_layers.py").write_text(MODULE)
+    (tmp_path / "layers.py").write_text(MODULE)
     with forgotten_afterwards(tmp_path):
         yield tmp_path
 
@@ -98,7 +98,7 @@ def test_processes_with_other_layers_refuse_each_other(folder: Path) -> None:
 def test_a_prepared_terrain_is_of_no_use_once_the_module_has_changed(folder: Path) -> None:
     before = scenario_key(scenario(folder, ("Factor", 1.5)))
     assert scenario_key(scenario(folder, ("Factor", 1.5))) == before
-    (folder / "pace_layers.py").write_text(MODULE.replace("return pace *", "return pace * 2 *"))
+    (folder / "layers.py").write_text(MODULE.replace("return pace *", "return pace * 2 *"))
     assert scenario_key(scenario(folder, ("Factor", 1.5))) != before
     assert kept_key(scenario(folder, ("Factor", 1.5))) is None
     assert kept_key(scenario(folder)) is not None
@@ -106,7 +106,7 @@ def test_a_prepared_terrain_is_of_no_use_once_the_module_has_changed(folder: Pat
 
 def test_a_machine_that_lacks_the_module_has_to_fetch_the_map(folder: Path) -> None:
     assert missing_files(scenario(folder, ("Factor", 1.5))) == []
-    (folder / "pace_layers.py").unlink()
+    (folder / "layers.py").unlink()
     assert missing_files(scenario(folder, ("Factor", 1.5))) == ["layers:Factor"]
     with pytest.raises(ConfigError, match=r"cost\.layers\[0\]\.layer: 'layers:Factor' could not be imported"):
         built(folder, ("Factor", 1.5))
@@ -115,8 +115,8 @@ def test_a_machine_that_lacks_the_module_has_to_fetch_the_map(folder: Path) -> N
 @pytest.mark.parametrize(
     ("name", "by", "said"),
     [
-        ("Raises", 1.0, "cost raised KeyError: 'snow' (pace_layers.py:"),
-        ("Writes", 1.0, "cost raised ValueError: assignment destination is read-only (pace_layers.py:"),
+        ("Raises", 1.0, "cost raised KeyError: 'snow' (layers.py:"),
+        ("Writes", 1.0, "cost raised ValueError: assignment destination is read-only (layers.py:"),
         ("Zero", 1.0, "cost returned pace 0 at row "),
         ("Factor", -1.0, "cost returned pace -"),
         ("Factor", 1e9, "cost returned pace "),
