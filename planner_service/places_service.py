@@ -247,7 +247,7 @@ class PlacesService(PlanningProcess):
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        self._candidacy.stop(now_ns)
+        self._candidacy.stop()
         waiting = iter(self._waiting.take, None)
         for question in (self._at_work, *self._going_on, *waiting):
             if question is not None:

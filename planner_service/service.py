@@ -231,7 +231,7 @@ class PlannerService(PlanningProcess):
     def _tell_no_tracker(self, now_ns: int) -> None:
         waits = self._candidacy.leads and self._watch.pose is None and not (self._untracked or self._removed)
         if waits and now_ns - self._began_ns >= _AWAITED_NS:
-            text = f"no tracker has published {self._target} yet; its vehicles wait"
+            text = f"no tracker has published {self._target} since its planner started; its vehicles wait"
             self._member.alarms.begin("no-tracker", self._target, text, now_ns, target=self._target)
         else:
             self._member.alarms.end("no-tracker", self._target, now_ns)
@@ -359,7 +359,7 @@ class PlannerService(PlanningProcess):
         return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map
 
     def stop(self, now_ns: int) -> None:
-        self._candidacy.stop(now_ns)
+        self._candidacy.stop()
         for _, event in self._held:
             self._refuse(event, f"{event.topic.name}: the planner ends")
         if self._planner.leads:

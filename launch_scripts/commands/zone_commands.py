@@ -41,14 +41,14 @@ def add(
     layer: str | None = None,
     crs: str | None = None,
     kind: str = "lethal",
-    for_: Annotated[float | None, duration("--for", least_s=0.001)] = None,
+    for_: Annotated[float | None, duration("--for", least_s=0.001, most_s=1e9)] = None,
     name: str = "",
     vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Close an area, or set its pace. Returns once all maps and trees include it.
 
-    swarm order zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --for 10m --name bridge
+    swarm order zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --for 10min --name bridge
 
     swarm order zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
 

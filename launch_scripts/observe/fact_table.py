@@ -109,7 +109,7 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("classes", "classes", each, "The vehicles by class."),
     Fact("following", "assigned", count, "Vehicles that have a target."),
     Fact("sent", "sent to places", each, "Vehicles that were sent to places, by the state of their goals."),
-    Fact("external", "external vehicles", first_of, "Vehicles and obstacles of other programs."),
+    Fact("external", "external vehicles", first_of, "External vehicles and other reported obstacles."),
     Fact("captures", "captures", count, "How often targets were caught."),
     Fact("marks", "marks", count, "Marks that vehicles made since the last start of their agents."),
     Fact(

@@ -209,7 +209,7 @@ def free_places(folder: Path, names: Sequence[str], out: Path | None, force: boo
     paths = [to / name for name in names]
     make_folder(to)
     for path in paths:
-        check_target(path, "--out", force=force)
+        check_target(path, "--out" if out else "export", force=force)
     return paths
 
 

@@ -172,7 +172,8 @@ def _check_numbers(dataset: Any, what: str) -> None:
     if placed.determinant == 0 or not np.isfinite(list(placed)[:6]).all():
         raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
     if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
-        raise TerrainError(f"{what} has a scale of {dataset.scales[0]:g}, expected finite numbers other than 0")
+        found = f"scales {dataset.scales[:4]} and offsets {dataset.offsets[:4]}"
+        raise TerrainError(f"{what} has {found}, expected finite numbers, and no scale of 0")
 
 
 def _plain(path: Path, what: str) -> Numbers:

@@ -14,7 +14,7 @@ Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is
 Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
-            logged once per key and minute, and never posted. If the bus has an `Authenticator`, so is a payload
+            logged once per topic and minute, and never posted. If the bus has an `Authenticator`, so is a payload
             without the run's code, unless `Topic.free` lets strangers say it; such a query is refused.
 Misrouting  A payload that names another key than the one under which it came is never posted, and is counted apart
             (`payloads_misrouted`). A query that names another key is refused.

@@ -400,6 +400,8 @@ class Vehicle(Reported):
             for_s = session.number("for_s", for_s, 0, 1e9, more=True)
         class_number = 0 if only_for is None else session.class_number(only_for, "only_for")
         kind = MarkKind.LETHAL if lethal else MarkKind.CLEAR if clear else MarkKind.PACE
+        if not self._marks.any:
+            session.trust()  # which asks the network: others wait for the lock meanwhile
         with session.lock:
             session.check_open()
             try:
@@ -409,7 +411,6 @@ class Vehicle(Reported):
             now_ns = session.swarm_now_ns()
             until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             if not self._marks.any:
-                session.trust()
                 session.bus.serve(MARKS, session.post, author=self._marks.author)
                 session.bus.subscribe(MARKS, session.post, author=self._marks.author)
             sets = self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns, class_number)

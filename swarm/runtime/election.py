@@ -14,7 +14,6 @@ from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.liveness import Newest, job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
-from swarm.runtime.order_book import FRESH_NS
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.processes import Heartbeat
 from swarm.wire.topics import LEAD
@@ -29,6 +28,8 @@ SETTLED_NS = 2 * NS_PER_S
 was just started has the whole map by then, and one that keeps stalling never comes so far."""
 _MOST_OTHERS = 64
 """Incarnations of other candidates that are remembered."""
+_FOR_GOOD_NS = 1 << 62
+"""A process that starts again has another incarnation, so the numbers of one life never begin again."""
 
 _Order = tuple[bool, int, int]
 """(not ready, rank, -incarnation): the lowest is best, so of one rank the younger incarnation."""
@@ -79,7 +80,7 @@ class Leadership:
         """Time from which on this candidate has been ready while a worse one leads; None if it is not so."""
         self._others: dict[tuple[int, int], _Other] = {}
         """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
-        self._newest = Newest(silence_ns=FRESH_NS)
+        self._newest = Newest(silence_ns=_FOR_GOOD_NS)
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
         """Takes the heartbeat of another candidate."""
@@ -89,10 +90,8 @@ class Leadership:
             return
         if key not in self._others and len(self._others) >= _MOST_OTHERS:
             return
-        if stamp_ns := heartbeat.stamp_ns:
-            fresh = abs(now_ns - stamp_ns) < FRESH_NS
-            if not (fresh and self._newest.is_news(key, (0, stamp_ns), now_ns)):
-                return
+        if not self._newest.is_news(key, (0, heartbeat.seq), now_ns):
+            return
         heard_ns = self._awake_ns + self._counted(now_ns)
         before = self._others.get(key)
         self._others[key] = _Other(_order(heartbeat.ready, rank, heartbeat.incarnation), heartbeat.leads, heard_ns)
@@ -166,6 +165,7 @@ class Candidacy:
         self._core = Leadership(setup.id, setup.incarnation, alone=standbys == 0, period_ns=int(NS_PER_S / tick_hz))
         self._due_ns = 0
         """Time of the next heartbeat; a change of the leader is published immediately."""
+        self._seq = 0
 
     @property
     def leads(self) -> bool:
@@ -189,10 +189,9 @@ class Candidacy:
         before = self._core.leads
         leads = self._core.tick(ready, now_ns)
         if self._standbys and (leads != before or now_ns >= self._due_ns):
-            self._due_ns = (
-                now_ns + HEARTBEAT_NS - HEARTBEAT_NS // 10
-            )  # ticks of the same period come a little early or late
-            self._heartbeat(ready, leads, now_ns)
+            # Ticks of the same period come a little early or late.
+            self._due_ns = now_ns + HEARTBEAT_NS - HEARTBEAT_NS // 10
+            self._heartbeat(ready, leads)
         return leads
 
     def tell(self, member: Member, now_ns: int) -> None:
@@ -203,14 +202,15 @@ class Candidacy:
         log.info("%s", text)
         member.note(now_ns, "leader", text)
 
-    def stop(self, now_ns: int) -> None:
+    def stop(self) -> None:
         """Makes another take over immediately."""
         if self._standbys:
-            self._heartbeat(False, False, now_ns)
+            self._heartbeat(False, False)
 
-    def _heartbeat(self, ready: bool, leads: bool, now_ns: int) -> None:
+    def _heartbeat(self, ready: bool, leads: bool) -> None:
         setup = self._setup
+        self._seq += 1
         heartbeat = Heartbeat(
-            role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads, stamp_ns=now_ns
+            role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads, seq=self._seq
         )
         self._bus.publish(LEAD, heartbeat, role=setup.role, id=setup.id)

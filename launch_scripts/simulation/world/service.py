@@ -158,7 +158,7 @@ class TargetsService:
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        self._candidacy.stop(now_ns)
+        self._candidacy.stop()
         self._member.publish_stats(now_ns)
 
     def _obey(self, now_ns: int) -> None:

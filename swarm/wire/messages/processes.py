@@ -22,6 +22,7 @@ from swarm.wire.fields import (
     Incarnation,
     LongText,
     Metres,
+    Natural,
     StampNs,
     Text,
     WebPort,
@@ -112,15 +113,15 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
-    """State of a candidate for one job, such as a planner or a standby: `ready` for it; `leads`. Only a newer
-    `stamp_ns` counts."""
+    """State of a candidate for one job, such as a planner or a standby. `ready`: it can do the job. `leads`: it
+    does. `seq`: number of this heartbeat in its sender's life; only a greater one counts."""
 
     role: Id
     id: Id
     incarnation: Incarnation
     ready: bool
     leads: bool
-    stamp_ns: StampNs = 0
+    seq: Natural
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):

@@ -181,7 +181,7 @@ def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_h
         for message in (
             stats("agent", name, at_s=at_s), status(name, 1.0), pose(name, 1.0, 1.0, at_s + 1),
             fleet(f"{name}.1", {f"{name}-00": (1.0, 1.0)}, at_s), set_of(f"{name}.1", 0, at_s + 1, {}),
-            Heartbeat(role="planner", id=name, incarnation=1, ready=True, leads=True),
+            Heartbeat(role="planner", id=name, incarnation=1, ready=True, leads=True, seq=1),
             GoalStates(agent=name, stamp_ns=1, states=[goal]),
         ):  # fmt: skip
             latest.heard(message, at_s * NS_PER_S)
@@ -296,7 +296,7 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
         return [line.title for line in recorder.summary(0).targets]
 
     def heartbeat(id: str, leads: bool) -> Heartbeat:
-        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
+        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads, seq=1)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
     begun = Recorder(standing_by, GRID, 1)
