@@ -197,7 +197,7 @@ ODD: dict[str, tuple[dict[str, Any], str]] = {
     **{kind: ({"dtype": kind}, "") for kind in REAL},
     **{kind: ({"dtype": kind}, rf"holds complex numbers \({kind}\), expected real ones") for kind in COMPLEX},
     "cells of no size": ({"transform": rasterio.Affine(np.nan, 0, WEST, 0, -10, NORTH)}, "pixels without a size"),
-    **{f"scale {scale}": ({"scales": (scale,)}, f"a scale of {scale}, expected") for scale in (0, np.nan, np.inf)},
+    **{f"scale {given}": ({"scales": (given,)}, rf"has scales \({given},\)") for given in (0.0, np.nan, np.inf)},
     **{f"half {value}": ({"dtype": "float64", "filled": value}, "") for value in (np.nan, np.inf, 1e300)},
     **{f"all {value}": ({"dtype": "float64", "filled": value}, NOTHING) for value in (np.nan, -np.inf)},
 }
