@@ -37,7 +37,7 @@ class GoalAnswer(NamedTuple):
 
     route        NO_TARGET while it is not known yet: ask again to continue. Until then its lower bound is the
                  frontier's cost
-    lethal_goal  no route leads to the goal: the status is UNREACHABLE
+    lethal_goal  the goal itself is on a lethal cell; the status is UNREACHABLE then
     grown_cells  cells that this ask has grown: 0 if a tree that was kept answered as it was
     """
 

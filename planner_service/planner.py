@@ -81,9 +81,10 @@ SEARCH_COUNTS = ("searches", "search_places")
 class Planner:
     """Keeps the tree of one target, and answers from it.
 
-    Each tick applies the newest pose and all map changes at once. At most one full growth is under way. Changes
-    that arrive meanwhile are applied when it is adopted. Before the first tree all routes are
-    NO_TARGET. The cost map belongs to the caller, which applies marks to it between calls.
+    Each tick applies the newest pose. Changes of the map may wait for a second (`MapIntake`), but no route that is
+    given passes one that waits. At most one full growth is under way; what changes meanwhile is applied when it is
+    adopted. Before the first tree all routes are NO_TARGET, or SEARCHING while the target is unseen. The cost map
+    belongs to the caller, which applies marks to it between calls.
 
     watch           position of the target, kept by the caller. The planners of all classes share it
     stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
@@ -184,7 +185,8 @@ class Planner:
         now_ns: int,
         send: Callable[[Answer], None] = lambda answer: None,
     ) -> Answer:
-        """Answers from the tree as it is. Never waits for a growth that is under way.
+        """Answers from the tree, after changes of the map that lie on a route, and after a growth towards the cells
+        if the request forces it. Never waits for a full growth that is under way.
 
         send  called with the reply as soon as it is known: the asker does not wait for statistics
         """
@@ -488,8 +490,7 @@ class Planner:
         inside = self._grid.inside(request.row, request.col)
         return [*request.cells, self._grid.cell(request.row, request.col) if inside else -1]
 
-    # --- published without a query
-    # -----------------------------------------------------------------------------------
+    # --- published without a query ------------------------------------------------------------------------------
 
     def _pushes(self, now_ns: int) -> list[Action]:
         """Newer routes for followers which a change concerns and which have not had one for a while."""

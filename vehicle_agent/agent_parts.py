@@ -41,8 +41,9 @@ from vehicle_agent.traffic.next_cells import FAR_CELLS
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 
 _ACTS = 10
-"""Times in that of the fastest cell at which an agent acts on right of way, at its ticks or between them. Each lets
-those behind wait for a moment: 5 cost a twentieth of the flow (`bench crowd --worlds corridor --seeds 1:2`)."""
+"""Number of times that an agent acts on right of way while a vehicle crosses the fastest cell, at its ticks or
+between them. Those behind wait for a moment each time: 5 cost a twentieth of the flow (`bench crowd --worlds
+corridor --seeds 1:2`)."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least, so that they are there before a vehicle is."""
 

@@ -175,7 +175,7 @@ class MarkedCells:
 
 
 def _remember(known: dict[K, V], key: K, value: V, most: int | None = None) -> None:
-    """Keeps the newest value of a key, unless as many other keys are known: `_MOST_NAMES` if not given."""
+    """Keeps the newest value of a key. A new key is ignored once `most` are known (`_MOST_NAMES` if None)."""
     if key in known or len(known) < (most or _MOST_NAMES):
         known[key] = value
 
@@ -218,7 +218,8 @@ class LatestState(Counts):
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._alive: dict[tuple[str, str], set[int]] = {}
-        """(role, id) of every process that has ever been seen alive -> incarnations whose token is up."""
+        """(role, id) -> incarnations whose token is up; empty for a process that was alive, of those that published
+        counts or that the observer started."""
         self._started: dict[tuple[str, str], set[int]] = {}
         """(role, id) -> incarnations of the processes that the observer itself has started."""
         self._told_ns: dict[tuple[str, str], int] = {}
@@ -285,6 +286,7 @@ class LatestState(Counts):
             self._alive[key].discard(peer.incarnation)
             if not self._alive[key] and key not in self._newest and key not in self._started:
                 del self._alive[key]  # of a stranger, whose names must not fill the place of others
+                self._told_ns.pop(key, None)
 
     def touch(self, now_ns: int) -> None:
         """Something of the run came at a time, or its end."""
@@ -307,7 +309,7 @@ class LatestState(Counts):
         return any(self._alive.get((role, ranked_id(job, rank))) for rank in range(HIGHEST_RANK + 1))
 
     def was_up(self, role: str, id: str) -> bool:
-        """Returns True if the process has ever been seen alive."""
+        """Returns True if the process is or was alive; one that has ended is forgotten if it published nothing."""
         return (role, id) in self._alive
 
     def knows(self, role: str, id: str) -> bool:

@@ -107,17 +107,17 @@ def _states(axes: Axes, plot: Plot, report: Report) -> bool:
 
 def _courses(axes: Axes, plot: Plot, report: Report) -> bool:
     """Series over time, the area below the first filled."""
-    most = plot.least
+    most, drawn = plot.least, False
     for number, (name, (label, colour)) in enumerate(plot.lines.items()):
         times, values = series_of(report, name)
         if not len(values):
-            return False
-        shown = plot.of(values)
+            continue
+        shown, drawn = plot.of(values), True
         axes.plot(times, shown, "--" if number else "-", color=colour, linewidth=1.7, label=label)
         axes.fill_between(times, shown, color=colour, alpha=0.0 if number else 0.25, linewidth=0)
         most = max(most, 1.1 * float(shown.max()))
     axes.set_ylim(0, most)
-    return True
+    return drawn
 
 
 def _shares(axes: Axes, plot: Plot, report: Report) -> bool:

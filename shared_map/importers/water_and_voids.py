@@ -20,7 +20,8 @@ from shared_map.terrain.row_bands import bands
 from swarm.config.ground import TerrainConfig
 
 MOST_SAMPLED = 1 << 24
-"""Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""
+"""Largest number of a file's cells in which level ground and undeclared voids are looked for: of a larger file
+every second row and column is taken, or every third, and so on."""
 _SAME_M = 0.005
 """Levelled water differs by rounding, or by what a resampling before ours left."""
 _STILL_M = 0.02
@@ -71,7 +72,7 @@ class LevelGround:
 
 
 def level_ground(elevation_m: Floats) -> LevelGround:
-    """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
+    """Areas that are level, or level but for the noise of a laser, with a shore above them: still water, as a rule.
 
     A file may have been resampled finer than its survey. Its shores then have ripples and slopes that no survey
     has, so patches are looked for in the cells of the survey.
@@ -192,7 +193,8 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     of_cell, off_m = of_cells(lakes)
     taken = np.bincount(of_cell.reshape(-1), minlength=water.size)
     rough_m = np.zeros(water.size, np.float32)
-    np.maximum.at(rough_m, of_cell, off_m)
+    whole = np.s_[: rows * side, : cols * side]  # cells beyond whole blocks may be shore, or voids
+    np.maximum.at(rough_m, of_cell[whole], off_m[whole])
     # Exactly flat areas have been found, with their shore to the cell.
     water &= 2 * np.bincount(of_cell[mask], minlength=water.size) < taken
     rough_m[~water] = -1

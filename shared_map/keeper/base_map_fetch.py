@@ -150,9 +150,10 @@ def _inflated(data: bytes, size: int, what: str) -> bytes:
         unpacked = unpacker.decompress(data, size + 1)
     except zlib.error as error:
         raise ProtocolError(f"{what} does not unpack: {error}") from error
-    if len(unpacked) != size or not unpacker.eof:
-        found = f"{len(unpacked)}" if len(unpacked) < size else f"more than {size}"
-        raise ProtocolError(f"{what} has {found} bytes, expected {size}")
+    if len(unpacked) > size:
+        raise ProtocolError(f"{what} has more than {size} bytes, expected {size}")
+    if len(unpacked) < size or not unpacker.eof:
+        raise ProtocolError(f"{what} has {len(unpacked)} bytes or no end, expected {size}")
     return unpacked
 
 

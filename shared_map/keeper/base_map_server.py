@@ -21,7 +21,8 @@ from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
-_LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
+_LEVEL = 1
+"""Level of zlib. Level 6 makes pieces no smaller, two thirds of the raw bytes, and takes twice the time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +147,7 @@ class BaseMapServer:
         elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
             event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")
         elif any(region >= regions for region in request.regions):
-            event.refuse(f"a region of {max(request.regions)} is not in 0..{regions - 1}")
+            event.refuse(f"region {max(request.regions)} is not in 0..{regions - 1}")
         else:
             for layer in request.layers:
                 for region in request.regions:

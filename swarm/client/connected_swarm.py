@@ -170,7 +170,6 @@ class Swarm:
         self._stop = stop
         self._open_trusted = open_trusted or (lambda: session.bus)
         """Opens a bus whose messages right of way accepts."""
-        self._externals: list[ExternalSession] = []
 
     def __enter__(self) -> Swarm:
         return self
@@ -259,12 +258,10 @@ class Swarm:
 
         generations = GenerationFile(file or state_folder() / "vehicles" / self.run_id / id)
         try:
-            external = ExternalSession(id, self.frame.grid, self._open_trusted(), generations)
+            return ExternalSession(id, self.frame.grid, self._open_trusted(), generations)
         except BaseException:
             generations.close()
             raise
-        self._externals.append(external)
-        return external
 
     def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
         """A target of the scenario that this program tracks: its walk there is `external`.
@@ -285,7 +282,7 @@ class Swarm:
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
     def route(self, start_m: Point, goal_m: Point, *, vehicle_class: str = GROUND, timeout_s: float = 5.0) -> Route:
-        """The best route between two places, (x_m, y_m) each. Waits until it is known.
+        """The best route between two places, (x_m, y_m) each. Waits until it is known, `timeout_s` at most.
 
         Raises ConfigError on a place outside the terrain, BusError where no process plans to places.
         """
@@ -293,9 +290,10 @@ class Swarm:
         start, goal = self.frame.cell(*start_m), self.frame.cell(*goal_m)
         request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)
         while True:
-            waiting = self._session.ask(PLACE_ROUTE, request, timeout_s, asker=asker_of(OPERATOR, "client"))
+            left_s = max(until_s - time.monotonic(), 0.1)
+            waiting = self._session.ask(PLACE_ROUTE, request, left_s, asker=asker_of(OPERATOR, "client"))
             try:
-                reply: PlaceRouteReply = self._session.answers(waiting, timeout_s)[0]
+                reply: PlaceRouteReply = self._session.answers(waiting, left_s)[0]
                 if reply.status != "growing" or time.monotonic() >= until_s:
                     return Route.of(self.frame, reply.routes[0], reply)
             except (ValueError, IndexError) as error:
@@ -324,8 +322,6 @@ class Swarm:
         """Takes away all vehicles and targets of this program, and leaves. May be repeated; the end of the program
         does it, too."""
         atexit.unregister(self.close)
-        for external in self._externals:
-            external.close()
         self._stop()
         self._session.close()
 
@@ -347,7 +343,8 @@ def connect(
     certificate, key  of this program, whose name says what it may do: rover.GROUP.ID, tracker.TARGET, operator.NAME
     timeout_s         how long to wait for a router, and for a process that belongs to a run
 
-    Raises ConfigError on an invalid argument, BusError if no process replies.
+    Raises ConfigError on an invalid argument, BusError if no router or process replies, RunMismatchError if two
+    runs share the namespace or the run's wire version is no neighbour of ours.
     """
     from swarm.bus.zenoh_bus import open_bus
     from swarm.config.explain import explain

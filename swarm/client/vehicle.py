@@ -188,7 +188,8 @@ class Vehicle(Reported):
         """The cell of the place that is followed; None if a target is followed."""
         self._route: Route | None = None
         self._ask_due_ns = 0
-        self._asking = False
+        self._asking: str | None = None
+        """The target of the last question, until that is answered."""
         self._streams: list[Stream[Route]] = []
         self._on_route: list[Callable[[Route], None]] = []
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
@@ -320,7 +321,7 @@ class Vehicle(Reported):
         target, before = self._target, self._route
         assert target is not None
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS
-        if self._asking:
+        if self._asking == target:
             return
         near_end = before is not None and before.remaining_s > 0 and self.cell in before.cells[-_NEAR_END_CELLS:]
         ran_out = before is not None and (not before.ok or near_end)
@@ -335,11 +336,12 @@ class Vehicle(Reported):
         else:
             place = PlaceRouteRequest(to=self._goal, **from_here)
             asked = self._session.ask(PLACE_ROUTE, place, _TIMEOUT_S, asker=asker_of("rover", self.id))
-        self._asking = True
+        self._asking = target
 
         def finish(done: Future[list[Any]]) -> None:
             with self._session.lock:
-                self._asking = False
+                if self._asking == target:
+                    self._asking = None
                 if self._target != target:
                     return
                 if (error := done.exception()) is not None:
@@ -408,6 +410,8 @@ class Vehicle(Reported):
                 once = checked_cells(session.frame, cells)
             except ConfigError as error:
                 raise session.refused(str(error)) from None
+            if not once:
+                return 0
             now_ns = session.swarm_now_ns()
             until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             if not self._marks.any:

@@ -51,8 +51,8 @@ class Leadership:
       then the younger incarnation.
     - A candidate that receives no leader's heartbeat for one lease takes over, unless a better-ranked candidate is
       alive, which does so itself.
-    - A candidate that receives a worse-ranked leader takes over once it has been ready for `SETTLED_NS`, or for a
-      lease if that one is not ready.
+    - A candidate that is better than the leader takes over once it has been so for `SETTLED_NS`, or for a lease if
+      the leader is not ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
     - A heartbeat counts once: one that was copied, and is repeated with its code, holds no candidate back.
 
@@ -77,7 +77,7 @@ class Leadership:
         self._led_ns = 0
         """Time when a leader was last heard; at first, when this began to listen."""
         self._better_since_ns: int | None = None
-        """Time from which on this candidate has been ready while a worse one leads; None if it is not so."""
+        """Time since when this candidate has been better than the leader; None if it is not."""
         self._others: dict[tuple[int, int], _Other] = {}
         """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
         self._newest = Newest(silence_ns=_FOR_GOOD_NS)

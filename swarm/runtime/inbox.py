@@ -79,7 +79,12 @@ class FairQueue(Generic[T]):
         return any(order for each, order in self._order.items() if each < rank)
 
     def put(self, sender: str, item: T, *, price: int = 1, rank: int = 0) -> list[T]:
-        """Adds an item. Returns those which are dropped for it."""
+        """Adds an item. Returns those which are dropped for it.
+
+        price  what its sender pays for it, and its share of the limits
+        rank   class of priority, 0 first. A sender with items keeps its rank: one with items of several ranks needs
+               a name for each
+        """
         self._next += 1
         flow = self._flows.get(sender)
         if flow is None:
@@ -180,9 +185,10 @@ class Inbox:
 
     Samples    `CAPACITY` per topic, then the oldest goes. On topics whose samples each carry the whole state of
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
-    Questions  `QUESTION_BYTES` in all, and a quarter of that per asker, then the oldest is refused. One whose asker
-               has left is refused, too. One that is `Undecoded` is decoded in its turn. Askers take turns and pay
-               by bytes; on a costly topic agents come before others, and askers without a name share one turn.
+    Questions  `QUESTION_BYTES` in all: then the oldest of those that come last is refused. A quarter of that per
+               asker: then its oldest is. One whose asker has left is refused, too. One that is `Undecoded` is
+               decoded in its turn. Askers take turns and pay by bytes; on a costly topic agents come before
+               others, and askers without a name share one turn.
     Batches    (`HeardMany`) are bounded by blocking their poster.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
@@ -217,8 +223,8 @@ class Inbox:
         self.superseded = 0
         """Samples replaced unread by a newer one, since the start."""
         self.counts = {"events_dropped": 0, "asks_expired": 0}
-        """Since the start: samples and questions that found their queue full; questions whose asker left before
-        their turn came."""
+        """Since the start: samples and questions dropped to make room for newer ones; questions whose asker left
+        before their turn came."""
 
     def post(self, event: Event) -> None:
         """Adds an event, from any thread.
@@ -248,16 +254,12 @@ class Inbox:
         """Makes the owner raise: how another thread ends its process."""
         self._put(error, _KEPT)
 
-    def _put(
-        self, event: Event | BaseException, name: str, newest: Hashable | None = None
-    ) -> Event | BaseException | None:
-        """Adds an event to the queue `name`. If the queue is full, removes its oldest event and returns it;
-        otherwise returns None.
+    def _put(self, event: Event | BaseException, name: str, newest: Hashable | None = None) -> None:
+        """Adds an event to the queue `name`; if that is full, its oldest event is dropped.
 
-        newest  key under which only the newest event is kept: it replaces an unread one with the same key, which is
-                not returned. None: every event is kept
+        newest  key under which only the newest event is kept: it replaces an unread one with the same key. None:
+                every event is kept
         """
-        dropped = None
         with self._lock:
             queue = self._queues.get(name)
             if queue is None:
@@ -265,16 +267,15 @@ class Inbox:
             if newest is not None and newest in queue:
                 queue[newest] = (queue[newest][0], event)
                 self.superseded += 1
-                return None
+                return
             if name != _KEPT and len(queue) >= CAPACITY:
-                _, (_, dropped) = queue.popitem(last=False)
+                queue.popitem(last=False)
                 self.counts["events_dropped"] += 1
             else:
                 self._unread += 1
             self._next += 1
             queue[self._next if newest is None else newest] = (self._next, event)
             self._ring()
-        return dropped
 
     def _put_question(self, question: Question) -> list[Question]:
         """Adds a question. Returns the questions which were dropped to make room."""

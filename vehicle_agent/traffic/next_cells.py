@@ -20,10 +20,11 @@ from vehicle_agent.obstacles import Obstacles
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
+"""Cost of a cell from which no step leads onto the route, besides twice the distance, in cells."""
 _SHORTEST_CUT = 0.5
-"""With direction-dependent costs: advantage of any cell but the route's next over staying, in cells. Planners know
-better than hosts what steps cost, so it is less than for the next; but more than for the next with a vehicle on
-it."""
+"""With direction-dependent costs: least advantage of any cell but the route's next over staying, in cells. Planners
+know better than hosts what steps cost, so it is less than for the next; but more than for the next with a vehicle
+on it."""
 _DIAGONAL = math.sqrt(2.0) - 1.0
 _OCCUPIED = 0.9
 """Cost of pushing another vehicle, in cells: less than a step, so that a vehicle without another path pushes."""
@@ -46,7 +47,7 @@ class Steering:
 
     pace       float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve    cells ahead of itself that a vehicle keeps though others wait for them
-    obstacles  vehicles without right of way: their cells are passed like lethal ones, but by routes
+    obstacles  vehicles without right of way: no step leads onto their cells, but routes may lead over them
     climb      says which steps are too steep; None if none is
 
     waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on

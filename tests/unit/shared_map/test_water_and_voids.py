@@ -58,6 +58,18 @@ def test_a_lake_that_differs_by_millimetres_is_one_lake() -> None:
     assert largest >= 0.9 * np.bincount(labels.ravel())[1:].max()
 
 
+@pytest.mark.parametrize("rows", [160, 161, 163])
+@pytest.mark.parametrize("last_m", [np.nan, 93.0])
+def test_a_rough_lake_is_found_whatever_lies_beyond_its_last_block(rows: int, last_m: float) -> None:
+    down, right = np.mgrid[:rows, :160]
+    away = np.hypot(down - rows, right - 80) - 50
+    noise = np.random.default_rng(1).uniform(-0.08, 0.08, away.shape)
+    ground = 100 + 0.5 * away + 0.3 * np.sin(0.7 * down) * np.cos(0.9 * right)
+    heights = np.where(away < 0, 90 + noise, ground).astype(np.float32)
+    heights[-1] = last_m
+    assert np.array_equal(level_ground(heights).mask[:-1], away[:-1] < 0)
+
+
 def test_nothing_level_is_nothing() -> None:
     assert level_ground(hills(5, 300)).patches == ()
     assert level_ground(np.full((3, 3), np.nan, np.float32)).patches == ()
