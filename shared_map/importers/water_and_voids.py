@@ -319,6 +319,8 @@ def undeclared_voids(
 
 def without(heights: Floats, voids: Sequence[float]) -> Floats:
     """Heights as stored, with NaN for each value that stands for no height."""
+    if not voids:  # as in most files: no copy
+        return heights
     return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
 
 

@@ -77,9 +77,9 @@ class CellRequests:
 
     def forget(self, vehicle: str) -> None:
         """It is not driven any more."""
-        for known in (self.of, self._made_of, self._beside, self._since_ns, self._steering.waiting_ns):
+        for known in (self.of, self._made_of, self._beside, self._since_ns):
             known.pop(vehicle, None)
-        self._steering.shut_in.discard(vehicle)
+        self._steering.forget(vehicle)
 
     def ground_changed(self, windows: Iterable[Window]) -> None:
         """The ground has changed in these windows."""

@@ -185,17 +185,20 @@ class Steering:
         others."""
         return self._obstacles.any and (cell in self._shut or self._obstacles.danger(cell) > 0.0)
 
+    def forget(self, vehicle: str) -> None:
+        """It does not wait any more."""
+        self.waiting_ns.pop(vehicle, None)
+        self.shut_in.discard(vehicle)
+
     def blocked(self, vehicle: Vehicle, now_ns: int) -> bool:
         """Returns True if a vehicle that holds no cell but its own is at rest though its route goes on. Asks for
         another route after a while."""
         if vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
-            self.waiting_ns.pop(vehicle.id, None)
-            self.shut_in.discard(vehicle.id)
+            self.forget(vehicle.id)
             return False
         cell, since_ns = self.waiting_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
         if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:
-            del self.waiting_ns[vehicle.id]
-            self.shut_in.discard(vehicle.id)
+            self.forget(vehicle.id)
             if cell == vehicle.cell:
                 vehicle.blocked_for_long(now_ns)
                 if self._is_shut_in(cell):
