@@ -39,6 +39,7 @@ BENCHMARKS = {
     "gap": "bench.planning.strategies",
     "scale": "bench.planning.strategies",
     "certificates": "bench.planning.certificates",
+    "places": "bench.planning.places",
     "pulled": "bench.planning.pulled",
     "air": "bench.planning.air",
     "terrain": "bench.terrain",
