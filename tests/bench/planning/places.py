@@ -1,4 +1,4 @@
-"""Routes between any two places: trees that grow as far as somebody asks, beside whole growths of the same goals."""
+"""Routes between any two places: trees that grow as far as their askers, beside whole growths of the same goals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WITHIN = (20, 60, 200, 0)
 CHANGED = 50
 """Cells that change at random before a goal is asked for again: what a few vehicles mark within seconds."""
 ROUNDS = 4
-"""How often cells change, and each goal is asked for after that."""
+"""Rounds of changes, after each of which every goal is asked for again."""
 _MANY = 1 << 30
 
 
@@ -71,7 +71,9 @@ class _Asked:
         cells = self._field.draw(CHANGED, self._rng)
         rows, cols = np.divmod(cells, grid.cols)
         self._pace[rows, cols] *= self._rng.choice(np.float32((1.5, 1 / 1.5)), CHANGED)
-        windows = [Window(row, col, row + 1, col + 1) for row, col in zip(rows.tolist(), cols.tolist(), strict=True)]
+        windows = [
+            Window(row, col, row + 1, col + 1) for row, col in zip(rows.tolist(), cols.tolist(), strict=True)
+        ]
         self.trees.changed(self._costs.apply(self._pace, windows))
 
 
@@ -88,7 +90,7 @@ def places(
     ./launch_scripts/bench places
     ./launch_scripts/bench places --size 2048 --goals 300
 
-    CPU time of one thread. first: a goal that nobody asked for yet; whole: the growth of the whole map in its
+    CPU time of one thread. first: a goal without a tree; whole: the growth of the whole map in its
     place; again: the same route once more; no growth: share of asks that are answered without one after 50 cells
     anywhere have changed. Then every goal has one asker, within 200 cells or anywhere.
     """

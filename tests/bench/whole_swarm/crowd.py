@@ -38,15 +38,16 @@ COLUMNS = (
     "over_ideal",
     "over_ideal_without_following",
     "longest_wait_s",
-    "longest_wait_seed",
     "waited_long_share",
-    "confined_long_share",
     "arrivals_per_vehicle_and_100_s",
+    "cpu_ms_per_cell",
+    "deliveries_per_cell",
 )
 _NOTES = (
     "Cells a step: while the target is not within reach; 1 is a straight drive at full speed.",
     "Ideal: PIBT in lockstep with four neighbours, all known at once, no messages.",
     f"A wait: on one cell, target not within reach; long is over {LONG_S:g} s. Confined: within 5 x 5 cells.",
+    "Deliveries: messages to each process which takes them; CPU: of all processes, planners included.",
     f"Wanted: no wait over {WANTED_LONGEST_S:g} s, at most {100 * WANTED_LONG_SHARE:g} % of vehicles ever so long.",
 )
 LIMIT_S = 120.0
@@ -107,6 +108,7 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
     simulation, limit = Simulation(scenario, terrain=terrain), TimeLimit(LIMIT_S)
     drives = Drives(terrain.grid.cols)
     steps: dict[str, int] = {}
+    deliveries = 0
     ideal, alone = (
         drive_ideal(terrain.pace_s_per_m, vehicles, seed, int(seconds / STEP_S), follow) for follow in (True, False)
     )
@@ -120,10 +122,17 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
             steps[event.message.author] = step
             drives.hear(event.message)
 
+    def deliver(now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
+        nonlocal deliveries
+        deliveries += 1
+
     simulation.network.bus("crowd-0", scenario.network.namespace).subscribe(FLEET, hear)
+    simulation.network.trace = deliver
+    began_cpu_s = time.process_time()
     with collected_rarely():
         while simulation.now_s < seconds and not limit.is_up:
             simulation.run_until(min(simulation.now_s + 0.5, seconds))
+    cpu_s = time.process_time() - began_cpu_s
     report = simulation.report(simulation.now_s)
     waits_s = [STEP_S * ticks for ticks in drives.longest_wait.values()]
     confined_s = [STEP_S * ticks for ticks in drives.longest_confined.values()]
@@ -133,6 +142,9 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
         "simulated_s": simulation.now_s,
         "cut_short": simulation.now_s < seconds - 1e-6,
         "wall_s": time.perf_counter() - began_s,
+        "cpu_s": cpu_s,
+        "deliveries": deliveries,
+        "driven_cells": drives.driven_cells,
         "vehicles": len(waits_s),
         "cells_per_step": drives.driven_cells / max(drives.ticks_out_of_reach, 1),
         "ideal_cells_per_step": ideal["cells_per_step"],
@@ -210,6 +222,7 @@ def row_of(name: str, drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The summary of several drives."""
     vehicles = sum(each["vehicles"] for each in drives) or 1
     simulated_s = sum(each["vehicles"] * each["simulated_s"] for each in drives) or 1.0
+    cells = sum(each["driven_cells"] for each in drives) or 1.0
     worst = max(drives, key=lambda each: each["longest_wait_s"])
     flow, ideal, alone = (
         sum(each[key] for each in drives) / len(drives)
@@ -228,6 +241,8 @@ def row_of(name: str, drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "waited_long_share": sum(each["waited_long"] for each in drives) / vehicles,
         "confined_long_share": sum(each["confined_long"] for each in drives) / vehicles,
         "arrivals_per_vehicle_and_100_s": 100 * sum(each["arrivals"] for each in drives) / simulated_s,
+        "cpu_ms_per_cell": 1000 * sum(each["cpu_s"] for each in drives) / cells,
+        "deliveries_per_cell": sum(each["deliveries"] for each in drives) / cells,
         "collisions": sum(each["collisions"] or 0 for each in drives),
         "lethal_entries": sum(each["lethal_entries"] or 0 for each in drives),
     }

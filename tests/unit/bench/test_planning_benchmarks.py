@@ -47,6 +47,14 @@ def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
     np.testing.assert_array_equal(rivals.costs_along(pace, parents, 0), [[0, 1, 3, np.inf, np.inf]])
 
 
+def test_places_grow_as_far_as_their_askers() -> None:
+    report = bench("places", "--size", "256", "--goals", "20")
+    near, *_, anywhere = report["rows"]
+    assert near["no_growth"] > anywhere["no_growth"]
+    assert [each["trees_kept"] for each in report["many"]] == [181, 201]
+    assert all(each["routes_per_s"] > 0 for each in report["many"])
+
+
 # --- fields ------------------------------------------------------------------------------------------------------
 
 

@@ -132,6 +132,8 @@ def test_a_small_crowd_is_driven() -> None:
     assert 0.1 < shown["cells_per_step"] <= 1.5
     assert drive["longest_wait_s"] < 8.0
     assert drive["arrivals"] > 0
+    assert shown["deliveries_per_cell"] > 1
+    assert 0 < shown["cpu_ms_per_cell"] < 1000 * drive["wall_s"] / drive["driven_cells"] * 1.1
     assert (drive["collisions"], drive["lethal_entries"]) == (0, 0)
 
 
