@@ -103,7 +103,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
     if scenario.terrain.roads:
         open_ground = ground if cost is common else _ground(source, classes, common, progress)
         _check_passable(open_ground, source.elevation_m, classes, common, grid)
-        from shared_map.terrain.synthetic.rivers_and_roads import lay_roads
+        from shared_map.terrain.synthetic import lay_roads
 
         laid = lay_roads(open_ground, scenario.terrain.roads, grid, scenario.seed)
         classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
@@ -122,7 +122,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
     notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
-        from shared_map.terrain.synthetic.landscape import paint_photo
+        from shared_map.terrain.synthetic import paint_photo
 
         photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed, progress)
         notes.append("photo painted from elevation and classes, as there is none")

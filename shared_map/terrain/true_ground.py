@@ -12,7 +12,7 @@ import numpy as np
 
 from shared_map.array_files import Bools, Bytes, CellsOf, Floats
 from shared_map.terrain.pace_layers import LETHAL, TerrainClass, largest_part
-from shared_map.terrain.synthetic.noise import fractal_noise
+from shared_map.terrain.synthetic import fractal_noise
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, HiddenConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
