@@ -14,7 +14,8 @@ from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map_fetch import NEEDED, Fetching, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
-from shared_map.terrain.terrain import build_truth, terrain_digest
+from shared_map.terrain.terrain import terrain_digest
+from shared_map.terrain.true_ground import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
