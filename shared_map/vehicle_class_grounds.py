@@ -22,15 +22,8 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
 from shared_map.cost_map import CostMap
+from shared_map.terrain import store
 from shared_map.terrain.air import air_terrain
-from shared_map.terrain.store import (
-    homes_of,
-    read_array,
-    read_ground,
-    read_meta,
-    save_ground,
-    scenario_key,
-)
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, ClassConfig, class_named, driven_classes, flies, of_class
@@ -52,9 +45,9 @@ class ClassGround:
     homes: Bools
 
 
-_MADE: WeakKeyDictionary[Terrain, dict[bytes, Terrain]] = WeakKeyDictionary()
+_MADE: WeakKeyDictionary[Terrain, dict[str, Terrain]] = WeakKeyDictionary()
 """Grounds made beside a terrain, so that the processes of a simulation make them once."""
-_KNOWN: WeakKeyDictionary[Terrain, dict[bytes, ClassGround]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Terrain, dict[str, ClassGround]] = WeakKeyDictionary()
 """Grounds prepared beside a terrain, with its ground truth."""
 
 
@@ -81,7 +74,7 @@ def class_grounds(
 
     common, truth, homes  those of "ground"; `homes_of` the other two, if that is known
     """
-    known = homes_of(common.pace_s_per_m, truth) if homes is None else homes
+    known = store.homes_of(common.pace_s_per_m, truth) if homes is None else homes
     grounds = {GROUND: ClassGround(common, truth, known)}
     for name in driven_classes(scenario):
         prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
@@ -98,7 +91,7 @@ def least_pace(own: ClassConfig | None) -> float:
 
 def _ground(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> ClassGround:
     own, own_truth = _terrain(scenario, common, name), _truth(scenario, common, truth, name)
-    homes = homes_of(own.pace_s_per_m, own_truth)
+    homes = store.homes_of(own.pace_s_per_m, own_truth)
     if not homes.any():
         raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
     return ClassGround(own, own_truth, homes)
@@ -141,9 +134,11 @@ def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
     return made[key]
 
 
-def _key(scenario: Scenario, name: str) -> bytes:
-    parts = [scenario.seed, scenario.terrain, scenario.cost, scenario.wind, class_named(scenario, name)]
-    return msgspec.json.encode(parts)
+def _key(scenario: Scenario, name: str) -> str:
+    """Digest of all that the ground of a class is made from."""
+    keys = [store.scenario_key(scenario), store.scenario_key(of_class(scenario, name))]
+    payload = msgspec.json.encode([*keys, class_named(scenario, name), scenario.wind], order="sorted")
+    return hashlib.blake2b(payload, digest_size=8).hexdigest()
 
 
 # --- prepared once in a run's folder for all processes of a machine -------------------------------------------
@@ -158,7 +153,10 @@ def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: F
     terrain."""
     for name in driven_classes(scenario):
         ground = _ground(scenario, common, truth, name)
-        _save(_folder(run_dir, name), _prepared_key(scenario, name), ground)
+        arrays: dict[str, NDArray[Any]] = {"truth": ground.truth, "homes": ground.homes}
+        if ground.terrain.flight_m is not None:
+            arrays["flight"] = ground.terrain.flight_m
+        store.save_ground(_folder(run_dir, name) / _META, ground.terrain, arrays, _key(scenario, name))
     _open(run_dir, scenario, common)
 
 
@@ -170,9 +168,9 @@ def load_classes(setup: RoleSetup, common: Terrain) -> None:
 
 def _open(run_dir: Path, scenario: Scenario, common: Terrain) -> None:
     for name in driven_classes(scenario):
-        ground = _load(_folder(run_dir, name), _prepared_key(scenario, name), scenario, common, name)
+        key = _key(scenario, name)
+        ground = _load(_folder(run_dir, name), key, scenario, common, name)
         if ground is not None:
-            key = _key(scenario, name)
             _KNOWN.setdefault(common, {})[key] = ground
             _MADE.setdefault(common, {})[key] = ground.terrain
 
@@ -181,39 +179,22 @@ def _folder(run_dir: Path, name: str) -> Path:
     return run_dir / "classes" / name
 
 
-def _prepared_key(scenario: Scenario, name: str) -> str:
-    parts = [
-        scenario_key(scenario),
-        scenario_key(of_class(scenario, name)),
-        class_named(scenario, name),
-        scenario.wind,
-    ]
-    return hashlib.blake2b(msgspec.json.encode(parts, order="sorted"), digest_size=8).hexdigest()
-
-
-def _save(folder: Path, key: str, ground: ClassGround) -> None:
-    arrays: dict[str, NDArray[Any]] = {"truth": ground.truth, "homes": ground.homes}
-    if ground.terrain.flight_m is not None:
-        arrays["flight"] = ground.terrain.flight_m
-    save_ground(folder / _META, ground.terrain, arrays, key)
-
-
 def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str) -> ClassGround | None:
     """None if there is none, or one of another key. Raises TerrainError if it is damaged."""
-    meta = read_meta(folder / _META, key)
+    meta = store.read_meta(folder / _META, key)
     if meta is None:
         return None
     shape = common.grid.shape
-    flight_m = read_array(folder, "flight", shape, np.float32) if flies(scenario, name) else None
+    flight_m = store.read_array(folder, "flight", shape, np.float32) if flies(scenario, name) else None
     terrain = replace(
         common,
-        **read_ground(folder / _META, meta, common.elevation_m if flight_m is None else flight_m),
+        **store.read_ground(folder / _META, meta, common.elevation_m if flight_m is None else flight_m),
         flight_m=flight_m,
         zones=common.zones if flight_m is None else (),
         least_s_per_m=least_pace(class_named(scenario, name)),
     )
-    truth = read_array(folder, "truth", shape, np.float32)
-    return ClassGround(terrain, truth, read_array(folder, "homes", shape, np.bool_))
+    truth = store.read_array(folder, "truth", shape, np.float32)
+    return ClassGround(terrain, truth, store.read_array(folder, "homes", shape, np.bool_))
 
 
 # --- marks as each class reads them ---------------------------------------------------------------------------

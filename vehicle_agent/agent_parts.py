@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.interest import Interest, MarkFilter, author_of
+from shared_map.replication.interest import Interest, MarkFilter
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.store import load_homes
@@ -78,7 +78,7 @@ class AgentParts:
         scenario, grid = setup.scenario, terrain.grid
         plan = _plan_of(setup) if setup.added is None else setup.added.plan
         group, class_name = plan.group.name, plan.group.vehicle_class
-        self.author, self.faults = author_of(group, setup.author), list[str]()
+        self.author, self.faults = f"{group}.{setup.author}", list[str]()
         grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
         own, as_class = grounds[class_name], of_class(scenario, class_name)
         self.flies = flies(scenario, class_name)

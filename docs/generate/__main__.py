@@ -24,8 +24,8 @@ from launch_scripts import cli
 from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.gateways.ros2.topic_table import INCOMING, TABLE
 from launch_scripts.typer_commands import Family
-from shared_map.importers.cover.cover_codes import TABLES
-from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
+from shared_map.importers.cover.land_cover import TABLES
+from shared_map.importers.zones.zone_features import BUILT_IN, COLUMNS
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"

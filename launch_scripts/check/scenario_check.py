@@ -22,7 +22,8 @@ from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pace_layers import inflate, inflation_halves
 from shared_map.terrain.row_bands import counted
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agent_plan import plan_agents

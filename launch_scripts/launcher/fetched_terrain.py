@@ -11,10 +11,11 @@ from pathlib import Path
 from launch_scripts.check.scenario_check import files_of
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.process_table import TABLE
-from shared_map.keeper.base_map_fetch import NEEDED, Fetching, fetch_base_map
+from shared_map.keeper.base_map import NEEDED, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
-from shared_map.terrain.terrain import build_truth, terrain_digest
+from shared_map.terrain.terrain import terrain_digest
+from shared_map.terrain.true_ground import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
@@ -89,8 +90,7 @@ def fetch_if_missing(
         layers = (*NEEDED, "photo") if looks else NEEDED
         with open_bus(scenario.network, authenticator=authenticator_of(scenario.network, found[0].run_id)) as bus:
             within_s = 2 * scenario.network.connect_timeout_s  # so slow a link is one that a start may wait for
-            wanted = Fetching(found[0].terrain, scenario.cost, layers, within_s)
-            terrain = fetch_base_map(bus, wanted, why, progress)
+            terrain = fetch_base_map(bus, found[0].terrain, scenario.cost, why, layers, within_s, progress)
         save_prepared(run_dir, terrain, build_truth(scenario, terrain), key)
         log.info("%s; terrain %s is as in the run", terrain.notes[-1], terrain.digest)
 

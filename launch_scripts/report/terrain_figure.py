@@ -18,7 +18,7 @@ from launch_scripts.observe.palette import BLUE, RED, hillshade
 from launch_scripts.report.plots_and_cards import saved
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.pyramid import Level, level_of
-from shared_map.terrain.synthetic.landscape import TINT
+from shared_map.terrain.synthetic import TINT
 from shared_map.terrain.terrain import Terrain
 
 MOST_CELLS = 1 << 21

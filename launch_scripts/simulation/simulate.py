@@ -19,7 +19,8 @@ from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, ProcessSpec, processes_of
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.simulated_process import EPOCH_NS, Node
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.true_ground import build_truth
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock

@@ -10,8 +10,8 @@ is known by how it begins. Guarantees of each reader:
 5. Changes to the data are listed in `Source.notes`.
 
 `raster_files` opens and guards all rasters; those which GDAL does not read, or not as they are, become datasets
-in memory: `xyz_grids` and the archives of `array_grids`, which has maps without heights, too. `height_rasters`
-tells what a raster holds; `georeference` says where it lies, and `onto_grid` brings it onto the grid.
+in memory: those of `plain_grids`, which has maps without heights, too. `height_rasters` tells what a raster holds;
+`georeference` says where it lies, and brings it onto the grid.
 `water_and_voids` finds water and voids in a file's own cells, before anything is resampled. Land cover and photos
 are in `cover`, vector zones in `zones`; codes, colours and classes of ways are data beside their readers.
 """

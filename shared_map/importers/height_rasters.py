@@ -19,9 +19,8 @@ from rasterio.transform import Affine, from_origin
 
 from shared_map.array_files import Floats
 from shared_map.importers.cover import land_cover
-from shared_map.importers.cover.cover_codes import TABLES, some
-from shared_map.importers.georeference import METRES, check_metres, crs_of, overruled, plan_grid
-from shared_map.importers.onto_grid import Placed
+from shared_map.importers.cover.land_cover import TABLES, some
+from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, plan_grid
 from shared_map.importers.raster_files import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.importers.water_and_voids import MOST_SAMPLED, looked_at, without

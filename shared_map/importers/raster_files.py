@@ -178,10 +178,10 @@ def _check_numbers(dataset: Any, what: str) -> None:
 
 def _plain(path: Path, what: str) -> Numbers:
     if path.suffix.lower() == ".npz":
-        from shared_map.importers.array_grids import read_npz
+        from shared_map.importers.plain_grids import read_npz
 
         return read_npz(path, what)
-    from shared_map.importers.xyz_grids import read_text_grid
+    from shared_map.importers.plain_grids import read_text_grid
 
     return read_text_grid(path, what)
 

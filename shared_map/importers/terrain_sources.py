@@ -102,7 +102,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
 
 
 def _synthetic(config: TerrainConfig, seed: int) -> Source:
-    from shared_map.terrain.synthetic.landscape import landscape
+    from shared_map.terrain.synthetic import landscape
 
     resolution_m = config.resolution_m or SYNTHETIC_RESOLUTION_M
     elevation_m, classes = landscape(config.rows, config.cols, resolution_m, config.relief_m, seed, config.rivers)
@@ -113,7 +113,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
     from shared_map.importers.height_rasters import read_raster
-    from shared_map.terrain.synthetic.landscape import cover
+    from shared_map.terrain.synthetic import cover
 
     resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
     config = msgspec.structs.replace(config, resolution_m=resolution_m, crs=None)
@@ -153,7 +153,7 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from rasterio.transform import from_origin
 
-    from shared_map.importers.array_grids import read_map, read_ros
+    from shared_map.importers.plain_grids import read_map, read_ros
 
     found = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
     side_m = config.resolution_m or 1.0

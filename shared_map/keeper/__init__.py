@@ -8,7 +8,7 @@ those that are gone. One runs in a swarm, or several, which hold the same.
   author turns out to live.
 - Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in
   books that all keepers merge (`order_service`). An answer promises that the order is on the disk.
-- A machine without the files of a terrain gets them from a keeper (`base_map_server`, `base_map_fetch`).
+- A machine without the files of a terrain gets them from a keeper (`base_map`).
 
 `service` is the shell that joins these, `main` the process.
 """

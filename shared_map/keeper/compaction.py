@@ -143,16 +143,12 @@ def _whole(held: MarkSet | None, dropped: MarkSet | None) -> MarkSet | None:
 def united(one: MarkSet, other: MarkSet) -> MarkSet:
     """The union of two sets that were compacted from the same one, under the higher number."""
     higher = max(one, other, key=lambda each: (each.epoch, each.seq))
-    a, b = statements(one), statements(other)
-    cells, first = np.unique(np.concatenate([a.cells, b.cells]), return_index=True)
-    untils = [np.full(len(each.cells), FOREVER) if each.untils_ns is None else each.untils_ns for each in (a, b)]
-    stated = Statements(
-        cells,
-        np.concatenate([a.kinds, b.kinds])[first],
-        np.concatenate([a.paces, b.paces])[first],
-        np.concatenate([a.stamps_ns, b.stamps_ns])[first],
-        np.concatenate(untils)[first],
-    )
+    both = []
+    for stated in (statements(one), statements(other)):
+        lasting = np.full(len(stated.cells), FOREVER)
+        both.append(stated if stated.untils_ns is not None else stated._replace(untils_ns=lasting))
+    together = Statements._make(np.concatenate(columns) for columns in zip(*both, strict=True))
+    stated = taken(together, np.unique(together.cells, return_index=True)[1])
     return mark_set(higher.author, higher.group, higher.tile, higher.epoch, higher.seq, stated)
 
 

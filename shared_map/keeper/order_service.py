@@ -22,7 +22,9 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
 from swarm.places import cell_of
-from swarm.runtime.order_book import MOST_SENT, FreshOrders, GoalBook, OrderBook, fault_of_vehicle, judged
+from swarm.runtime import order_book
+from swarm.runtime.membership import Member
+from swarm.runtime.order_book import FreshOrders, GoalBook, OrderBook
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import (
     GiveOrder,
@@ -50,9 +52,17 @@ class KeptOrders:
     """
 
     def __init__(
-        self, id: str, scenario: Scenario, terrain: Terrain, store: KeeperStore, bus: Bus, post: Post
+        self,
+        member: Member,
+        id: str,
+        scenario: Scenario,
+        terrain: Terrain,
+        store: KeeperStore,
+        bus: Bus,
+        post: Post,
     ) -> None:
         self.book, self.goals = OrderBook(), GoalBook()
+        self._member = member
         self._id = id
         self._scenario = scenario
         self._terrain = terrain
@@ -87,9 +97,8 @@ class KeptOrders:
         for topic in (ORDERS, GOALS):  # a store may be new while the swarm is old
             self._bus.ask(topic, Nothing(), self._post, tag=_TAG)
 
-    def take_order_event(self, event: Event, now_ns: int) -> Order | VehicleGoals | str | bool:
-        """Returns True if the event was about orders and needs no other handler; for a given order also the order,
-        or the reason for refusing it."""
+    def take_order_event(self, event: Event, now_ns: int) -> bool:
+        """Returns True if the event was about orders and needs no other handler."""
         match event:
             case Appeared(peer=Peer(role="agent", id=id)):
                 if len(self._added) < _MOST_ADDED and id not in self._planned:
@@ -114,8 +123,8 @@ class KeptOrders:
                 return False
         return True
 
-    def _answered(self, asked: Asked, now_ns: int) -> Order | VehicleGoals | str | bool:
-        """Answers a query about orders, as `take_order_event` returns it."""
+    def _answered(self, asked: Asked, now_ns: int) -> bool:
+        """Answers a query about orders; false if it is about something else."""
         given: Order | VehicleGoals | str | None = None
         match asked.request:
             case _ if asked.topic is ORDERS:
@@ -139,9 +148,18 @@ class KeptOrders:
             case _:
                 return False
         if isinstance(given, str):
-            asked.refuse(given)
+            self.refuse(asked, given)
+            return True
         asked.end()
-        return given or True
+        if given is not None:
+            self._member.note(now_ns, "order", order_book.described(given))
+        return True
+
+    def refuse(self, asked: Asked, why: str) -> None:
+        """Answers an order with the reason why it is not taken."""
+        self._member.counters.count("orders_refused")
+        asked.refuse(why)
+        asked.end()
 
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
@@ -175,7 +193,7 @@ class KeptOrders:
             given = self._placed(given)
         except ConfigError as error:
             return f"{given.subject} {given.name}: {error}"
-        order = judged(given, self.book, self._scenario, self._vehicles_with(given.name), now_ns)
+        order = order_book.judged(given, self.book, self._scenario, self._vehicles_with(given.name), now_ns)
         if isinstance(order, str):
             return order
         if order.cell is not None:
@@ -221,10 +239,10 @@ class KeptOrders:
 
     def _send(self, given: SendVehicle, now_ns: int) -> VehicleGoals | str:
         vehicle, grid = given.vehicle, self._terrain.grid
-        if (fault := fault_of_vehicle(vehicle, self._vehicles_with(vehicle))) is not None:
+        if (fault := order_book.fault_of_vehicle(vehicle, self._vehicles_with(vehicle))) is not None:
             return fault
-        if len(self.goals) >= MOST_SENT and self.goals.get(vehicle) is None:
-            return f"vehicle {vehicle}: {MOST_SENT} vehicles have been sent already, which is the limit"
+        if len(self.goals) >= order_book.MOST_SENT and self.goals.get(vehicle) is None:
+            return f"vehicle {vehicle}: {order_book.MOST_SENT} vehicles have been sent already, which is the limit"
         try:
             cells = [cell_of(place, MapFrame(grid), "place") for place in given.places]
             if (fault := self._fault_of(given, cells)) is not None:

@@ -9,7 +9,7 @@ from itertools import islice
 
 import msgspec
 
-from shared_map.keeper.base_map_server import BaseMapServer
+from shared_map.keeper.base_map import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
@@ -26,11 +26,10 @@ from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import StoreError
 from swarm.liveness import Roster
 from swarm.runtime.membership import Member
-from swarm.runtime.order_book import described
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import figures
 from swarm.wire.messages.map_data import MarkSet
-from swarm.wire.messages.orders import Order, VehicleGoals, ZoneOrder, Zones
+from swarm.wire.messages.orders import ZoneOrder, Zones
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import SIGHTED, STATS, ZONES
@@ -89,7 +88,7 @@ class KeeperService:
         self._numbers = class_numbers(setup.scenario)
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
-        self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
+        self._orders = KeptOrders(self._member, setup.id, setup.scenario, terrain, store, bus, post)
         self._stats: dict[tuple[str, str], Stats] = {}
         """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
         self._stats_size = 0
@@ -161,21 +160,10 @@ class KeeperService:
             case Disappeared(peer):
                 self._roster.gone(peer)
         if isinstance(event, Asked) and (fault := self._orders.stale(event, now_ns)) is not None:
-            self.counters.count("orders_refused")
-            event.refuse(fault)
-            event.end()
-            return
-        if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
+            self._orders.refuse(event, fault)
+        elif isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
-            return
-        ordered = self._orders.take_order_event(event, now_ns)
-        if ordered is not False:
-            if isinstance(ordered, Order | VehicleGoals):
-                self._member.note(now_ns, "order", described(ordered))
-            elif isinstance(ordered, str):
-                self.counters.count("orders_refused")
-            return
-        if not self._member.on_member_event(event):
+        elif not (self._orders.take_order_event(event, now_ns) or self._member.on_member_event(event)):
             self._sync.on_map_event(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
@@ -271,9 +259,7 @@ class KeeperService:
             except StoreError as error:
                 found = str(error)
             if isinstance(found, str):
-                self.counters.count("orders_refused")
-                asked.refuse(found)
-                asked.end()
+                self._orders.refuse(asked, found)
                 return
             self.replica.merge(sets)
             self._keeper.saved(sets)

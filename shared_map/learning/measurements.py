@@ -45,13 +45,8 @@ class Measurement(NamedTuple):
     variance: int
 
 
-class Columns(NamedTuple):
-    """Columns of a set of marks, as in `MarkSet`."""
-
-    cells: NDArray[np.uint16]
-    kinds: NDArray[np.uint8]
-    paces: NDArray[np.float32]
-    stamps_ns: NDArray[np.int64]
+Columns = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]
+"""Cells, kinds, paces and stamps of a set of marks, as in `MarkSet`."""
 
 
 def columns_of(measured: Mapping[int, Measurement], stamp_ns: int) -> Columns:
@@ -60,7 +55,7 @@ def columns_of(measured: Mapping[int, Measurement], stamp_ns: int) -> Columns:
     of = [measured[key] for key in keys]
     numbers = [n for each in of for n in (each.cells, each.mean + _SIGN, each.variance)]
     cells = [3 * key + part for key in keys for part in range(3)]
-    return Columns(
+    return (
         np.array(cells, np.uint16),
         np.full(len(cells), MarkKind.PACE, np.uint8),
         (1 + np.array(numbers, np.float64) / ONE).astype(np.float32),

@@ -21,14 +21,6 @@ from swarm.config.setting_types import RESERVED_GROUP
 from swarm.grid import REGION_CELLS, GridSpec
 
 
-def author_of(group: str, name: str) -> str:
-    """The author id of a process of a group.
-
-    name  of the process and its incarnation
-    """
-    return f"{group}.{name}"
-
-
 def readable_for_target(
     scenario: Scenario, target: str, chased_by: Callable[[str], Collection[str]] | None = None
 ) -> frozenset[str] | None:

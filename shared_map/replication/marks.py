@@ -51,6 +51,10 @@ class Statements(NamedTuple):
     untils_ns: NDArray[np.int64] | None = None
 
 
+_COLUMNS = {"cells": "<u2", "kinds": "<u1", "paces": "<f4", "stamps_ns": "<i8"}
+"""Columns that each set has -> their type in it; `untils_ns` is empty where nothing expires."""
+
+
 def statements(mark_set: MarkSet) -> Statements:
     """The columns of a set, as read-only views of its bytes where possible."""
     kinds = column(mark_set.kinds, "<u1")
@@ -80,26 +84,12 @@ def next_expiry_ns(mark_set: MarkSet, after_ns: int) -> int | None:
 
 def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, stated: Statements) -> MarkSet:
     """A set of these statements. Raises ValueError if they break a rule of the wire."""
-    made = MarkSet(
-        author=author,
-        group=group,
-        tile=tile,
-        epoch=epoch,
-        seq=seq,
-        cells=pack_column(stated.cells, "<u2"),
-        kinds=pack_column(stated.kinds, "<u1"),
-        paces=pack_column(stated.paces, "<f4"),
-        stamps_ns=pack_column(stated.stamps_ns, "<i8"),
-        untils_ns=_packed_untils(stated.untils_ns),
-    )
+    columns = {name: pack_column(getattr(stated, name), dtype) for name, dtype in _COLUMNS.items()}
+    if stated.untils_ns is not None and (stated.untils_ns != FOREVER).any():
+        columns["untils_ns"] = pack_column(stated.untils_ns, "<i8")
+    made = MarkSet(author=author, group=group, tile=tile, epoch=epoch, seq=seq, **columns)
     made.check()
     return made
-
-
-def _packed_untils(untils_ns: NDArray[np.int64] | None) -> bytes:
-    if untils_ns is None or (untils_ns == FOREVER).all():
-        return b""
-    return pack_column(untils_ns, "<i8")
 
 
 def base_seq(seq: int) -> int:
@@ -165,21 +155,17 @@ def fault(of: MarkSet, grid: GridSpec) -> str | None:
 
 
 def dense(stated: Statements) -> Statements:
-    """Spread over the 1024 cells of a tile, `untils_ns` included, to be changed in place: CLEAR, NO_STATEMENT and
-    FOREVER where nothing is stated."""
-    untils_ns = np.full(TILE_AREA, FOREVER, np.int64)
+    """Spread over the 1024 cells of a tile, to be changed in place: CLEAR and NO_STATEMENT where nothing is stated.
+    None of them expires."""
     spread = Statements(
         np.arange(TILE_AREA, dtype=np.uint16),
         np.full(TILE_AREA, MarkKind.CLEAR, np.uint8),
         np.zeros(TILE_AREA, np.float32),
         np.full(TILE_AREA, NO_STATEMENT, np.int64),
-        untils_ns,
     )
     cells = stated.cells
     spread.kinds[cells], spread.paces[cells] = stated.kinds, stated.paces
     spread.stamps_ns[cells] = stated.stamps_ns
-    if stated.untils_ns is not None:
-        untils_ns[cells] = stated.untils_ns
     return spread
 
 
@@ -190,13 +176,7 @@ def sparse(spread: Statements) -> Statements:
 
 def taken(stated: Statements, where: NDArray[np.intp]) -> Statements:
     """The statements at these places (int (n,)) of the columns."""
-    return Statements(
-        stated.cells[where],
-        stated.kinds[where],
-        stated.paces[where],
-        stated.stamps_ns[where],
-        None if stated.untils_ns is None else stated.untils_ns[where],
-    )
+    return Statements._make(None if each is None else each[where] for each in stated)
 
 
 NO_STATEMENTS = Statements(
@@ -265,11 +245,7 @@ def _message(author: str, group: str, sets: list[MarkSet]) -> MarkSets:
         seqs=pack_column([each.seq for each in sets], "<u8"),
         counts=pack_column([len(each.kinds) for each in sets], "<u2"),
         ending=bytes([bool(each.untils_ns) for each in sets]),
-        cells=b"".join([each.cells for each in sets]),
-        kinds=b"".join([each.kinds for each in sets]),
-        paces=b"".join([each.paces for each in sets]),
-        stamps_ns=b"".join([each.stamps_ns for each in sets]),
-        untils_ns=b"".join([each.untils_ns for each in sets]),
+        **{name: b"".join([getattr(each, name) for each in sets]) for name in (*_COLUMNS, "untils_ns")},
     )
 
 

@@ -98,16 +98,8 @@ def _new_winners_of_few(grid: GridSpec, changes: Sequence[TileChange], before_ns
             corner = tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS
             for cell, kind, pace, stamp_ns in sorted(here):
                 changed.append((corner + cell // TILE_CELLS * grid.cols + cell % TILE_CELLS, kind, pace, stamp_ns))
-    if not changed:
-        return NewWinners(*_NO_COLUMNS, counts)
-    cells, kinds, paces, stamps_ns = zip(*changed, strict=True)
-    return NewWinners(
-        np.array(cells, np.uint32),
-        np.array(kinds, np.uint8),
-        np.array(paces, np.float32),
-        np.array(stamps_ns, np.int64),
-        counts,
-    )
+    columns: Iterable[Sequence[float]] = zip(*changed, strict=True) if changed else ((),) * len(_TYPES)
+    return NewWinners._make([*map(np.array, columns, _TYPES), counts])
 
 
 def _winners_of_few(sets: Sequence[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
@@ -229,9 +221,5 @@ _FEW = 128
 """Up to this number of marks, before and after together, lists are faster than arrays
 (docs/design/map-merge-law.md)."""
 _NOTHING = (_CLEAR, 0.0, NO_STATEMENT)
-_NO_COLUMNS = (
-    np.empty(0, np.uint32),
-    np.empty(0, np.uint8),
-    np.empty(0, np.float32),
-    np.empty(0, np.int64),
-)
+_TYPES = (np.uint32, np.uint8, np.float32, np.int64)
+"""Types of the columns of `NewWinners`."""

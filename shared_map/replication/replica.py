@@ -11,26 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared_map.learning.measurements import Measurement, columns_of
+from shared_map.replication import marks
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held
 from shared_map.replication.held_sets import HeldSets
 from shared_map.replication.interest import MarkFilter
-from shared_map.replication.marks import (
-    NO_STATEMENT,
-    NO_STATEMENTS,
-    HybridClock,
-    Statements,
-    dense,
-    is_ahead,
-    is_tombstone,
-    is_zone,
-    mark_set,
-    next_expiry_ns,
-    next_seq,
-    sparse,
-    standing,
-    statements,
-)
 from shared_map.replication.merge import TileChange, new_winners, winners
 from shared_map.replication.tiles import beyond_tile, tile_cells
 from swarm.clock import NS_PER_S
@@ -108,7 +93,7 @@ class MapReplica:
             None  # when to look again at words that came too soon; None: there are none
         )
         self._learned_ns = -_LEARN_EVERY_NS  # when words last changed the cost map
-        self._clock = HybridClock()
+        self._clock = marks.HybridClock()
         self._publish_ns = int(NS_PER_S / publish_hz)
         self._pending: dict[int, None] = {}  # own tiles whose newest set has not been published, in order
         self._published_ns: dict[int, int] = {}  # own tile -> when its set was published last
@@ -137,7 +122,7 @@ class MapReplica:
                 self._reassert(each)
                 continue
             sets = before[tile] if tile in before else self.held.of_tile(tile)
-            if not each.kinds and is_tombstone(each):
+            if not each.kinds and marks.is_tombstone(each):
                 self.held.delete(each, self._now_ns)
             elif not self.held.put(each):
                 self.counts["sets_without_room"] += 1
@@ -151,7 +136,7 @@ class MapReplica:
         if not taken:
             return Merged([], [])
         self.counts["sets_merged"] += len(taken)
-        self.zones_version += any([is_zone(each.author) for each in taken])  # noqa: C419 - twice as fast
+        self.zones_version += any([marks.is_zone(each.author) for each in taken])  # noqa: C419 - twice as fast
         counts = self._settle(before, self._now_ns, measured)
         if len(before) == len(taken):
             return Merged(taken, counts)
@@ -160,7 +145,7 @@ class MapReplica:
 
     def _admits(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Returns True if a set is part of this map, wanted and new; counts the reason if not."""
-        if self.held.off_grid(received) or is_ahead(received, self._now_ns):
+        if self.held.off_grid(received) or marks.is_ahead(received, self._now_ns):
             self.counts["sets_refused"] += 1
             return False
         if received.author != self.author:
@@ -200,7 +185,7 @@ class MapReplica:
                 self._cost_map.apply(won.cells, won.kinds, won.paces, class_number)
             if measured:
                 newest_ns = int(won.stamps_ns.max())
-                if newest_ns != NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
+                if newest_ns != marks.NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
                     self._newest_ns = newest_ns
         return won.counts
 
@@ -271,7 +256,7 @@ class MapReplica:
 
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
         """Checks a tile again when the next statement of these sets expires."""
-        ends = [end_ns for each in sets if (end_ns := next_expiry_ns(each, self._now_ns)) is not None]
+        ends = [end_ns for each in sets if (end_ns := marks.next_expiry_ns(each, self._now_ns)) is not None]
         if not ends or min(ends) >= self._expiry_ns.get(tile, FOREVER):
             return
         self._expiry_ns[tile] = min(ends)
@@ -281,7 +266,7 @@ class MapReplica:
             heapq.heapify(self._expiries)
 
     def _expire(self, now_ns: int) -> None:
-        """Gives cells whose winner expired their next one, and drops our own expired statements from our sets."""
+        """Gives cells whose winner expired their next one. What we state ourselves does not expire."""
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
         expired: dict[int, list[MarkSet]] = {}
         while self._expiries and self._expiries[0][0] <= now_ns:
@@ -291,35 +276,21 @@ class MapReplica:
                 expired[tile] = self.held.of_tile(tile)
         if not expired:
             return
-        self.zones_version += any(is_zone(each.author) for sets in expired.values() for each in sets)
+        self.zones_version += any(marks.is_zone(each.author) for sets in expired.values() for each in sets)
         self._settle(expired, before_ns, False)
         for tile, sets in expired.items():
             self._await_expiry(tile, sets)
-            own = self.held.get(tile, self.author)
-            if own is not None and own.untils_ns:
-                left = standing(own, self._now_ns)
-                if len(left.cells) < len(own.kinds):
-                    self._put_own(tile, left)
 
     # --- our own statements ---------------------------------------------------------------------------------
 
-    def write(
-        self,
-        cells: ArrayLike,
-        kinds: ArrayLike,
-        paces: ArrayLike,
-        now_ns: int,
-        *,
-        lifetime_s: float | None = None,
-    ) -> list[MarkSet]:
+    def write(self, cells: ArrayLike, kinds: ArrayLike, paces: ArrayLike, now_ns: int) -> list[MarkSet]:
         """States something about cells; of a cell named twice the last statement counts. The own cost map changes
         at once. Returns the sets that may be published now; `tick` returns the others later.
 
-        cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
-        kinds       uint8 (cells,)    MarkKind, or one for all
-        paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
-                    of marks (`swarm.wire.messages.map_data`)
-        lifetime_s  the statements expire this time after their stamps, by the reader's clock; None: never
+        cells  int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
+        kinds  uint8 (cells,)    MarkKind, or one for all
+        paces  float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds of
+               marks (`swarm.wire.messages.map_data`)
 
         Raises RuntimeError if the replica has no author.
         """
@@ -333,7 +304,7 @@ class MapReplica:
         tiles, inner = tile_cells(self.grid, flat)
         for tile in np.unique(tiles).tolist():
             here = tiles == tile
-            self._write_tile(tile, inner[here], new_kinds[here], new_paces[here], now_ns, lifetime_s)
+            self._write_tile(tile, inner[here], new_kinds[here], new_paces[here], now_ns)
         return self.tick(now_ns)
 
     def _write_tile(
@@ -343,46 +314,42 @@ class MapReplica:
         kinds: NDArray[np.uint8],
         paces: NDArray[np.float32],
         now_ns: int,
-        lifetime_s: float | None,
     ) -> None:
         own = self._own(tile)
-        assert own.untils_ns is not None
-        won = dense(winners(self.held.of_tile(tile), self._now_ns))
+        won = marks.dense(winners(self.held.of_tile(tile), self._now_ns))
         stamps = self._clock.stamps_ns(now_ns, won.stamps_ns[cells])
-        if lifetime_s is None and len(np.unique(cells)) == len(cells):
-            # A mark that we have stated already, and that wins permanently, need not be stated again.
-            wins = (own.stamps_ns[cells] != NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
+        if len(np.unique(cells)) == len(cells):
+            # A mark that we have stated already, and that wins, need not be stated again.
+            wins = (own.stamps_ns[cells] != marks.NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
             known = wins & (won.kinds[cells] == kinds) & (won.paces[cells] == paces)
-            known &= own.untils_ns[cells] == FOREVER
             if known.all():
                 return
             cells, kinds, paces, stamps = cells[~known], kinds[~known], paces[~known], stamps[~known]
         own.kinds[cells], own.paces[cells], own.stamps_ns[cells] = kinds, paces, stamps
-        own.untils_ns[cells] = FOREVER if lifetime_s is None else stamps + int(lifetime_s * NS_PER_S)
         self.counts["marks_written"] += len(cells)
-        self._put_own(tile, sparse(own))
+        self._put_own(tile, marks.sparse(own))
 
     def write_learned(self, measured: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
         """States what we have learned (`shared_map.learning.measurements`), instead of what was stated before."""
-        self._put_own(beyond_tile(self.grid), Statements(*columns_of(measured, now_ns)))
+        self._put_own(beyond_tile(self.grid), marks.Statements(*columns_of(measured, now_ns)))
         return self.tick(now_ns)
 
-    def _own(self, tile: int) -> Statements:
+    def _own(self, tile: int) -> marks.Statements:
         """Our statements about a tile, spread over all of its cells."""
         if self.author is None:
             raise RuntimeError("a replica without an author cannot write")
         own = self.held.get(tile, self.author)
-        return dense(NO_STATEMENTS if own is None else statements(own))
+        return marks.dense(marks.NO_STATEMENTS if own is None else marks.statements(own))
 
-    def _put_own(self, tile: int, stated: Statements, epoch: int | None = None) -> None:
+    def _put_own(self, tile: int, stated: marks.Statements, epoch: int | None = None) -> None:
         """Replaces our set of a tile, under the next number.
 
         epoch  of that number; None: as before
         """
         assert self.author is not None
         held = self.held.get(tile, self.author)
-        last, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
-        own = mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, stated)
+        last, seq = (1, 0) if held is None else (held.epoch, marks.next_seq(held.seq))
+        own = marks.mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, stated)
         before = {tile: self.held.of_tile(tile)}
         self.held.put(own, own=True)
         self.counts["sets_merged"] += 1
@@ -396,7 +363,7 @@ class MapReplica:
             self.counts["sets_refused"] += 1
             return
         held = self.held.get(received.tile, self.author)
-        stated = NO_STATEMENTS if held is None else statements(held)
+        stated = marks.NO_STATEMENTS if held is None else marks.statements(held)
         self._put_own(received.tile, stated, received.epoch + 1)
 
     # --- comparing with others ------------------------------------------------------------------------------
@@ -414,13 +381,13 @@ class MapReplica:
         """Returns True if all marks of an author in some tile have expired: too early if our clock is ahead of
         its."""
         sets = (self.held.get(tile, author) for tile in self.held.tiles)
-        return any(each and each.kinds and not len(standing(each, self._now_ns).cells) for each in sets)
+        return any(each and each.kinds and not len(marks.standing(each, self._now_ns).cells) for each in sets)
 
     def own_digest(self) -> dict[str, bytes]:
         """Rows of all that we stated ourselves."""
         return self.held.ledger.held([] if self.author is None else [self.author])
 
-    def winners(self, tile: int) -> Statements:
+    def winners(self, tile: int) -> marks.Statements:
         """The winning statements about a tile, in order of cell; cells without any are absent."""
         return winners(self.held.of_tile(tile), self._now_ns)
 

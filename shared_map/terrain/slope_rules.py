@@ -26,15 +26,9 @@ Factor = Callable[[Floats, Floats, CostConfig], Floats]
 
 
 class RuleRow(NamedTuple):
-    """One rule.
+    """One rule: the factor of a step by its rise, and whether uphill and downhill differ."""
 
-    mean         the factor of a cell by its grade (never negative), whichever way the cell is crossed
-    directed     the factor of a step by its rise
-    is_directed  whether uphill and downhill differ
-    """
-
-    mean: Factor
-    directed: Factor
+    factor: Factor
     is_directed: bool
 
 
@@ -45,7 +39,11 @@ def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
     the same as with direction-dependent steps.
     """
     sine = _sine(grade)
-    factor = _bounded(SLOPE_RULES[cost.slope_rule].mean(grade, sine, cost), cost)
+    rule = SLOPE_RULES[cost.slope_rule]
+    factor = _bounded(rule.factor(grade, sine, cost), cost)
+    if rule.is_directed:
+        factor += _bounded(rule.factor(-grade, -sine, cost), cost)
+        factor *= np.float32(0.5)
     return _without_steeper(factor, sine, cost.max_slope_deg)
 
 
@@ -55,7 +53,12 @@ def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     Steeper than `max_climb_deg` up or `max_descent_deg` down is inf.
     """
     sine = _sine(rise)
-    factor = _bounded(SLOPE_RULES[cost.slope_rule].directed(rise, sine, cost), cost)
+    rule = SLOPE_RULES[cost.slope_rule]
+    if rule.is_directed:
+        factor = rule.factor(rise, sine, cost)
+    else:
+        factor = rule.factor(np.abs(rise), np.abs(sine), cost)
+    factor = _bounded(factor, cost)
     climb_deg, descent_deg = step_limits_deg(cost)
     return _without_steeper(_without_steeper(factor, sine, climb_deg), -sine, descent_deg)
 
@@ -170,38 +173,17 @@ def _table(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return found
 
 
-def _by_steepness(mean: Factor) -> RuleRow:
-    """A rule that does not tell uphill from downhill."""
-
-    def directed(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-        return mean(np.abs(rise), np.abs(sine), cost)
-
-    return RuleRow(mean, directed, False)
-
-
-def _by_direction(directed: Factor) -> RuleRow:
-    """A rule that tells uphill from downhill; its mean is that of up and down."""
-
-    def mean(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-        both = _bounded(directed(rise, sine, cost), cost)
-        both += _bounded(directed(-rise, -sine, cost), cost)
-        both *= np.float32(0.5)
-        return both
-
-    return RuleRow(mean, directed, True)
-
-
 SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
     # Plain curves: to `steep_factor` at `max_slope_deg`.
-    "linear": _by_steepness(_linear),
-    "quadratic": _by_steepness(_quadratic),
+    "linear": RuleRow(_linear, False),
+    "quadratic": RuleRow(_quadratic, False),
     # Balance of power, as in J. Y. Wong, Theory of Ground Vehicles.
-    "energy": _by_direction(_energy),
+    "energy": RuleRow(_energy, True),
     # W. Tobler, Three presentations on geographical analysis and modeling, NCGIA Technical Report 93-1, 1993.
-    "tobler": _by_direction(_tobler),
+    "tobler": RuleRow(_tobler, True),
     # W. Naismith, Scottish Mountaineering Club Journal 2, 1892; E. Langmuir, Mountaincraft and Leadership, 1984.
-    "naismith_langmuir": _by_direction(_naismith_langmuir),
+    "naismith_langmuir": RuleRow(_naismith_langmuir, True),
     # Points of a scenario: `slope_table` or `slope_csv`.
-    "table": _by_direction(_table),
+    "table": RuleRow(_table, True),
 }
 """Every rule; a new one is a row here and its name in `swarm.config.ground.SlopeRule`."""

@@ -29,7 +29,8 @@ from shared_map.array_files import Bools, Floats, give_back_memory, open_array, 
 from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.step_climb import ENTRIES, Climb, Wind
-from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain, build_truth
+from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain
+from shared_map.terrain.true_ground import build_truth
 from shared_map.terrain.zones import files_of_zone
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.load import BUILT_IN_TERRAINS

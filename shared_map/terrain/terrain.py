@@ -15,20 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats
+from shared_map.terrain import pace_layers
 from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
-from shared_map.terrain.pace_layers import (
-    TerrainClass,
-    class_factors,
-    grade_of_padded,
-    inflate,
-    inflation_halves,
-    slope_deg,
-    terrain_pace,
-)
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import Climb, climb_of
-from shared_map.terrain.true_ground import true_ground
 from shared_map.terrain.zones import ZoneFacts, paint_zones
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario
@@ -103,10 +94,10 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
     if scenario.terrain.roads:
         open_ground = ground if cost is common else _ground(source, classes, common, progress)
         _check_passable(open_ground, source.elevation_m, classes, common, grid)
-        from shared_map.terrain.synthetic.rivers_and_roads import lay_roads
+        from shared_map.terrain.synthetic import lay_roads
 
         laid = lay_roads(open_ground, scenario.terrain.roads, grid, scenario.seed)
-        classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
+        classes = np.where(laid, np.uint8(pace_layers.TerrainClass.ROAD), classes)
         ground[laid] = np.float32(1 / cost.road_speed_m_per_s)
         notes.append(f"{scenario.terrain.roads} roads laid between seeded places, {int(laid.sum())} cells")
     if cost.layers:
@@ -122,7 +113,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
     notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
-        from shared_map.terrain.synthetic.landscape import paint_photo
+        from shared_map.terrain.synthetic import paint_photo
 
         photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed, progress)
         notes.append("photo painted from elevation and classes, as there is none")
@@ -136,10 +127,10 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
 
     def work(row0: int, row1: int) -> None:
         padded_m, resolution_m = padded_rows(source.elevation_m, row0, row1), source.grid.resolution_m
-        steepness = grade_of_padded(padded_m, resolution_m)
+        steepness = pace_layers.grade_of_padded(padded_m, resolution_m)
         np.copyto(steepness, np.float32(np.nan), where=np.isnan(source.elevation_m[row0:row1]))
         readings = None if source.readings is None else source.readings[row0:row1]
-        pace = terrain_pace(steepness, classes[row0:row1], cost, readings)
+        pace = pace_layers.terrain_pace(steepness, classes[row0:row1], cost, readings)
         if source.factor is not None:
             pace *= source.factor[row0:row1]
         ground[row0:row1] = pace
@@ -161,8 +152,8 @@ def finished(
     _check_passable(ground, elevation_m, classes, cost, grid)
     # However wide a vehicle is said to be, wider than the terrain is the same.
     radius_m = min(cost.vehicle_radius_m, 2 * max(grid.rows, grid.cols) * grid.resolution_m)
-    halves = inflation_halves(radius_m, grid.resolution_m)
-    pace = inflate(ground, halves) if halves else ground
+    halves = pace_layers.inflation_halves(radius_m, grid.resolution_m)
+    pace = pace_layers.inflate(ground, halves) if halves else ground
     if np.isinf(pace).all():
         raise TerrainError(
             f"{_ALL_LETHAL} cost.vehicle_radius_m = {cost.vehicle_radius_m:g} is too wide for every gap in it"
@@ -189,11 +180,11 @@ def _check_passable(pace: Floats, elevation_m: Floats, classes: Bytes, cost: Cos
     """Raises TerrainError that says why, if a vehicle could stand nowhere."""
     if not np.isinf(pace).all():
         return
-    slopes = slope_deg(elevation_m, grid.resolution_m)
+    slopes = pace_layers.slope_deg(elevation_m, grid.resolution_m)
     shares = {
         "void": np.isnan(elevation_m).mean(),
         f"steeper than cost.max_slope_deg = {cost.max_slope_deg:g}": (slopes > cost.max_slope_deg).mean(),
-        "of a lethal class": np.isinf(class_factors(cost)[classes]).mean() if cost.classes else 0.0,
+        "of a lethal class": np.isinf(pace_layers.class_factors(cost)[classes]).mean() if cost.classes else 0.0,
     }
     causes = ", ".join(f"{share:.0%} is {what}" for what, share in shares.items() if share > 0)
     raise TerrainError(
@@ -232,18 +223,3 @@ def terrain_of_pace(
     cost = CostConfig(vehicle_radius_m=vehicle_radius_m)
     photo = np.full((rows, cols, 3), 128, np.uint8)
     return finished(grid, height, photo, np.zeros((rows, cols), np.uint8), ground, cost, ())
-
-
-def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
-    """The true pace of the ground: the prior ground changed by what `terrain.hidden` asks for.
-
-    Without inflation: it is what a sensor sees of each cell. Never shown to planners."""
-    return true_ground(
-        scenario.terrain.hidden,
-        scenario.cost,
-        terrain.grid,
-        terrain.ground_s_per_m,
-        terrain.elevation_m,
-        terrain.classes,
-        scenario.seed,
-    )

@@ -10,12 +10,13 @@ import heapq
 
 import numpy as np
 
-from shared_map.array_files import Bools, Bytes, CellsOf, Floats
+from shared_map.array_files import Bools, CellsOf, Floats
 from shared_map.terrain.pace_layers import LETHAL, TerrainClass, largest_part
-from shared_map.terrain.synthetic.noise import fractal_noise
+from shared_map.terrain.synthetic import fractal_noise
+from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import paint_zones
-from swarm.config.ground import CostConfig, HiddenConfig
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.config.scenario import Scenario
+from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 RUBBLE_FACTOR = np.float32(3.0)
@@ -23,78 +24,48 @@ CONNECTED_SHARE = 0.85
 """At least this share of the largest passable part stays passable and connected, besides flooded cells."""
 
 
-def true_ground(
-    hidden: HiddenConfig,
-    cost: CostConfig,
-    grid: GridSpec,
-    ground: Floats,
-    elevation_m: Floats,
-    classes: Bytes,
-    seed: int,
-) -> Floats:
-    """True pace in s/m, float32 (rows, cols), without inflation. A new array.
+def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
+    """The true pace of the ground: the prior ground changed by what `terrain.hidden` asks for.
 
-    ground       float32  (rows, cols)  s/m; the map's ground, without inflation; inf is lethal
-    elevation_m  float32  (rows, cols)  NaN is a void
-    classes      uint8    (rows, cols)  TerrainClass
+    True pace in s/m, float32 (rows, cols), a new array. Without inflation: it is what a sensor sees of each cell.
+    Never shown to planners.
     """
-    truth = np.array(ground, np.float32)
+    hidden, elevation_m, classes = scenario.terrain.hidden, terrain.elevation_m, terrain.classes
+    truth = np.array(terrain.ground_s_per_m, np.float32)
     for name, factor in hidden.class_factor.items():
         there = (classes == TerrainClass[name.upper()]) & np.isfinite(truth)
         truth[there] = np.clip(truth[there] * np.float32(factor), PACE_LEAST, PACE_MOST)
-    rng = np.random.default_rng([seed, 5])
-    whole = _Parts(truth).largest
+    rng = np.random.default_rng([scenario.seed, 5])
+    least = (CONNECTED_SHARE - hidden.flooded_share) * _largest(truth)
     _rubble(truth, hidden.rubble_fields, rng)
-    parts = _flooded(truth, elevation_m, hidden.flooded_share, rng, whole)
-    _close_roads(parts, classes == TerrainClass.ROAD, hidden.closed_roads, rng, whole, hidden.flooded_share)
-    paint_zones(truth, hidden.zones, grid, cost, np.isnan(elevation_m), key="terrain.hidden.zones")
+    _close_valley(truth, elevation_m, hidden.flooded_share, rng, least)
+    _close_roads(truth, classes == TerrainClass.ROAD, hidden.closed_roads, rng, least)
+    void = np.isnan(elevation_m)
+    paint_zones(truth, hidden.zones, terrain.grid, scenario.cost, void, key="terrain.hidden.zones")
     return truth
 
 
-def _flooded(truth: Floats, elevation_m: Floats, share: float, rng: np.random.Generator, whole: int) -> _Parts:
-    """Makes a valley lethal, as much of it as leaves enough connected. Returns the parts that are left."""
+def _largest(truth: Floats) -> int:
+    """Cells of the largest connected passable part."""
+    return int(largest_part(np.isfinite(truth)).sum())
+
+
+def _close_valley(truth: Floats, elevation_m: Floats, share: float, rng: np.random.Generator, least: float) -> None:
+    """Makes a valley lethal, as much of it as leaves `least` cells in the largest part."""
     flood = _flood(truth, elevation_m, share, rng)
     while flood:
         wet = np.array(flood, np.intp)
         kept = truth.reshape(-1)[wet]
         truth.reshape(-1)[wet] = LETHAL
-        parts = _Parts(truth)
-        if parts.largest >= (CONNECTED_SHARE - share) * whole:
-            return parts
+        if _largest(truth) >= least:
+            return
         truth.reshape(-1)[wet] = kept
         flood = flood[: len(flood) // 2]
-    return _Parts(truth)
 
 
-class _Parts:
-    """The connected passable parts of a ground that is closed block by block."""
-
-    def __init__(self, truth: Floats) -> None:
-        self.truth = truth
-        self.largest = self._largest()
-        """Cells of the largest part."""
-
-    def _largest(self) -> int:
-        return int(largest_part(np.isfinite(self.truth)).sum())
-
-    def close(self, block: tuple[slice, slice], least: float) -> bool:
-        """Makes a block lethal, unless that leaves fewer than `least` cells in the largest part. Whether it did."""
-        kept = self.truth[block].copy()
-        self.truth[block] = LETHAL
-        left = self._largest()
-        if left >= least:
-            self.largest = left
-            return True
-        self.truth[block] = kept
-        return False
-
-
-def _close_roads(
-    parts: _Parts, road: Bools, count: int, rng: np.random.Generator, whole: int, flooded_share: float
-) -> None:
+def _close_roads(truth: Floats, road: Bools, count: int, rng: np.random.Generator, least: float) -> None:
     """Makes stretches of road and the cells beside them lethal. Up to 20 places are tried for each; none fits if
-    each would cut the largest passable part to too few cells."""
-    truth, least = parts.truth, whole * (CONNECTED_SHARE - flooded_share)
+    each would leave fewer than `least` cells in the largest part."""
     cols = truth.shape[1]
     roads = np.flatnonzero(road) if count else np.empty(0, np.intp)
     for _ in range(count):
@@ -105,8 +76,11 @@ def _close_roads(
             row, col = divmod(int(roads[rng.integers(len(roads))]), cols)
             half = int(rng.integers(1, 3))
             block = (slice(max(row - half, 0), row + half + 1), slice(max(col - half, 0), col + half + 1))
-            if parts.close(block, least):
+            kept = truth[block].copy()
+            truth[block] = LETHAL
+            if _largest(truth) >= least:
                 break
+            truth[block] = kept
 
 
 def _rubble(truth: Floats, count: int, rng: np.random.Generator) -> None:

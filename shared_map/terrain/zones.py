@@ -296,23 +296,18 @@ def files_of_zone(zone: ZoneConfig) -> list[Path]:
 def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
     covers none."""
+    named = f"{where} {zone.called!r}"
     if zone.mask is not None:
-        inside = mask_of(Path(zone.mask), grid)
+        inside, why = mask_of(Path(zone.mask), grid), f"{zone.mask} is 0 everywhere"
     elif zone.polygon is not None:
-        frame = MapFrame(grid)
-        corners = corners_of(zone.polygon, frame, f"{where} {zone.name or zone.kind!r}: polygon")
-        side_m = grid.resolution_m
+        frame, side_m = MapFrame(grid), grid.resolution_m
+        corners = corners_of(zone.polygon, frame, f"{named}: polygon")
         inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
-        if not inside.any():
-            raise TerrainError(
-                f"{where} {zone.name or zone.kind!r} covers no cell of the terrain: {extent_of(frame)}"
-            )
+        why = extent_of(frame)
     else:
         inside = polygon_mask(zone.polygon_m or (), grid)
-    if not inside.any():
         width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
-        raise TerrainError(
-            f"{where} {zone.name or zone.kind!r} covers no cell, so it is outside the terrain: its corners are"
-            f" metres east and south of the north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
-        )
+        why = f"its corners are metres east and south of the north-west corner of {width:.0f} m x {height:.0f} m"
+    if not inside.any():
+        raise TerrainError(f"{named} covers no cell of the terrain: {why}")
     return inside

@@ -57,7 +57,7 @@ def _make(folder: Path, size: int, degrees: bool) -> None:
     import rasterio
     from rasterio.transform import from_origin
 
-    from shared_map.terrain.synthetic.landscape import landscape, paint_photo
+    from shared_map.terrain.synthetic import landscape, paint_photo
 
     elevation_m, classes = landscape(size, size, RESOLUTION_M, size * RESOLUTION_M / 20, seed=1)
     photo = paint_photo(elevation_m, classes, RESOLUTION_M, seed=1)

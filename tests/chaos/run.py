@@ -26,7 +26,8 @@ from launch_scripts.launcher.run_options import find_scenario, make_run_dir, wit
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.world.referee import Referee
-from shared_map.terrain.terrain import build_terrain, build_truth
+from shared_map.terrain.terrain import build_terrain
+from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import class_truths
 from swarm.bus.endpoints import listening
 from swarm.config.agent_plan import plan_agents

@@ -28,7 +28,8 @@ from planner_service.service import PlannerService
 from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth, terrain_of_pace
+from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
+from shared_map.terrain.true_ground import build_truth
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.config.agent_plan import plan_agents

@@ -96,7 +96,7 @@ def from_file(path: Path) -> Pace:
         case ".npy":
             pace = _read_npy(path)
         case ".map":
-            from shared_map.importers.array_grids import read_map
+            from shared_map.importers.plain_grids import read_map
 
             pace = read_map(path).numbers
         case _:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from shared_map.array_files import Bools, Floats
-from shared_map.terrain.synthetic.noise import fractal_noise
+from shared_map.terrain.synthetic import fractal_noise
 
 SIDE = 384
 _AROUND = np.ones((3, 3), np.bool_)

@@ -2,5 +2,5 @@
 
 `zone_files` is the door. `vector_files` opens a file and reads its features as they are stored. `burn_shapes`
 repairs them, brings them into cells, and burns them. `zone_features` decides which features count and what they
-are worth, by the classes of ways of `way_classes` with its table `ways.toml`. Only these need the extra `vectors`.
+are worth, by the classes of ways in `ways.toml`. Only these need the extra `vectors`.
 """

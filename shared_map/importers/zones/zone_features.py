@@ -1,25 +1,143 @@
-"""Shapes of a zone's file: which of its features count, what they are worth, and the areas of them for orders."""
+"""Features of a zone's file: which of them count, what they are worth by the classes of ways (OpenStreetMap's tags
+of roads and water), and their areas for orders.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
 
-from shared_map.importers.zones import way_classes
 from shared_map.importers.zones.burn_shapes import POLYGON, Drawn, Placing, Shapes
 from shared_map.importers.zones.shape_texts import INCLUSION
 from shared_map.importers.zones.vector_files import Features, Layer, open_layers, read_features, unusable
-from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way, states_extent
 from shared_map.importers.zones.zone_files import LEAST, MOST, FileFacts
-from swarm.config.ground import ZoneConfig
+from swarm.config.ground import WayConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
+
+Kind = Literal["road", "water"]
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A class of roads or water.
+
+    width_m  of its lines, in metres; areas have their own
+    factor   of a road relative to the road pace, of water to the ground; None is lethal
+    """
+
+    width_m: float
+    factor: float | None
+
+
+_TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
+
+
+def _built_in(kind: Kind) -> dict[str, Way]:
+    rows = _TABLES[kind].items()
+    return {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows}
+
+
+BUILT_IN: Mapping[Kind, Mapping[str, Way]] = {"road": _built_in("road"), "water": _built_in("water")}
+COLUMNS: Mapping[Kind, tuple[str, ...]] = {
+    "road": ("highway", "fclass"),
+    "water": ("waterway", "natural", "landuse", "fclass"),
+}
+"""Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
+TAGS = ("bridge", "tunnel", "area", "inclusion")
+_EXTENTS: Mapping[str, Sequence[float]] = _TABLES["extents"]
+"""Columns of a point's or a line's own extent, in any case -> its width over it, and the largest width, metres."""
+PACKED = ("other_tags", "tags")
+"""Columns that hold further tags: as GDAL writes them, or JSON."""
+
+_VARIANT = re.compile(r"(_link|_grade[1-5])$")
+_NO = ("no", "0", "f", "false")
+_NOT_A_BRIDGE = (*_NO, "aqueduct")
+_PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
+_LENGTH = re.compile(r"\s*(\d{1,9}(?:[.,]\d{1,9})?)\s*(m|metres|meters|km|ft|feet|')?\s*")
+_UNITS_M = {"km": 1000.0, "ft": 0.3048, "feet": 0.3048, "'": 0.3048}
+
+
+def unpacked(row: Mapping[str, str]) -> dict[str, str]:
+    """Returns the tags of a feature: its columns, and those that are packed into one. A column of its own counts
+    more."""
+    tags: dict[str, str] = {}
+    packed = row.get("tags")
+    if packed is not None and packed.startswith("{"):
+        try:
+            known = json.loads(packed)
+        except (ValueError, RecursionError):
+            known = {}
+        tags |= {str(key): str(value) for key, value in known.items() if isinstance(value, str | int | float)}
+    tags |= dict(_PAIR.findall(row.get("other_tags", "")))
+    return tags | {key: value for key, value in row.items() if key not in PACKED}
+
+
+def class_of(kind: Kind | None, tags: Mapping[str, str], attribute: str | None) -> str | None:
+    """The class of a feature; None if it says none."""
+    if attribute is not None or kind is None:
+        return tags.get(attribute or "")
+    for column in COLUMNS[kind]:
+        found = tags.get(column)
+        if found is not None and (column not in ("natural", "landuse") or found in BUILT_IN["water"]):
+            return found
+    return None
+
+
+def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | None:
+    """Returns the cost of a class, by the user's table, then by the built-in one of a kind; None if it is left
+    out."""
+    known = None if kind is None else BUILT_IN[kind].get(_VARIANT.sub("", name))
+    given = own.get(name)
+    if given is None:
+        return known
+    if given.factor == "ignored":
+        return None
+    width_m = given.width_m if given.width_m is not None else known.width_m if known is not None else 0.0
+    return Way(width_m, None if given.factor == "lethal" else given.factor)
+
+
+def states_extent(column: str) -> bool:
+    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not."""
+    name = column.lower()
+    return name in _EXTENTS or "radius" in name or "diameter" in name
+
+
+def width_of(tags: Mapping[str, str]) -> float | None:
+    """The width in metres that a feature has of its own; of "2-4 m" the larger.
+
+    Raises ValueError, which names the column, if it states an extent that cannot be read.
+    """
+    stated = {key.lower(): value for key, value in tags.items() if states_extent(key)}
+    for key in sorted(stated, key=lambda key: [*_EXTENTS, key].index(key)):
+        lengths = [_LENGTH.fullmatch(part) for part in re.split("[;-]", stated[key])]
+        found = [float(each[1].replace(",", ".")) * _UNITS_M.get(each[2], 1.0) for each in lengths if each]
+        over, most_m = _EXTENTS.get(key, (math.nan, 0.0))
+        if len(found) < len(lengths) or not max(found) * over <= most_m:
+            raise ValueError(f"its {key} is {stated[key][:40]!r}, expected metres as radius, diameter or width")
+        if max(found) > 0:
+            return max(found) * over
+    return None
+
+
+def is_bridge(tags: Mapping[str, str]) -> bool:
+    return tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
+
+
+def is_tunnel(tags: Mapping[str, str]) -> bool:
+    """Returns True if it runs below the ground: a map of one level has no place for it."""
+    return tags.get("tunnel", "no").lower() not in _NO
+
 
 _WIDEST_M = 1000.0
 """Lines that run so far outside the terrain are of no use to it."""
@@ -105,7 +223,7 @@ def _margin_m(zone: ZoneConfig, layer: Layer) -> float:
     for features in read_features(layer, stated) if stated else ():
         for n in range(len(features.numbers)):
             with contextlib.suppress(ValueError):
-                widths.append(way_classes.width_of(features.tags(n)) or 0.0)
+                widths.append(width_of(features.tags(n)) or 0.0)
     return max(widths) / 2
 
 
@@ -152,11 +270,11 @@ class _Worth:
             id = features.id(n)
             key = n, shape.geom_type == "Polygon"
             if key not in ways:
-                tags = way_classes.unpacked(features.tags(n))
+                tags = unpacked(features.tags(n))
                 if key[1]:  # an area has its own extent
                     tags = {name: value for name, value in tags.items() if not states_extent(name)}
                 way = self._way(tags, id)
-                bridge = way is not None and self._kind == "road" and way_classes.is_bridge(tags)
+                bridge = way is not None and self._kind == "road" and is_bridge(tags)
                 self._facts.bridges += bridge
                 inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no").lower()
                 ways[key] = way, bridge, self.closes and inclusion in ("yes", "true", "1")
@@ -169,12 +287,12 @@ class _Worth:
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
         zone, kind = self._zone, self._kind
-        name = way_classes.class_of(kind, tags, zone.attribute) if self._by_class else ""
+        name = class_of(kind, tags, zone.attribute) if self._by_class else ""
         if name is None:
             self._facts.skip("without a class")
             return None
         if name:
-            way = way_classes.way_of(kind, name, zone.classes)
+            way = way_of(kind, name, zone.classes)
             if way is None:
                 self._facts.skip(f"of class {name[:40]}", id)
         elif zone.kind in ("pace", "factor") and zone.attribute is not None:
@@ -183,12 +301,12 @@ class _Worth:
             way = Way(0.0, zone.value or 1.0)
         if way is None:
             return None
-        if kind is not None and way_classes.is_tunnel(tags):
+        if kind is not None and is_tunnel(tags):
             self._facts.skip("below the ground", id)
             return None
         closes = self.closes or (kind == "water" and not name)
         try:
-            own_m = way_classes.width_of(tags)
+            own_m = width_of(tags)
         except ValueError as error:
             if closes or kind == "water":
                 raise unusable(self._layer.what, id, str(error)) from None

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
-from shared_map.importers.georeference import crs_name
-from shared_map.importers.onto_grid import place_on
+from shared_map.importers.georeference import crs_name, place_on
 from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones.shape_texts import is_vector
 from swarm.config.ground import ZoneConfig

@@ -98,7 +98,7 @@ def test_a_picture_of_any_shape_with_voids_and_coarsened(
 
 def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) -> None:
     spots = {"forest": [], "grass": []}
-    from shared_map.terrain.synthetic.landscape import landscape
+    from shared_map.terrain.synthetic import landscape
 
     _, classes = landscape(300, 280, 30.0, 400.0, 4)
     rng = np.random.default_rng(1)

@@ -8,7 +8,7 @@ import pytest
 
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.store import load_prepared, save_prepared
-from shared_map.terrain.synthetic.noise import mountain_noise
+from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.load import parse_scenario

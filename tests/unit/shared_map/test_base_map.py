@@ -3,6 +3,7 @@
 import contextlib
 import zlib
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,12 +15,11 @@ from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher import fetched_terrain
-from shared_map.keeper.base_map_fetch import NEEDED, BaseMapCopy, Fetching, fetch_base_map
-from shared_map.keeper.base_map_server import LAYERS, BaseMapServer, describe, pack
+from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, BaseMapServer, describe, fetch_base_map, pack
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.bus.bus import Bus, Event, Replied
+from swarm.bus.bus import Event, Replied
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
@@ -147,15 +147,15 @@ class Network:
         self.swarm.run(5)
 
 
-def asking(network: Network) -> Bus:
-    return network  # type: ignore[return-value]
+def fetched(network: Network, why: str = "no file", **named: Any) -> Terrain:
+    bus: Any = network
+    return fetch_base_map(bus, TERRAIN.digest, SCENARIO.cost, why, EVERY, **named)
 
 
 def test_a_process_without_the_file_gets_the_terrain_of_the_run() -> None:
     network = Network(BaseMapServer(TERRAIN, "0"))
     told: list[tuple[str, float]] = []
-    wanted = Fetching(TERRAIN.digest, SCENARIO.cost, EVERY)
-    terrain = fetch_base_map(asking(network), wanted, "no file", lambda what, share: told.append((what, share)))
+    terrain = fetched(network, progress=lambda what, share: told.append((what, share)))
     assert same(terrain, TERRAIN)
     assert told[-1] == ("base map from keeper 0", 1.0)
     assert terrain.notes[-1].startswith("fetched from keeper 0")
@@ -164,14 +164,12 @@ def test_a_process_without_the_file_gets_the_terrain_of_the_run() -> None:
 def test_a_keeper_with_another_terrain_is_passed_over() -> None:
     other = build_terrain(msgspec.structs.replace(SCENARIO, seed=9))
     network = Network(BaseMapServer(other, "a"), BaseMapServer(TERRAIN, "b"))
-    assert same(fetch_base_map(asking(network), Fetching(TERRAIN.digest, SCENARIO.cost, EVERY), "no file"), TERRAIN)
+    assert same(fetched(network), TERRAIN)
 
 
 def test_nobody_there_is_one_sentence_within_the_deadline() -> None:
     with pytest.raises(TerrainError) as caught:
-        fetch_base_map(
-            asking(Network()), Fetching("fed", SCENARIO.cost, within_s=0.3), "there is no file ridge.tif"
-        )
+        fetched(Network(), why="there is no file ridge.tif", within_s=0.3)
     assert str(caught.value) == (
         "there is no file ridge.tif, and the base map cannot be fetched: no keeper in namespace swarm answered "
         "within 0.3 s; start one where the file is"
@@ -192,14 +190,12 @@ class Liar(BaseMapServer):
 
 def test_who_lies_beside_the_keeper_only_costs_time() -> None:
     network = Network(Liar(also=True), BaseMapServer(TERRAIN, "0"))
-    assert same(fetch_base_map(asking(network), Fetching(TERRAIN.digest, SCENARIO.cost, EVERY), "no file"), TERRAIN)
+    assert same(fetched(network), TERRAIN)
 
 
 def test_a_keeper_that_only_lies_is_given_up_in_a_sentence() -> None:
     with pytest.raises(TerrainError, match=r"0% came, then nothing for 0.3 s; refused: .* does not unpack"):
-        fetch_base_map(
-            asking(Network(Liar(also=False))), Fetching(TERRAIN.digest, SCENARIO.cost, within_s=0.3), "no file"
-        )
+        fetched(Network(Liar(also=False)), within_s=0.3)
 
 
 @pytest.mark.parametrize(

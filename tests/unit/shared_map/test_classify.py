@@ -11,12 +11,11 @@ from scipy import ndimage
 from skimage.draw import line
 
 from shared_map.array_files import Bytes, Floats
-from shared_map.importers.cover.classify import Labels, class_readings, confusion, held_out, learnt, read_labels
-from shared_map.importers.cover.photo_rules import box_sum
+from shared_map.importers.cover import classify
+from shared_map.importers.cover.classify import Labels, box_sum, class_readings, held_out, learnt, read_labels
 from shared_map.importers.terrain_sources import Source, load_source
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.synthetic.landscape import landscape, paint_photo
-from shared_map.terrain.synthetic.noise import fractal_noise
+from shared_map.terrain.synthetic import fractal_noise, landscape, paint_photo
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -58,7 +57,7 @@ def test_the_lake_of_davos_is_found_without_labels(davos: tuple[Source, Labels])
 def test_rules_agree_with_the_labels_of_davos(davos: tuple[Source, Labels]) -> None:
     source, labels = davos
     labelled = labels.classes != TerrainClass.UNKNOWN
-    table = confusion(labels.classes[labelled], source.classes[labelled])
+    table = classify.confusion(labels.classes[labelled], source.classes[labelled])
     unknown = table[:, TerrainClass.UNKNOWN].sum()
     assert unknown / table.sum() < 0.3
     assert np.trace(table) / (table.sum() - unknown) > 0.85
@@ -68,7 +67,7 @@ def test_rules_agree_with_the_labels_of_davos(davos: tuple[Source, Labels]) -> N
 def test_learning_from_labels_holds_on_polygons_it_has_not_seen(davos: tuple[Source, Labels]) -> None:
     source, labels = davos
     true, predicted = held_out(source.photo, source.elevation_m, 10.0, labels.classes, labels.groups)
-    table = confusion(true, predicted)
+    table = classify.confusion(true, predicted)
     assert np.trace(table) / table.sum() > 0.7
     classes = learnt(source.photo, source.elevation_m, 10.0, labels.classes)
     assert overlap(labels.classes, np.where(labels.groups >= 0, classes, 0), TerrainClass.WATER) > 0.95

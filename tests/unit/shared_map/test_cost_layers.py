@@ -9,7 +9,8 @@ from support.plugin_modules import forgotten_afterwards
 
 from launch_scripts.launcher.fetched_terrain import missing_files
 from shared_map.terrain.store import kept_key, scenario_key
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.true_ground import build_truth
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, RunMismatchError, TerrainError

@@ -66,7 +66,7 @@ def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, met
 
 def photo_of(ground: Floats) -> Any:
     """A painted true-colour photo, uint8 (rows, cols, 3)."""
-    from shared_map.terrain.synthetic.landscape import paint_photo
+    from shared_map.terrain.synthetic import paint_photo
 
     return paint_photo(ground, np.full(ground.shape, TerrainClass.GRASS, np.uint8), 20.0, 1)
 

@@ -9,8 +9,7 @@ import rasterio
 from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, written
 
-from shared_map.importers.cover.cover_codes import TABLES, read_cover_table
-from shared_map.importers.cover.land_cover import read_cover
+from shared_map.importers.cover.land_cover import TABLES, read_cover, read_cover_table
 from shared_map.terrain.pace_layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import COVER_TABLES

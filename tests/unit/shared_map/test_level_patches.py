@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from support.effort import few
 
-from shared_map.importers.level_patches import labelled
+from shared_map.importers.water_and_voids import labelled
 
 
 def stairs(seed: int, rows: int, cols: int, steps: float) -> np.ndarray:

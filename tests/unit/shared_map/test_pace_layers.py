@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.height_models import written
 
 from shared_map.importers.terrain_sources import load_source
@@ -147,6 +148,12 @@ def test_a_polygon_covers_the_cells_whose_middle_lies_in_it() -> None:
     )
     assert hole.sum() == 24
     assert not hole[2, 2]
+
+
+def test_a_mask_without_a_painted_cell_is_refused_by_its_name(tmp_path: Path) -> None:
+    Image.new("L", (30, 20)).save(tmp_path / "none.png")
+    with pytest.raises(TerrainError, match=r"'rough' covers no cell of the terrain: .*none\.png is 0 everywhere"):
+        zone_mask(ZoneConfig(kind="rough", mask=str(tmp_path / "none.png")), GridSpec(20, 30, 10.0))
 
 
 def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.cover import photo_rules
-from shared_map.importers.cover.classify import class_readings
-from shared_map.importers.cover.photo_rules import CLASS_OF_READINGS, EXPOSURES, Features, ground_readings
+from shared_map.importers.cover import classify
 from shared_map.importers.cover.photos import Photo
 from shared_map.importers.terrain_sources import Source, with_photo
 from shared_map.terrain.pace_layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
-from shared_map.terrain.synthetic.landscape import landscape, paint_photo
+from shared_map.terrain.synthetic import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.grid import GridSpec
 
@@ -30,7 +28,7 @@ def photos() -> list[tuple[Bytes, Floats]]:
     ]
 
 
-def as_read(f: Features, gain: float, warm: float) -> Bytes:
+def as_read(f: classify.Features, gain: float, warm: float) -> Bytes:
     """The class at one exposure: rules from general to particular, a later rule wins."""
     by, tint = np.float32(gain), np.float32(warm)
     red, green, blue = f.red * (by * tint), f.green * by, f.blue * by / tint
@@ -61,27 +59,27 @@ def as_read(f: Features, gain: float, warm: float) -> Bytes:
 
 def test_rules_in_place_say_what_rules_written_one_by_one_say() -> None:
     for photo, elevation_m in photos():
-        for _, f in photo_rules.tiles(photo, elevation_m, 15.0, 0, 70):
+        for _, f in classify.tiles(photo, elevation_m, 15.0, 0, 70):
             plain = as_read(f, 1.0, 1.0)
             expected = np.choose(plain, [BIT.get(kind, np.uint8(0)) for kind in TerrainClass]).astype(np.uint8)
             sand = (plain == TerrainClass.SNOW) & (f.grade < np.float32(0.1)) & (f.texture > 8)
             expected[sand] |= BIT[TerrainClass.UNKNOWN]
-            for exposure in EXPOSURES:
+            for exposure in classify.EXPOSURES:
                 other = as_read(f, *exposure)
                 expected |= np.choose(other, [BIT.get(kind, np.uint8(0)) for kind in TerrainClass]).astype(np.uint8)
-            np.testing.assert_array_equal(ground_readings(f), expected)
+            np.testing.assert_array_equal(classify.ground_readings(f), expected)
 
 
 def test_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     for photo, elevation_m in photos():
-        expected = class_readings(photo, elevation_m, 15.0)
-        monkeypatch.setattr(photo_rules, "TILE_COLS", 37)
-        found = class_readings(photo, elevation_m, 15.0)
+        expected = classify.class_readings(photo, elevation_m, 15.0)
+        monkeypatch.setattr(classify, "TILE_COLS", 37)
+        found = classify.class_readings(photo, elevation_m, 15.0)
         monkeypatch.undo()
         np.testing.assert_array_equal(found.classes, expected.classes)
         np.testing.assert_array_equal(found.readings, expected.readings)
         assert not (found.readings[found.classes != TerrainClass.UNKNOWN]).any()
-        several = CLASS_OF_READINGS[found.readings] == TerrainClass.UNKNOWN
+        several = classify.CLASS_OF_READINGS[found.readings] == TerrainClass.UNKNOWN
         assert several.all()
 
 

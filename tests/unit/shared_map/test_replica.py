@@ -10,7 +10,7 @@ from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, sta
 from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, MarkKind, MarkSet, MarksRequest
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet, MarksRequest
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 NOW = 1_000 * NS_PER_S
@@ -175,16 +175,6 @@ def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show
     assert composites[0].same(composites[1])
 
 
-def test_an_author_drops_its_own_ended_statements_from_its_set() -> None:
-    replica, composite = writer()
-    replica.write([5], [LETHAL], [0], NOW, lifetime_s=2.0)
-    [action] = replica.write([6], [LETHAL], [0], NOW + NS_PER_S)
-    assert np.frombuffer(action.untils_ns, "<i8").tolist() == [NOW + 2 * NS_PER_S, FOREVER]
-    [action] = replica.tick(NOW + 2 * NS_PER_S)
-    assert action == set_of("a1.1", 0, 2, {6: (LETHAL, 0, NOW + NS_PER_S)})
-    assert composite.kinds[[5, 6]].tolist() == [CLEAR, LETHAL]
-
-
 @pytest.mark.parametrize("untils_ns", [range(10**18, 10**18 + 500), range(10**18, 10**18 - 500, -1)])
 def test_sets_whose_statements_expire_leave_no_more_behind_than_the_last_of_them(untils_ns: range) -> None:
     replica, composite = replica_of([])
@@ -197,16 +187,6 @@ def test_sets_whose_statements_expire_leave_no_more_behind_than_the_last_of_them
     assert composite.kinds[1] == LETHAL
     replica.tick(until_ns)
     assert composite.kinds[1] == CLEAR
-
-
-def test_saying_the_same_again_prolongs_a_lifetime() -> None:
-    replica, composite = writer()
-    replica.write([5], [LETHAL], [0], NOW, lifetime_s=2.0)
-    replica.write([5], [LETHAL], [0], NOW + NS_PER_S, lifetime_s=2.0)
-    replica.tick(NOW + 2 * NS_PER_S)
-    assert composite.kinds[5] == LETHAL
-    replica.tick(NOW + 3 * NS_PER_S)
-    assert composite.kinds[5] == CLEAR
 
 
 def test_a_mark_from_the_far_future_is_refused_and_every_other_can_be_overruled() -> None:

@@ -20,7 +20,8 @@ from shared_map.terrain.store import (
     save_prepared,
     scenario_key,
 )
-from shared_map.terrain.terrain import build_terrain, build_truth, terrain_of_pace
+from shared_map.terrain.terrain import build_terrain, terrain_of_pace
+from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario

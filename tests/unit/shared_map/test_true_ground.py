@@ -9,8 +9,9 @@ import pytest
 from scipy import ndimage
 
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.synthetic.noise import Noise, fractal_noise, mountain_noise
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from shared_map.terrain.synthetic import Noise, fractal_noise, mountain_noise
+from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import HiddenConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
 

@@ -15,11 +15,10 @@ from support.effort import few, paired
 from support.height_models import SIDE, hills, is_water, load, written
 from support.water_models import MODELS, UNKNOWABLE, WaterModel, counted
 
-from shared_map.importers.array_grids import read_npz
-from shared_map.importers.level_patches import level_patches
+from shared_map.importers.plain_grids import read_npz
 from shared_map.importers.survey_cells import surveyed
 from shared_map.importers.terrain_sources import _jacksboro_path
-from shared_map.importers.water_and_voids import level_ground, undeclared_voids
+from shared_map.importers.water_and_voids import level_ground, level_patches, undeclared_voids
 
 # --- level ground -------------------------------------------------------------------------------------------
 

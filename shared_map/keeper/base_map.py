@@ -1,30 +1,167 @@
-"""The base map as a process without the terrain's files fetches it: pieces from a keeper become a terrain again."""
+"""The base map: a keeper serves a terrain in packed pieces, of which a machine without its files makes it again.
+
+The hash of each piece is sent beforehand, so that a false piece is refused on receipt; the run's digest shows that
+the whole is the terrain of the run.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.keeper.base_map_server import LAYERS, piece_digest, region_window
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain, finished
-from swarm.bus.bus import Bus
+from swarm.bus.bus import Asked, Bus, Event
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
+from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
 log = logging.getLogger(__name__)
+
+_LEVEL = 1
+"""Level of zlib. Level 6 makes pieces no smaller, two thirds of the raw bytes, and takes twice the time."""
+
+
+class _Layer(NamedTuple):
+    """A layer of a terrain: its field, (rows, cols, *depth)."""
+
+    field: str
+    dtype: type[np.generic]
+    depth: tuple[int, ...] = ()
+
+
+LAYERS = {
+    "ground": _Layer("ground_s_per_m", np.float32),
+    "elevation": _Layer("elevation_m", np.float32),
+    "classes": _Layer("classes", np.uint8),
+    "photo": _Layer("photo", np.uint8, (3,)),
+}
+_PIECES_KEPT = 1024
+"""Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
+_PIECES_PER_REQUEST = 64
+"""Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
+
+
+def region_window(grid: GridSpec, region: int) -> Window:
+    """The cells of a region; regions at the east and south border may be cut off."""
+    region_row, region_col = divmod(region, grid.region_cols)
+    row0, col0 = region_row * REGION_CELLS, region_col * REGION_CELLS
+    return Window(row0, col0, min(row0 + REGION_CELLS, grid.rows), min(col0 + REGION_CELLS, grid.cols))
+
+
+def piece_digest(piece: bytes) -> bytes:
+    """Returns the hash of a piece, as a description holds it."""
+    return hashlib.blake2b(piece, digest_size=BASE_DIGEST_BYTES).digest()
+
+
+def _piece(terrain: Terrain, layer: str, region: int) -> bytes:
+    array: NDArray[Any] = getattr(terrain, LAYERS[layer].field)
+    window = region_window(terrain.grid, region)
+    return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
+
+
+def describe(terrain: Terrain, keeper: str) -> BaseMap:
+    """Returns a keeper's description of its terrain: grid, notes, and the digest of every layer of every region.
+
+    `keeper` is the keeper's id, which a refusal names.
+    """
+    grid = terrain.grid
+    digests = {
+        layer: b"".join(piece_digest(_piece(terrain, layer, region)) for region in range(grid.regions))
+        for layer in LAYERS
+    }
+    return BaseMap(
+        keeper=keeper,
+        terrain=terrain.digest,
+        **asdict(grid),
+        digests=digests,
+        notes=list(terrain.notes),
+    )
+
+
+def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
+    """One layer of one region, packed. zlib, because every process has it; byte planes halve what it leaves of
+    floats.
+
+    Parameters
+    ----------
+    layer : str
+        One of `LAYERS`.
+    region : int
+        0 to grid.regions - 1.
+
+    Raises
+    ------
+    KeyError
+        If there is no such layer.
+    """
+    values = np.frombuffer(_piece(terrain, layer, region), np.uint8)
+    planes = values.reshape(-1, np.dtype(LAYERS[layer].dtype).itemsize).T.tobytes()
+    return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
+
+
+class BaseMapServer:
+    """Answers for a terrain, which never changes: so on the bus's own thread, beside the keeper's loop, which a
+    large map must not hold up. Pieces are packed once and kept."""
+
+    def __init__(self, terrain: Terrain, keeper: str) -> None:
+        self._terrain = terrain
+        self._keeper = keeper
+        self._packed = lru_cache(_PIECES_KEPT)(self._pack)
+
+    def start(self, bus: Bus) -> None:
+        """Serves the description, and pieces."""
+        bus.serve(BASE_MAP, self.answer_map, keeper=self._keeper)
+        bus.serve(BASE_TILES, self.answer_tiles, keeper=self._keeper)
+
+    def answer_map(self, event: Event) -> None:
+        """Answers what the terrain is."""
+        assert isinstance(event, Asked)
+        event.answer(self._described)
+        event.end()
+
+    def answer_tiles(self, event: Event) -> None:
+        """Answers with the pieces that are asked for, or says why there are none."""
+        assert isinstance(event, Asked)
+        request = event.request
+        assert isinstance(request, BaseMapRequest)
+        regions = self._terrain.grid.regions
+        unknown = [layer for layer in request.layers if layer not in LAYERS]
+        if unknown:
+            event.refuse(f"there is no layer {unknown[0][:40]!r}; there are {', '.join(LAYERS)}")
+        elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
+            event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")
+        elif any(region >= regions for region in request.regions):
+            event.refuse(f"region {max(request.regions)} is not in 0..{regions - 1}")
+        else:
+            for layer in request.layers:
+                for region in request.regions:
+                    event.answer(self._packed(layer, region))
+        event.end()
+
+    @cached_property
+    def _described(self) -> BaseMap:
+        return describe(self._terrain, self._keeper)
+
+    def _pack(self, layer: str, region: int) -> BaseMapTile:
+        return pack(self._terrain, layer, region)
+
+
+# --- the side of a process without the files --------------------------------------------------------------------
 
 NEEDED = ("ground", "elevation", "classes")
 """Layers that every process needs. The prior pace follows from the ground and the vehicle's radius; the photo is to
@@ -70,10 +207,8 @@ class BaseMapCopy:
         self._missing = {layer: dict.fromkeys(range(self.grid.regions)) for layer in layers}
         self._arrays: dict[str, NDArray[Any]] = {}
         for layer in layers:
-            kind = LAYERS[layer]
-            shape = (self.grid.rows, self.grid.cols)
             # For `empty` the system allocates memory page by page, when a piece is written there.
-            self._arrays[layer] = np.empty(shape if kind.depth == 1 else (*shape, kind.depth), kind.dtype)
+            self._arrays[layer] = np.empty((*self.grid.shape, *LAYERS[layer].depth), LAYERS[layer].dtype)
 
     def missing(self, at_most: int) -> Iterator[tuple[str, list[int]]]:
         """Returns (layer, regions) still missing, up to a limit of regions per layer."""
@@ -100,15 +235,14 @@ class BaseMapCopy:
                 return False
             raise ProtocolError(f"{self._who}: unrequested: layer {tile.layer[:40]!r}, region {tile.region}")
         what = f"{self._who}: layer {tile.layer}, region {tile.region}"
-        window, kind = region_window(self.grid, tile.region), LAYERS[tile.layer]
-        width = np.dtype(kind.dtype).itemsize
-        planes = _inflated(tile.data, window.cells * kind.depth * width, what)
-        piece = np.frombuffer(planes, np.uint8).reshape(width, -1).T.tobytes()
+        window = region_window(self.grid, tile.region)
+        into = self._arrays[tile.layer][window.row0 : window.row1, window.col0 : window.col1]
+        planes = _inflated(tile.data, into.nbytes, what)
+        piece = np.frombuffer(planes, np.uint8).reshape(into.itemsize, -1).T.tobytes()
         place = tile.region * BASE_DIGEST_BYTES
         if piece_digest(piece) != self._digests[tile.layer][place : place + BASE_DIGEST_BYTES]:
             raise ProtocolError(f"{what} is not as its digest says")
-        into = self._arrays[tile.layer][window.row0 : window.row1, window.col0 : window.col1]
-        into[...] = np.frombuffer(piece, kind.dtype).reshape(into.shape)
+        into[...] = np.frombuffer(piece, into.dtype).reshape(into.shape)
         del self._missing[tile.layer][tile.region]
         return True
 
@@ -157,34 +291,33 @@ def _inflated(data: bytes, size: int, what: str) -> bytes:
     return unpacked
 
 
-@dataclass(frozen=True, slots=True)
-class Fetching:
-    """Layers to fetch, and the time limit.
-
-    terrain   digest of the run's terrain
-    within_s  gives up when so long nothing has come
-    """
-
-    terrain: str
-    cost: CostConfig
-    layers: tuple[str, ...] = NEEDED
-    within_s: float = 20.0
-
-
-def fetch_base_map(bus: Bus, wanted: Fetching, why: str, progress: Progress = no_progress) -> Terrain:
+def fetch_base_map(
+    bus: Bus,
+    terrain: str,
+    cost: CostConfig,
+    why: str,
+    layers: tuple[str, ...] = NEEDED,
+    within_s: float = 20.0,
+    progress: Progress = no_progress,
+) -> Terrain:
     """The run's terrain from any keeper that has it. Blocks; for the start of a process, on its main thread.
 
-    why  the missing part, to begin the sentence with when it fails: "there is no file ..."
+    terrain   digest of the run's terrain
+    why       the missing part, to begin the sentence with when it fails: "there is no file ..."
+    within_s  gives up when so long nothing has come
+
     Raises TerrainError if no keeper serves it, or if it is another terrain.
     """
-    patience_s = time.monotonic() + wanted.within_s
+    patience_s = time.monotonic() + within_s
     refusals: dict[str, str] = {}
     while True:
         replies = replies_to(bus, BASE_MAP, Nothing(), _ASK_TIMEOUT_S, _MOST_KEEPERS)[0]
         others = [each for each in replies if isinstance(each, BaseMap) and each.keeper not in refusals]
         for described in sorted(others, key=lambda each: each.keeper):
             try:
-                return _fetch(bus, BaseMapCopy(described, wanted.terrain, wanted.layers), wanted, progress)
+                copy = BaseMapCopy(described, terrain, layers)
+                _fetch(bus, copy, within_s, progress)
+                return copy.terrain(cost)
             except TerrainError as error:
                 log.warning("%s", error)
                 refusals[described.keeper] = str(error)
@@ -192,14 +325,15 @@ def fetch_base_map(bus: Bus, wanted: Fetching, why: str, progress: Progress = no
             break
         time.sleep(_PAUSE_S)
     why_not = "; ".join(refusals.values()) or (
-        f"no keeper in namespace {bus.namespace} answered within {wanted.within_s:g} s; start one where the file is"
+        f"no keeper in namespace {bus.namespace} answered within {within_s:g} s; start one where the file is"
     )
     raise TerrainError(f"{why}, and the base map cannot be fetched: {why_not}")
 
 
-def _fetch(bus: Bus, copy: BaseMapCopy, wanted: Fetching, progress: Progress) -> Terrain:
+def _fetch(bus: Bus, copy: BaseMapCopy, within_s: float, progress: Progress) -> None:
+    """Asks for pieces until nothing is missing. Raises TerrainError if none comes for `within_s`."""
     what = f"base map from keeper {copy.keeper}"
-    due_s = time.monotonic() + wanted.within_s
+    due_s = time.monotonic() + within_s
     false: str | None = None
     while copy.share < 1.0:
         before = copy.share
@@ -211,7 +345,7 @@ def _fetch(bus: Bus, copy: BaseMapCopy, wanted: Fetching, progress: Progress) ->
             for tile in (each for each in replies if isinstance(each, BaseMapTile)):
                 try:
                     if copy.take(tile):
-                        due_s = time.monotonic() + wanted.within_s
+                        due_s = time.monotonic() + within_s
                 except ProtocolError as error:
                     if false is None:
                         log.warning("refused a piece: %s", error)
@@ -220,6 +354,5 @@ def _fetch(bus: Bus, copy: BaseMapCopy, wanted: Fetching, progress: Progress) ->
         if copy.share == before:
             time.sleep(_PAUSE_S)
         if time.monotonic() > due_s:
-            late = f"{what}: {copy.share:.0%} came, then nothing for {wanted.within_s:g} s"
+            late = f"{what}: {copy.share:.0%} came, then nothing for {within_s:g} s"
             raise TerrainError(late if false is None else f"{late}; refused: {false}")
-    return copy.terrain(wanted.cost)

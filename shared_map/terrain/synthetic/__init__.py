@@ -1,1 +1,0 @@
-"""Made-up ground: seeded landscapes, rivers and roads."""
