@@ -65,7 +65,7 @@ def route(
     """
     from launch_scripts.commands import terrain_routes
     from launch_scripts.launcher.run_options import find_scenario
-    from launch_scripts.report.exporter import FORMATS, MISSIONS, check_target
+    from launch_scripts.report.gis_formats import FORMATS, MISSIONS, check_target
     from swarm.places import read_place
 
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png", force=force)
@@ -194,7 +194,7 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     """Serves until Ctrl-C, on an address of this machine. Raises BusError if the port is taken, or there is no
     router."""
     from launch_scripts.observe.run_observer import OutsideObserver
-    from launch_scripts.web.health_verdict import Process
+    from launch_scripts.web.health_pages import Process
     from launch_scripts.web.prometheus import MetricsEndpoint, families
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock

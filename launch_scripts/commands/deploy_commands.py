@@ -36,7 +36,7 @@ from launch_scripts.launcher.run_options import common_run_id, find_scenario, ow
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.plain_text import number_of
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
-from launch_scripts.report.exporter import check_target
+from launch_scripts.report.gis_formats import check_target
 from launch_scripts.typer_commands import command, complete_scenarios, family_app
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config import revocations

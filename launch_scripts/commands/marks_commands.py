@@ -19,8 +19,8 @@ from launch_scripts.commands.shared_options import AsJson, Force, Where
 from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import ask_learned
 from launch_scripts.plain_text import number_of
-from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_layers, write_raster
-from launch_scripts.report.run_layers import mark_layer
+from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_layers, write_raster
+from launch_scripts.report.run_gis_layers import mark_layer
 from launch_scripts.typer_commands import command, family_app
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.learned_factors import learned_kinds, name_of

@@ -128,7 +128,7 @@ def export(
     format  geojson, csv or gpx: a file per layer; gpkg or kml: one file; mcap: ROS 2 messages.
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     """
-    from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
+    from launch_scripts.report.run_gis_layers import ENDINGS, WHAT, export_run
 
     ending = "" if out is None or out.is_dir() else out.suffix.lower().removeprefix(".")
     chosen = format or (ending if ending in ENDINGS else ENDINGS[0])

@@ -193,7 +193,7 @@ def run_role(
 
 def _health_of(name: str, part: Part) -> Health:
     """Returns the health reports of the role: to its supervisor, and to probes if they have a port."""
-    from launch_scripts.web.health_verdict import Process, health_pages
+    from launch_scripts.web.health_pages import Process, health_pages
     from launch_scripts.web.http_server import Server
     from swarm.runtime.health import Health, supervisor_of
 

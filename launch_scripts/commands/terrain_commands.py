@@ -18,7 +18,7 @@ from rich.table import Table
 from launch_scripts.commands.shared_options import AsJson, Crs, Force, PresetOption, VehicleClass, duration
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.run_options import find_scenario
-from launch_scripts.report.exporter import AREAS, TIFF, check_target, write_raster
+from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, build_terrain

@@ -15,7 +15,7 @@ import typer
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report.exporter import (
+from launch_scripts.report.gis_formats import (
     COSTS,
     MISSIONS,
     Feature,

@@ -21,7 +21,7 @@ from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
-from launch_scripts.web.health_verdict import Process
+from launch_scripts.web.health_pages import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.guard import KILLED_BY
 from swarm.runtime.health import BOARD_BYTES, Board, Phase

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
 from launch_scripts.launcher.run_options import UpOptions
-from launch_scripts.web.health_verdict import Process
+from launch_scripts.web.health_pages import Process
 from swarm.errors import BusError
 from swarm.runtime.health import Health, supervisor_of
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -72,26 +71,19 @@ def buckets_of(buckets: Mapping[int, int]) -> Buckets:
     return np.array(sorted(buckets.items()), np.int64).reshape(-1, 2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """The run at one instant. `states` counts vehicles per VehicleState; totals are None until published.
+class Sample(NamedTuple):
+    """The run at one instant.
 
-    growth_ms              of the last growth of a tree, mean over targets
-    gap_excess             the histogram of certified gaps - 1 of all routes that were begun until then
-    waiting_s, standing_s  of all vehicles together until `driven_s`, as `Driven` counts them
-    driven_s               UNIX time of the last count of these; 0 before
+    shown       name of a series of the report -> its value; None until it is published
+    gap_excess  the histogram of certified gaps - 1 of all routes that were begun until then
+    at_rest_s   (waiting, standing), seconds of all vehicles together until `driven_s`, as `Driven` counts them
+    driven_s    UNIX time of the last count of these; 0 before
     """
 
-    time_s: float
-    states: tuple[int, ...]
-    captures: int | None
-    marks: int | None
-    messages_per_s: float | None
-    growth_ms: float | None
-    gap_excess: Buckets = field(default_factory=lambda: buckets_of({}))
-    waiting_s: float = 0.0
-    standing_s: float = 0.0
-    driven_s: float = 0.0
+    shown: dict[str, float | None]
+    gap_excess: Buckets
+    at_rest_s: tuple[float, float]
+    driven_s: float
 
 
 def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
@@ -107,13 +99,13 @@ def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
     return gaps
 
 
-def at_once(samples: Sequence[Sample], of: Callable[[Sample], float]) -> list[float]:
-    """Mean number of vehicles in a state since the sample before, from their summed seconds in it. A sample without
-    a new count repeats the number before: a run which ends has none."""
+def at_once(samples: Sequence[Sample], state: int) -> list[float]:
+    """Mean number of vehicles in a state (of `Sample.at_rest_s`) since the sample before, from their summed seconds
+    in it. A sample without a new count repeats the number before: a run which ends has none."""
     counts = [0.0] * min(len(samples), 1)
     for early, late in itertools.pairwise(samples):
-        passed_s = late.driven_s - early.driven_s
-        counts.append(max(of(late) - of(early), 0.0) / passed_s if passed_s > 0 else counts[-1])
+        passed_s, rested_s = late.driven_s - early.driven_s, late.at_rest_s[state] - early.at_rest_s[state]
+        counts.append(max(rested_s, 0.0) / passed_s if passed_s > 0 else counts[-1])
     return counts
 
 

@@ -26,24 +26,11 @@ from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
 from swarm.runtime.operator import replies_to
+from swarm.wire import topics as wire_topics
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.map_data import MarkSet, MarksRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import (
-    FLEET,
-    FOLLOWED,
-    GOAL_STATES,
-    LEAD,
-    MARKS,
-    NOTE,
-    OBSTACLE,
-    ORDERS,
-    POSE,
-    RUN,
-    STATS,
-    STATUS,
-    Topic,
-)
+from swarm.wire.topics import Topic
 from swarm.wire.versions import are_neighbours
 
 TRACK_S = 0.5
@@ -51,18 +38,23 @@ TRACK_S = 0.5
 ROUTES_S = 2.0
 """The newest route that a vehicle begins within this time is kept."""
 HEARD: Mapping[Topic, float] = {
-    STATS: 0.0,
-    STATUS: 0.0,
-    POSE: 0.0,
-    LEAD: 0.5,
-    ORDERS: 0.5,
-    GOAL_STATES: 0.5,
-    OBSTACLE: 0.0,
-    FLEET: 0.4,
+    wire_topics.STATS: 0.0,
+    wire_topics.STATUS: 0.0,
+    wire_topics.POSE: 0.0,
+    wire_topics.LEAD: 0.5,
+    wire_topics.ORDERS: 0.5,
+    wire_topics.GOAL_STATES: 0.5,
+    wire_topics.OBSTACLE: 0.0,
+    wire_topics.FLEET: 0.4,
 }
 """The topics of a `LatestState`, and how often the newest of each key is taken, in seconds; 0 for all that comes.
 Places are sampled every 0.5 s, and each sample must find newer ones: else all vehicles seem to stand at times."""
-RECORDED: Mapping[Topic, float] = {**HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S}
+RECORDED: Mapping[Topic, float] = {
+    **HEARD,
+    wire_topics.NOTE: 0.0,
+    wire_topics.MARKS: TRACK_S,
+    wire_topics.FOLLOWED: ROUTES_S,
+}
 """The topics of a `Recorder`, likewise."""
 
 _GONE, _RUN = "observer-gone", "observer-run"
@@ -117,18 +109,18 @@ class RunObserver:
 
     def keep_samples_of(self, role: str, id: str) -> None:
         """Has the figures and notes of one process kept until they are due, and asks for the last of them."""
-        for topic in (STATS, NOTE):
+        for topic in (wire_topics.STATS, wire_topics.NOTE):
             self._bus.collect(topic, role=role, id=id)
         self.ask_gone(role=role, id=id)
 
     def forget(self, role: str, id: str) -> None:
         """Ends `keep_samples_of`."""
-        for topic in (STATS, NOTE):
+        for topic in (wire_topics.STATS, wire_topics.NOTE):
             self._bus.unsubscribe(topic, role=role, id=id)
 
     def ask_gone(self, **of: str) -> None:
         """Asks what processes that are gone have said last; `of` names one of them."""
-        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_TIMEOUT_S, **of)
+        self._bus.ask(wire_topics.STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_TIMEOUT_S, **of)
 
     def pace(self, topic: Topic, every_s: float, now_ns: int) -> None:
         """Takes a topic at this interval from now on."""
@@ -198,7 +190,7 @@ class OutsideObserver(RunObserver):
         """Queries the processes of the run, if it is time to. Call it often."""
         if now_ns >= self._ask_due_ns and not self._asking:
             self._asking = True
-            self._bus.ask(RUN, Nothing(), self._post, tag=_RUN, timeout_s=_ASK_TIMEOUT_S)
+            self._bus.ask(wire_topics.RUN, Nothing(), self._post, tag=_RUN, timeout_s=_ASK_TIMEOUT_S)
 
     def listen(self, clock: Clock, for_s: float) -> None:
         """Takes in what arrives within some seconds, and what came before."""
@@ -301,7 +293,7 @@ class OutsideObserver(RunObserver):
 
 def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
     """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
-    replies, _ = replies_to(bus, RUN, Nothing(), timeout_s)
+    replies, _ = replies_to(bus, wire_topics.RUN, Nothing(), timeout_s)
     return [each for each in replies if isinstance(each, RunInfo) and (routers or each.run_id != NO_RUN)]
 
 
@@ -322,7 +314,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
     where  names the swarm in errors
     """
     beyond = beyond_tile(frame_of_run(bus, where).grid)
-    replies, failure = replies_to(bus, MARKS, MarksRequest(tiles=[beyond]), _LEARNED_TIMEOUT_S)
+    replies, failure = replies_to(bus, wire_topics.MARKS, MarksRequest(tiles=[beyond]), _LEARNED_TIMEOUT_S)
     found: dict[str, MarkSet] = {}
     for word in replies:
         if isinstance(word, MarkSet) and word.tile == beyond:

@@ -153,20 +153,15 @@ class Recorder:
         self._sample_due_ns = now_ns + _SAMPLE_NS
         state = self.summary(now_ns)
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
-        self.samples.add(
-            Sample(
-                time_s=state.elapsed_s,
-                states=tuple(state.states.values()),
-                captures=state.captures,
-                marks=state.marks,
-                messages_per_s=state.messages_per_s,
-                growth_ms=_mean(line.growth_ms for line in state.targets if line.growth_ms is not None),
-                gap_excess=history.buckets_of(self.observed.histogram("followed_gap_excess").buckets),
-                waiting_s=waiting_s,
-                standing_s=standing_s,
-                driven_s=(self.driven.at_ns or 0) / NS_PER_S,
-            )
-        )
+        shown = {
+            "t_s": state.elapsed_s,
+            **{name: getattr(state, name) for name in ("captures", "marks", "messages_per_s")},
+            **state.states,
+            "growth_ms_mean": _mean(line.growth_ms for line in state.targets if line.growth_ms is not None),
+        }
+        gap_excess = history.buckets_of(self.observed.histogram("followed_gap_excess").buckets)
+        driven_s = (self.driven.at_ns or 0) / NS_PER_S
+        self.samples.add(Sample(shown, gap_excess, (waiting_s, standing_s), driven_s))
 
     def report(
         self,
@@ -183,7 +178,7 @@ class Recorder:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
         # Later messages are those of a run that ends: without trackers there is no alarm.
         state = self.summary(observed.moved_ns or observed.last_ns or 0)
-        rates = [sample.messages_per_s for sample in self.samples.all() if sample.messages_per_s is not None]
+        rates = [rate for sample in self.samples.all() if (rate := sample.shown["messages_per_s"]) is not None]
         fields = {
             "scenario": self.scenario.name,
             "run_id": run_id,
@@ -214,17 +209,13 @@ class Recorder:
         """The run over time, at about `_POINTS` instants at most: lists with one value per `t_s`."""
         samples = self.samples.all()
         samples = samples[:: max(1, -(-len(samples) // _POINTS))]
-        names = ("captures", "marks", "messages_per_s")
         gaps = history.certified_gaps(samples)
         fields: dict[str, list[Any]] = {
-            "t_s": [sample.time_s for sample in samples],
-            **{name: [getattr(sample, name) for sample in samples] for name in names},
-            **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
+            **{name: [sample.shown[name] for sample in samples] for name in (samples[0].shown if samples else ())},
             **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
             "routes_begun": [gap["routes"] for gap in gaps],
-            "waiting_at_once": history.at_once(samples, lambda sample: sample.waiting_s),
-            "standing_at_once": history.at_once(samples, lambda sample: sample.standing_s),
-            "growth_ms_mean": [sample.growth_ms for sample in samples],
+            "waiting_at_once": history.at_once(samples, 0),
+            "standing_at_once": history.at_once(samples, 1),
         }
         return {name: [_rounded(value) for value in values] for name, values in fields.items()}
 

@@ -101,25 +101,22 @@ def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str 
 def registered() -> list[KnownRun]:
     """The runs that run, then those whose folders are there, each the newest first. Removes the entry of a launcher
     that has ended, if its folder was removed or another entry names it."""
-    found: dict[Path, list[_Entry]] = {}
-    pids: dict[Path, list[int]] = {}
+    found: dict[Path, list[tuple[_Entry, bool]]] = {}
     for file, entry in _entries():
         folder, is_running = Path(entry.folder), _runs(entry)
         with suppress(OSError, ValueError):  # a folder that cannot be looked at
             if not is_running and (folder in found or not folder.is_dir()):
                 file.unlink()
             elif folder.is_absolute():
-                found.setdefault(folder, []).append(entry)
-                pids.setdefault(folder, []).extend([entry.pid] * is_running)
-    runs = [
-        KnownRun(
-            folder,
-            tuple(pids[folder]),
-            max(each.web_port for each in entries),
-            any(each.is_whole for each in entries),
+                found.setdefault(folder, []).append((entry, is_running))
+    runs = []
+    for folder, entries in found.items():
+        launchers = tuple(entry.pid for entry, is_running in entries if is_running)
+        web_port, is_whole = (
+            max(entry.web_port for entry, _ in entries),
+            any(entry.is_whole for entry, _ in entries),
         )
-        for folder, entries in found.items()
-    ]
+        runs.append(KnownRun(folder, launchers, web_port, is_whole))
     return sorted(runs, key=lambda run: not run.launchers)
 
 

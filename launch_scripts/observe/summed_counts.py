@@ -14,18 +14,8 @@ from typing import TypeVar
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import job_of
-from swarm.runtime.stats import (
-    CPU_S,
-    GAPS_OF,
-    GAPS_TO,
-    MESSAGES_PER_S,
-    RESTARTS,
-    RSS_BYTES,
-    UNPROVEN_OF,
-    UNPROVEN_TO,
-    Histogram,
-    merged,
-)
+from swarm.runtime import stats as counters
+from swarm.runtime.stats import Histogram, merged
 from swarm.wire.messages.processes import Stats
 
 LONG_SILENCE_NS = 10 * NS_PER_S
@@ -164,11 +154,11 @@ class Counts:
                 id=id,
                 alive=(role, id) in up,
                 up_s=max(now.stamp_ns - now.incarnation, 0) / NS_PER_S,
-                cpu_percent=_rate(before, now, "gauges", CPU_S, 100.0),
-                rss_bytes=now.gauges.get(RSS_BYTES),
+                cpu_percent=_rate(before, now, "gauges", counters.CPU_S, 100.0),
+                rss_bytes=now.gauges.get(counters.RSS_BYTES),
                 late_per_s=_rate(before, now, "counts", "ticks_late"),
-                messages_per_s=now.gauges.get(MESSAGES_PER_S),
-                restarts=round(now.gauges.get(RESTARTS, 0.0)),
+                messages_per_s=now.gauges.get(counters.MESSAGES_PER_S),
+                restarts=round(now.gauges.get(counters.RESTARTS, 0.0)),
             )
             for (role, id), now in self.newest().items()
             for before in [self._before.get((role, id))]
@@ -219,12 +209,12 @@ def certified_gap(counted: Counts) -> CertifiedGap:
 
 def gaps_to(counted: Counts) -> dict[str, CertifiedGap]:
     """The gap per target, of the routes to it."""
-    return _gaps(counted.histograms_by(GAPS_TO), counted.counts_by(UNPROVEN_TO))
+    return _gaps(counted.histograms_by(counters.GAPS_TO), counted.counts_by(counters.UNPROVEN_TO))
 
 
 def gaps_of(counted: Counts) -> dict[str, CertifiedGap]:
     """The gap per vehicle, of the routes which it began."""
-    return _gaps(counted.histograms_by(GAPS_OF), counted.counts_by(UNPROVEN_OF))
+    return _gaps(counted.histograms_by(counters.GAPS_OF), counted.counts_by(counters.UNPROVEN_OF))
 
 
 def _gaps(proven: Mapping[str, Histogram], unproven: Mapping[str, int]) -> dict[str, CertifiedGap]:

@@ -23,10 +23,10 @@ from launch_scripts.observe.palette import colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.report.npz_files import TRACKS_FILE, read_tracks
 from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, headline
-from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
+from launch_scripts.report.report_json import TABLES, flat
 from launch_scripts.report.run_picture import GROUND_FILE, LEARNED_FILE, QUICKER, SLOWER, draw_map, size_km
-from launch_scripts.report.write_report import TABLES, flat
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.errors import StoreError

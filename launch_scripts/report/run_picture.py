@@ -24,9 +24,9 @@ from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
+from launch_scripts.report.npz_files import RunTracks, Track
 from launch_scripts.report.plots_and_cards import PLOTS, cards, draw_plot, halo, headline, saved
-from launch_scripts.report.run_arrays import RunTracks, Track
-from launch_scripts.report.run_layers import groups_of
+from launch_scripts.report.run_gis_layers import groups_of
 from shared_map.array_files import Floats
 from shared_map.learning.learned_factors import keys_of
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
@@ -294,20 +294,15 @@ _PLOTTED = ("certified gap, p95", "messages/s, mean")
 def save_picture(path: Path, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
     """Draws the run and writes it as PNG."""
     with saved(path, (WIDTH_IN, HEIGHT_IN), DPI) as figure:
-        draw(figure, ground, tracks, report)
-
-
-def draw(figure: Figure, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
-    """Draws the run on a figure of the size of the picture."""
-    _draw_head(figure, report)
-    axes = figure.add_axes(_MAP)
-    draw_map(axes, tracks, report)
-    draw_border(axes, ground, tracks)
-    left, width, top, bottom, gap = 0.655, 0.297, 0.818, 0.058, 0.052
-    height = (top - bottom - gap * (len(_BESIDE) - 1)) / len(_BESIDE)
-    for n, name in enumerate(_BESIDE):
-        beside = figure.add_axes((left, top - height - n * (height + gap), width, height))
-        draw_plot(beside, next(plot for plot in PLOTS if plot.name == name), report)
+        _draw_head(figure, report)
+        axes = figure.add_axes(_MAP)
+        draw_map(axes, tracks, report)
+        draw_border(axes, ground, tracks)
+        left, width, top, bottom, gap = 0.655, 0.297, 0.818, 0.058, 0.052
+        height = (top - bottom - gap * (len(_BESIDE) - 1)) / len(_BESIDE)
+        for n, name in enumerate(_BESIDE):
+            beside = figure.add_axes((left, top - height - n * (height + gap), width, height))
+            draw_plot(beside, next(plot for plot in PLOTS if plot.name == name), report)
 
 
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@
   and Origin are this machine is answered, with any method: a page of another site can make a browser connect to any
   loopback port, and can have its own name lead there (DNS rebinding). Connections are bounded in number and time.
 - `live_page`: the files of rerun's web viewer, and the stream behind them.
-- `health_verdict`: from what processes say of themselves to the answer that `health_probe` gets.
+- `health_pages`: the pages of health, made from what processes say of themselves; `health_probe` asks for one.
 - `prometheus`: what a run has counted, as metric families of Prometheus.
 """
 

@@ -26,7 +26,7 @@ from prometheus_client.registry import Collector
 
 from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web import LOOPBACK, Reply
-from launch_scripts.web.health_verdict import Process, health_pages
+from launch_scripts.web.health_pages import Process, health_pages
 from launch_scripts.web.http_server import Server
 from shared_map.keeper.service import THROTTLED
 from swarm.clock import NS_PER_S

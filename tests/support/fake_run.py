@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from launch_scripts.observe.run_recorder import Recorder
-from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.report.report_json import make_report, write_report
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.simulated_process import EPOCH_NS as BEGAN_NS
 from shared_map.array_files import Floats

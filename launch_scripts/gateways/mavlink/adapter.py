@@ -6,17 +6,9 @@ from contextlib import suppress
 
 from msgspec import Struct
 
+from launch_scripts.gateways.mavlink import guidance
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import Arming, Kind, kind_of
-from launch_scripts.gateways.mavlink.guidance import (
-    Guide,
-    Missions,
-    Way,
-    Wishes,
-    arming_of,
-    flies,
-    guide_of,
-)
 from swarm.client import ConfigError, Frame
 from swarm.client.terrain_frame import Point
 from swarm.clock import NS_PER_S
@@ -77,7 +69,7 @@ class Adapter:
     kind  its type and make, from its first heartbeat; None before
     """
 
-    def __init__(self, frame: Frame, wishes: Wishes) -> None:
+    def __init__(self, frame: Frame, wishes: guidance.Wishes) -> None:
         self.kind: Kind | None = None
         self._frame = frame
         self._wishes = wishes
@@ -90,9 +82,9 @@ class Adapter:
         self._there = False
         self._reported: codec.Position | None = None
         """Newest report to the swarm; None while the vehicle has no position for it."""
-        self._way: Way = ()
+        self._way: guidance.Way = ()
         self._swarm_up = True
-        self._guide: Guide | None = None
+        self._guide: guidance.Guide | None = None
         """None: the vehicle is not driven."""
         self._arming: Arming | None = None
         """None: another controller arms the vehicle and sets its mode."""
@@ -115,10 +107,10 @@ class Adapter:
                 self._tells.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
                 self._tells += self._arming.on_command_answer(message)
-            case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, Missions):
+            case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, guidance.Missions):
                 self._guide.on_mission_message(message)
 
-    def hear_way(self, way: Way) -> None:
+    def hear_way(self, way: guidance.Way) -> None:
         """Takes in a route to the target that is followed."""
         self._way = way
 
@@ -135,11 +127,11 @@ class Adapter:
             self.kind = kind
             armed = "armed" if beat.armed else "disarmed"
             self._tells.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
-            guide = None if self._wishes.target is None else guide_of(kind, self._frame, self._wishes)
+            guide = None if self._wishes.target is None else guidance.guide_of(kind, self._frame, self._wishes)
             if isinstance(guide, str):
                 self._tells.append(f"the vehicle is not driven: {guide}")
             elif guide is not None:
-                self._guide, self._arming = guide, arming_of(kind, self._wishes)
+                self._guide, self._arming = guide, guidance.arming_of(kind, self._wishes)
         if kind != self.kind:
             self._tells.append("another kind of vehicle speaks under the same number: it is ignored")
             return
@@ -216,7 +208,7 @@ class Adapter:
             self._guide.forget()
             self._way = ()
             actions.append(Unfollow())
-        if self._at is None or (self.kind is not None and flies(self.kind, self._wishes.altitude_m)):
+        if self._at is None or (self.kind is not None and guidance.flies(self.kind, self._wishes.altitude_m)):
             actions.append(Withdraw())
         else:
             # Its destination is then unknown.

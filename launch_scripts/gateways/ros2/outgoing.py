@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2 import map_messages, ros_messages
 from launch_scripts.gateways.ros2.gateway_settings import Settings
-from launch_scripts.gateways.ros2.map_feed import MapFeed
+from launch_scripts.gateways.ros2.map_messages import MapFeed
 from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place, RosMap, RosMessages, ros_name
 from launch_scripts.gateways.ros2.ros_types import RosTypes
 from launch_scripts.gateways.ros2.topic_table import TARGET, VEHICLE, TopicRow

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
@@ -19,14 +20,18 @@ from zenoh import ext
 from zenoh.handlers import Callback
 
 from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, NodeName, Qos, read_token
-from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, REQUEST, RESPONSE, RosTypes
-from swarm.errors import BusError, ProtocolError
+from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
+from swarm.clock import NS_PER_S
+from swarm.errors import BusError, ProtocolError, SwarmError
 
 log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 0.5
 """A latched message that was lost is missed by its subscribers this long after it was put. Nothing is sent while
 nothing new is put."""
+_MOST_BYTES = 1 << 14
+"""A pose, a goal or a polygon of 256 corners is smaller."""
+Failed = Callable[[str], None]
 
 
 class Publisher:
@@ -46,37 +51,6 @@ class Publisher:
             self._put(content, attachment=attachment.packed())
         except zenoh.ZError as error:
             raise BusError(f"{self.endpoint.topic} is not put: {error}") from error
-
-
-class Newest:
-    """Last message of a topic that was not taken yet. Made by `Node.newest`."""
-
-    def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
-        self.endpoint = endpoint
-        self._node, self._most_bytes = node, most_bytes
-        self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
-
-    def keep(self, sample: zenoh.Sample) -> None:
-        """On Zenoh's threads: keeps the bytes as they are."""
-        self._waiting.append(sample)
-
-    def take(self) -> Any | None:
-        """The newest message, once; None if none has come, or it is none of its type."""
-        try:
-            payload = self._waiting.pop().payload
-        except IndexError:
-            return None
-        try:
-            if len(payload) > self._most_bytes:
-                raise ProtocolError(f"message of {len(payload)} bytes, expected at most {self._most_bytes}")
-            return self._node.types.unpack(payload.to_bytes(), self.endpoint.type_name)
-        except ProtocolError as error:
-            self._node.dropped(self.endpoint.topic, error)
-            return None
-
-    def close(self) -> None:
-        """Hears no more."""
-        self._node.remove(self.endpoint)
 
 
 class Node:
@@ -124,28 +98,35 @@ class Node:
         self._declare(endpoint, made)
         return Publisher(self.types, endpoint, made.put)
 
-    def newest(
-        self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT, most_bytes: int = LARGEST_MESSAGE_BYTES
-    ) -> Newest:
-        """Subscribes, and keeps only what came last until it is taken: a flood costs no more than one message."""
+    def listen(self, topic: str, type_name: str, qos: Qos, keep: Callable[[zenoh.Sample], object]) -> Endpoint:
+        """Subscribes. `keep` is called with each sample on Zenoh's threads; `read` makes a message of one."""
         endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
-        newest = Newest(self, endpoint, most_bytes)
         made: Any
         # This node ignores its own messages: a topic may go both ways.
         if qos is Qos.LATCHED:
             made = ext.declare_advanced_subscriber(
                 self._session,
                 endpoint.key,
-                newest.keep,
+                keep,
                 allowed_origin=zenoh.Locality.REMOTE,
                 history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
                 recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 subscriber_detection=True,
             )
         else:
-            made = self._session.declare_subscriber(endpoint.key, newest.keep, allowed_origin=zenoh.Locality.REMOTE)
+            made = self._session.declare_subscriber(endpoint.key, keep, allowed_origin=zenoh.Locality.REMOTE)
         self._declare(endpoint, made)
-        return newest
+        return endpoint
+
+    def read(self, endpoint: Endpoint, sample: zenoh.Sample, most_bytes: int) -> Any | None:
+        """The message of a sample; None if it is none of its type, or larger than allowed."""
+        try:
+            if len(sample.payload) > most_bytes:
+                raise ProtocolError(f"message of {len(sample.payload)} bytes, expected at most {most_bytes}")
+            return self.types.unpack(sample.payload.to_bytes(), endpoint.type_name)
+        except ProtocolError as error:
+            self.dropped(endpoint.topic, error)
+            return None
 
     def serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
         """Answers a service.
@@ -222,6 +203,116 @@ class Node:
         """Counts messages of another type."""
         self.counts["dropped"] += 1
         log.debug("%s: %s", topic, error)
+
+
+# --- what no flood from ROS fills: the newest message of a topic, and a bounded queue -----------------------------
+
+
+class WorkQueue:
+    """Does work that may wait, on threads of its own.
+
+    most  the pieces that may wait, or are at work
+    """
+
+    def __init__(self, name: str, threads: int, most: int) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
+        self._room = threading.Semaphore(most)
+
+    def give(self, what: str, work: Callable[[], None], failed: Failed) -> bool:
+        """Does it when its turn comes; `failed` is called with a sentence if it raises, or the queue is closed.
+        Returns False, and does nothing, if too much waits already."""
+        if not self._room.acquire(blocking=False):
+            return False
+
+        def end(done: Future[None]) -> None:
+            self._room.release()
+            if done.cancelled():
+                failed("the gateway ends")
+            elif isinstance(error := done.exception(), SwarmError):
+                failed(str(error))
+            elif error is not None:
+                log.error("%s failed", what, exc_info=error)
+                failed(f"{what} failed: see the gateway's log")
+
+        try:
+            self._pool.submit(work).add_done_callback(end)
+        except RuntimeError:  # it is closed
+            failed("the gateway ends")
+        return True
+
+    def close(self) -> None:
+        """Takes nothing more, and waits for nothing."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Input:
+    """The newest message of a topic, taken at ticks and at most at this interval.
+
+    take   is called with it, and the time by time.monotonic_ns. Raises SwarmError on a refused message
+    queue  `take` may wait, and is called by its thread; None: it is called by `tick`
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        type_name: str,
+        hz: float,
+        take: Callable[[Any, int], None],
+        *,
+        qos: Qos = Qos.DEFAULT,
+        most_bytes: int = _MOST_BYTES,
+        queue: WorkQueue | None = None,
+    ) -> None:
+        self.refused = 0
+        self._node, self._take, self._most_bytes, self._queue = node, take, most_bytes, queue
+        self._period_ns = int(NS_PER_S / hz)
+        self._due_ns = 0
+        self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
+        self._held: Any = None
+        """Message for which the queue had no room."""
+        self._said: str | None = None
+        self.endpoint = node.listen(topic, type_name, qos, self._waiting.append)
+
+    def tick(self, now_ns: int) -> None:
+        """Processes received messages, if that is due."""
+        if now_ns < self._due_ns:
+            return
+        message = self._newest() or self._held
+        if message is None:
+            return
+        self._due_ns, self._held = now_ns + self._period_ns, None
+        if self._queue is not None:
+            work = f"a message of {self.endpoint.topic}", lambda: self._try(message, now_ns), self.refuse
+            self._held = None if self._queue.give(*work) else message
+            return
+        try:
+            self._try(message, now_ns)
+        except SwarmError as error:
+            self.refuse(str(error))
+
+    def refuse(self, sentence: str) -> None:
+        """Says why a message is refused; what begins in the same way is said once, until one is not refused."""
+        self.refused += 1
+        kind = sentence.partition(" is ")[0]
+        if kind != self._said:
+            self._said = kind
+            log.warning("topic %s: %s", self.endpoint.topic, sentence)
+
+    def close(self) -> None:
+        """Hears no more."""
+        self._node.remove(self.endpoint)
+
+    def _newest(self) -> Any | None:
+        """The newest message, once; None if none has come. Only this one is decoded."""
+        return self._node.read(self.endpoint, self._waiting.pop(), self._most_bytes) if self._waiting else None
+
+    def _try(self, message: Any, now_ns: int) -> None:
+        self._take(message, now_ns)
+        self._said = None
+
+
+# --- the session --------------------------------------------------------------------------------------------------
 
 
 def open_ros(endpoint: str, timeout_s: float = 10.0) -> zenoh.Session:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
-from launch_scripts.gateways.ros2.map_feed import MapFeed
+from launch_scripts.gateways.ros2.map_messages import MapFeed
 from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap

@@ -26,8 +26,8 @@ from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, Sight, Sti
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web import HEALTHY, READY, Reply
+from launch_scripts.web.health_pages import Process, health_pages, verdict
 from launch_scripts.web.health_probe import ask, fast
-from launch_scripts.web.health_verdict import Process, health_pages, verdict
 from launch_scripts.web.http_server import MOST_CONNECTIONS, Server, refusal
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals

@@ -23,9 +23,9 @@ from support.map_strategies import set_of
 
 from launch_scripts.observe.history import BegunRoute, tracks_of
 from launch_scripts.observe.run_recorder import Recorder
-from launch_scripts.report.exporter import in_degrees, write_layers
-from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
-from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
+from launch_scripts.report.gis_formats import in_degrees, write_layers
+from launch_scripts.report.npz_files import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace

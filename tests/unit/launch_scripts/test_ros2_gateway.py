@@ -17,8 +17,7 @@ from support.effort import few
 from support.ros_messages import path
 
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
-from launch_scripts.gateways.ros2.map_feed import MapFeed
-from launch_scripts.gateways.ros2.map_messages import corners
+from launch_scripts.gateways.ros2.map_messages import MapFeed, corners
 from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put
 from launch_scripts.gateways.ros2.rmw import NO_HASH, Endpoint, Kind, NodeName, PeerWatch, Qos
 from launch_scripts.gateways.ros2.ros_messages import (

@@ -27,8 +27,8 @@ from launch_scripts.gateways.ros2.incoming.ros_places import (
     corners_of,
     robot_place,
 )
-from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
+from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError

@@ -13,9 +13,9 @@ from support.swarm_model import SwarmModel
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.incoming.robot import Robot
-from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
+from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.client import Route
 from swarm.clock import NS_PER_S

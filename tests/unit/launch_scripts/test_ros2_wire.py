@@ -1,6 +1,9 @@
 """The gateway's wire format as ROS 2 peers expect it: keys, tokens, attachments, hashes, CDR."""
 
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
+from itertools import count
 from types import SimpleNamespace
 from typing import Any, get_args
 
@@ -10,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from launch_scripts.gateways.ros2 import rmw
-from launch_scripts.gateways.ros2.ros_node import Newest
+from launch_scripts.gateways.ros2.ros_node import Input, Node
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.errors import ProtocolError
 
@@ -117,12 +120,16 @@ def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, n
 
 def test_the_newest_message_waits_until_somebody_asks_and_is_taken_once() -> None:
     types, name = types_of("jazzy"), "std_msgs/msg/String"
+    endpoint = SimpleNamespace(topic="/said", type_name=name)
+    kept: list[Callable[[Any], None]] = []
     node: Any = SimpleNamespace(types=types, dropped=lambda topic, error: None)
-    newest = Newest(node, SimpleNamespace(topic="/said", type_name=name), 100)  # type: ignore[arg-type]
-    for word in ("old", "new"):
-        content = zenoh.ZBytes(types.pack(types.make(name, data=word), name))
-        newest.keep(SimpleNamespace(payload=content))  # type: ignore[arg-type]
-    assert newest.take().data == "new"  # type: ignore[union-attr]
-    assert newest.take() is None
-    newest.keep(SimpleNamespace(payload=zenoh.ZBytes(bytes(200))))  # type: ignore[arg-type]
-    assert newest.take() is None, "more bytes than a message may have"
+    node.listen = lambda topic, type_name, qos, keep: kept.append(keep) or endpoint
+    node.read = partial(Node.read, node)
+    taken: list[str] = []
+    heard = Input(node, "/said", name, 1e9, lambda message, _: taken.append(message.data), most_bytes=100)
+    now_ns = count()
+    for data, ticks in (("old", 0), ("new", 2), ("x" * 200, 1)):
+        kept[0](SimpleNamespace(payload=zenoh.ZBytes(types.pack(types.make(name, data=data), name))))
+        for _ in range(ticks):
+            heard.tick(next(now_ns))
+    assert taken == ["new"], "the older one, one taken twice, or more bytes than a message may have"

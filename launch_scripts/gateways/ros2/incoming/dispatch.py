@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.robot import Robot, RouteQuestions
+from launch_scripts.gateways.ros2.incoming.robot import MOST_ASKED, ROUTE_THREADS, Robot
 from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, closed_cells, corners_of
-from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
-from launch_scripts.gateways.ros2.ros_node import Node
+from launch_scripts.gateways.ros2.ros_node import Input, Node, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
 from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, VEHICLE_GOAL, ZONE
 from launch_scripts.plain_text import number_of
@@ -64,7 +63,7 @@ class Incoming:
         self._map = map or RosMap(swarm.frame.grid)
         self._messages = RosMessages(node.types, self._map)
         self._reader = FrameReader(self._map)
-        self._routes = RouteQuestions(swarm)
+        self._routes = WorkQueue("ros2-routes", ROUTE_THREADS, MOST_ASKED)
         self._orders = WorkQueue("ros2-orders", 1, _MOST_ORDERS)
         """An order waits until it is obeyed, and the next one for it."""
         self._robots: dict[str, Robot] = {}

@@ -12,10 +12,9 @@ from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
 from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, Place, Track
-from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages
-from launch_scripts.gateways.ros2.ros_node import Node, Publisher
+from launch_scripts.gateways.ros2.ros_node import Input, Node, Publisher, WorkQueue
 from launch_scripts.gateways.ros2.topic_table import POSE_TYPES, ROBOT
 from swarm.client import BusError, ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
 from swarm.clock import NS_PER_S
@@ -24,8 +23,8 @@ log = logging.getLogger(__name__)
 
 _PATIENCE_S = 5.0
 """A planner that starts, or grows the tree of a new goal, answers within this time on the demo's terrain."""
-_MOST_ASKED = 64
-_THREADS = 16
+MOST_ASKED = 64
+ROUTE_THREADS = 16
 """A route takes milliseconds; only one whose planner is busy or missing takes as long as `_PATIENCE_S`."""
 Answer = Callable[[Route | str], None]
 """Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
@@ -37,35 +36,11 @@ _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
 
 
-class RouteQuestions:
-    """Questions for routes, to a target or to any place: asked on threads of their own, answered once."""
-
-    def __init__(self, swarm: Swarm) -> None:
-        self._swarm = swarm
-        self._queue = WorkQueue("ros2-routes", _THREADS, _MOST_ASKED)
-        self.close = self._queue.close
-
-    def ask(self, goal: Place | str, start: Place, vehicle_class: str, answer: Answer) -> None:
-        """Finds the route to a target, wherever it is, or to a place."""
-
-        def find() -> None:
-            if isinstance(goal, str):
-                asked = self._swarm.route_soon(
-                    goal, start.x_m, start.y_m, vehicle_class=vehicle_class, timeout_s=_PATIENCE_S
-                )
-                answer(asked.result())
-            else:
-                ends = (start.x_m, start.y_m), (goal.x_m, goal.y_m)
-                answer(self._swarm.route(*ends, vehicle_class=vehicle_class, timeout_s=_PATIENCE_S))
-
-        if not self._queue.give("a question for a route", find, answer):
-            answer(f"{_MOST_ASKED} questions wait already")
-
-
 class Robot:
     """Made when a robot is found, closed when it has left. One thread calls `tick`, and owns all state; what
     answers on others is posted to it.
 
+    routes    asks for routes on its threads, for all robots
     topic     where it says where it is
     is_taken  whether a vehicle of the swarm's own is called so in ROS
     """
@@ -76,7 +51,7 @@ class Robot:
         robots: Robots,
         node: Node,
         swarm: Swarm,
-        routes: RouteQuestions,
+        routes: WorkQueue,
         messages: RosMessages,
         is_taken: Callable[[str], bool] = lambda name: False,
     ) -> None:
@@ -235,9 +210,23 @@ class Robot:
             start = self._start_of(request.start)
             what = "goal"
             goal = _target_frame(request.goal) or self._reader.pose(request.goal.header, request.goal.pose)
-            self._routes.ask(goal, start, self._robots.vehicle_class, answer)
+            self._find_route(goal, start, answer)
         except ConfigError as error:
             answer(f"{what}: {error}")
+
+    def _find_route(self, goal: Place | str, start: Place, answer: Answer) -> None:
+        """Asks for the route to a target, wherever it is, or to a place."""
+        swarm = self._swarm
+        how: dict[str, Any] = {"vehicle_class": self._robots.vehicle_class, "timeout_s": _PATIENCE_S}
+
+        def find() -> None:
+            if isinstance(goal, str):
+                answer(swarm.route_soon(goal, start.x_m, start.y_m, **how).result())
+            else:
+                answer(swarm.route((start.x_m, start.y_m), (goal.x_m, goal.y_m), **how))
+
+        if not self._routes.give("a question for a route", find, answer):
+            answer(f"{MOST_ASKED} questions wait already")
 
     def _start_of(self, start: Any) -> Place:
         """Returns the start of a plan: the stated one, or without a frame the position of the robot. Raises

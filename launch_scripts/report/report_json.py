@@ -7,9 +7,8 @@ import importlib.metadata
 import io
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.run_folder import REPORT_FILE, ended
 from launch_scripts.observe.run_recorder import Recorder
-from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
+from launch_scripts.report.npz_files import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
@@ -69,34 +68,23 @@ def write_report(
     truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     """
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
-    # matplotlib takes a moment
-    from launch_scripts.report.run_picture import (
-        GROUND_FILE,
-        LEARNED_FILE,
-        ground_picture,
-        learned_pixels,
-    )
+    from launch_scripts.report import run_page, run_picture  # matplotlib takes a moment
 
-    tracks = packed_tracks(recorder)
-    ground = ground_picture(terrain, recorder.scenario, truth)
+    tracks, factors = packed_tracks(recorder), factors_in(recorder.observed.learned_words())
+    ground = run_picture.ground_picture(terrain, recorder.scenario, truth)
     report = {**report, "ground_shows": ground.drawn}
-    contents: dict[str, Callable[[], bytes]] = {
-        REPORT_FILE: lambda: json.dumps(report, indent=1, allow_nan=False).encode() + b"\n",
-        **{file: partial(csv_of, section, report) for section, (file, _) in TABLES.items()},
-        TRACKS_FILE: lambda: tracks,
-        GROUND_FILE: lambda: image_bytes(ground.pixels, "WEBP"),
-        GROUND_PACE_FILE: lambda: packed_ground(terrain, ground.level),
-    }
-    factors = factors_in(recorder.observed.learned_words())
+    write_file(folder / REPORT_FILE, json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    for section, (file, _) in TABLES.items():
+        write_file(folder / file, csv_of(section, report))
+    write_file(folder / TRACKS_FILE, tracks)
+    write_file(folder / run_picture.GROUND_FILE, image_bytes(ground.pixels, "WEBP"))
+    write_file(folder / GROUND_PACE_FILE, packed_ground(terrain, ground.level))
     if (factors != 1).any():
-        contents[LEARNED_FILE] = lambda: image_bytes(learned_pixels(terrain, factors), "PNG")
-    for name, content in contents.items():
-        write_file(folder / name, content())
-    from launch_scripts.report.run_page import write_page
-    from launch_scripts.report.run_picture import save_picture
-
-    save_picture(folder / PICTURE_FILE, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
-    write_page(folder)
+        pixels = run_picture.learned_pixels(terrain, factors)
+        write_file(folder / run_picture.LEARNED_FILE, image_bytes(pixels, "PNG"))
+    shown = tracks_in(tracks, folder / TRACKS_FILE)
+    run_picture.save_picture(folder / PICTURE_FILE, ground, shown, report)
+    run_page.write_page(folder)
 
 
 TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "group"),

@@ -11,22 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
-from launch_scripts.report.exporter import (
-    AREAS,
-    COSTS,
-    FORMATS,
-    TIMED,
-    Feature,
-    Layer,
-    Points,
-    Value,
-    areas_of,
-    check_target,
-    moment,
-    turns_of,
-    write_layers,
-)
-from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, Track, read_tracks
+from launch_scripts.report import gis_formats as gis
+from launch_scripts.report.gis_formats import Feature, Layer
+from launch_scripts.report.npz_files import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from swarm.errors import ConfigError
 from swarm.files import make_folder
@@ -41,27 +28,27 @@ Groups = Mapping[str, str]
 
 def vehicle_tracks(tracks: RunTracks, groups: Groups) -> list[Layer]:
     """Returns the tracks of vehicles; and the position of each that never moved, as a line has a length."""
-    lines = Layer("vehicle_tracks", "LineString", {"vehicle": "text", "group": "text", **TIMED})
+    lines = Layer("vehicle_tracks", "LineString", {"vehicle": "text", "group": "text", **gis.TIMED})
     return _moved(lines, [(each, {"vehicle": each.id, "group": groups.get(each.id)}) for each in tracks.vehicles])
 
 
 def target_tracks(tracks: RunTracks, groups: Groups) -> list[Layer]:
     """Returns the tracks of targets: a target which jumps begins a new piece."""
-    lines = Layer("target_tracks", "LineString", {"target": "text", "piece": "int", **TIMED})
+    lines = Layer("target_tracks", "LineString", {"target": "text", "piece": "int", **gis.TIMED})
     return _moved(lines, [(each, {"target": each.id, "piece": each.piece}) for each in tracks.targets])
 
 
-def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, Value]]]) -> list[Layer]:
+def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, gis.Value]]]) -> list[Layer]:
     """Tracks as lines, or points where they have no length."""
     points = Layer(f"{lines.name.removesuffix('_tracks')}s_standing", "Point", lines.fields)
     for track, whose in tracks:
         if not len(track.time_ns):
             continue
         steps_m = np.hypot(*np.diff(track.xy_m, axis=0).T)
-        values: dict[str, Value] = {
+        values: dict[str, gis.Value] = {
             **whose,
-            "begins": moment(track.time_ns[0]),
-            "ends": moment(track.time_ns[-1]),
+            "begins": gis.moment(track.time_ns[0]),
+            "ends": gis.moment(track.time_ns[-1]),
             "samples": len(track.time_ns),
             "length_m": round(float(steps_m.sum()), 2),
         }
@@ -75,7 +62,7 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, Value]]]) -> li
 def _captures(tracks: RunTracks, groups: Groups) -> list[Layer]:
     """Returns the captures of targets."""
     features = [
-        Feature([each.xy_m], {"target": each.id, "at": moment(each.time_ns[0])}) for each in tracks.captures
+        Feature([each.xy_m], {"target": each.id, "at": gis.moment(each.time_ns[0])}) for each in tracks.captures
     ]
     return [Layer("captures", "Point", {"target": "text", "at": "time"}, features)]
 
@@ -87,16 +74,16 @@ def _routes(tracks: RunTracks, groups: Groups) -> list[Layer]:
     layer = Layer(
         "routes", "LineString",
         {"vehicle": "text", "target": "text", "at": "time", "cost_s": "real", "certified_gap": "real",
-         "length_m": "real"}, about=COSTS,
+         "length_m": "real"}, about=gis.COSTS,
     )  # fmt: skip
     for route in tracks.routes:
-        x_m, y_m = middles_of(grid, turns_of(route.cells, grid))
+        x_m, y_m = middles_of(grid, gis.turns_of(route.cells, grid))
         length_m = float(np.hypot(np.diff(x_m), np.diff(y_m)).sum())
         if length_m > 0:
-            values: dict[str, Value] = {
+            values: dict[str, gis.Value] = {
                 "vehicle": route.vehicle,
                 "target": route.target,
-                "at": moment(np.int64(route.time_ns)),
+                "at": gis.moment(np.int64(route.time_ns)),
                 "cost_s": route.cost_s,
                 "certified_gap": route.gap if math.isfinite(route.gap) else None,
                 "length_m": round(length_m, 2),
@@ -129,10 +116,10 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     power = 10.0 ** np.floor(np.log10(known) - 1)
     rounded, of_cell = np.unique(np.round(known / power) * power, return_inverse=True)
     codes[paced] = 2 + of_cell
-    for code, rings in areas_of(codes, codes > 0, grid):
+    for code, rings in gis.areas_of(codes, codes > 0, grid):
         border_m2, *holes_m2 = map(_enclosed_m2, rings)
         area_m2 = border_m2 - sum(holes_m2)
-        values: dict[str, Value] = {
+        values: dict[str, gis.Value] = {
             "kind": "lethal" if code == 1 else "pace",
             "pace_s_per_m": None if code == 1 else float(f"{rounded[code - 2]:.4g}"),
             "cells": round(area_m2 / grid.resolution_m**2),
@@ -142,7 +129,7 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     return layer
 
 
-def _enclosed_m2(ring: Points) -> float:
+def _enclosed_m2(ring: gis.Points) -> float:
     x_m, y_m = (ring - ring[0]).T
     return float(abs(np.dot(x_m[:-1], y_m[1:]) - np.dot(x_m[1:], y_m[:-1])) / 2)
 
@@ -157,7 +144,7 @@ WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {
 """Name of an export -> its layers."""
 
 
-ENDINGS = (*(ending.removeprefix(".") for ending in FORMATS), "mcap")
+ENDINGS = (*(ending.removeprefix(".") for ending in gis.FORMATS), "mcap")
 """The words of `swarm runs export --format`."""
 
 # --- files of `swarm runs export` ---------------------------------------------------------------------------------
@@ -173,16 +160,16 @@ def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None,
     """
     tracks = tracks_of_run(folder)
     groups = groups_of(read_report(folder)) if (folder / REPORT_FILE).exists() else {}
-    names = what or [name for name in WHAT if name != "marks" or f".{format}" in AREAS]
+    names = what or [name for name in WHAT if name != "marks" or f".{format}" in gis.AREAS]
     layers = [layer for name in WHAT if name in names for layer in WHAT[name](tracks, groups)]
     frame, run = MapFrame(tracks.grid), folder.resolve().name
-    if FORMATS[f".{format}"].many:
+    if gis.FORMATS[f".{format}"].many:
         files = {f"{run}.{format}": layers}
     else:
         files = {f"{run}-{layer.name}.{format}": [layer] for layer in layers}
     where = free_places(folder, list(files), out, force)
     for path, some in zip(where, files.values(), strict=True):
-        write_layers(path, some, frame)
+        gis.write_layers(path, some, frame)
     return [
         f"{path}: {', '.join(f'{len(layer.features):,} {layer.name}' for layer in some)}"
         for path, some in zip(where, files.values(), strict=True)
@@ -209,7 +196,7 @@ def free_places(folder: Path, names: Sequence[str], out: Path | None, force: boo
     paths = [to / name for name in names]
     make_folder(to)
     for path in paths:
-        check_target(path, "--out" if out else "export", force=force)
+        gis.check_target(path, "--out" if out else "export", force=force)
     return paths
 
 
