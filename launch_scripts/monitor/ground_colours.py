@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
 LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
 STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
 FOUND, OVERRULED = rgb(palette.SKY), rgb(palette.PINK)
+TREE = (255, 255, 255)
 UNREACHED = (70, 60, 66)
 _HATCH_TEXELS = 7
 _CIVIDIS = "#00224e #1a386f #434e6c #61656f #7d7c78 #9b9476 #bcae6c #dec958 #fee838"
@@ -48,6 +49,11 @@ _MOST_FACTOR = 4.0
 _COST_STEPS = 256
 Ints = NDArray[np.int64]
 _MOST_SAMPLES = 64 * 64
+_BESIDE = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+_ON_THE_WAY = np.linspace(0, 1, 9)[1:-1]
+"""Positions between two samples at which lethal cells are looked for."""
+_LEAST_BRANCH = 3
+"""Samples whose way leads through one from which a line is drawn."""
 _PIXELS = 160
 """Longer side of a picture, in pixels: some for each sample, so that slopes are smooth."""
 _BANDS = 10
@@ -159,12 +165,17 @@ class GroundColours:
         image: Bytes = np.clip(colours[index] * shade, 0, 255).astype(np.uint8)
         return image
 
+    def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:
+        """Returns True for each of these rows and columns of cells that is lethal by the map: bool (rows, cols)."""
+        lethal: Bools = np.isinf(self._now[rows[:, None], cols])
+        return lethal
+
     def on_relief(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
         """Colours of these rows and columns of cells, float32 (rows, cols, 3), lit; lethal ground is dark."""
         side = self._mesh.texel
         shade = 0.5 + 0.5 * self._shade[rows[:, None] // side, cols // side]
         lit: Bytes = np.clip(colours * shade, 0, 255).astype(np.uint8)
-        lit[np.isinf(self._now[rows[:, None], cols])] = LETHAL_PRIOR
+        lit[self.lethal_at(rows, cols)] = LETHAL_PRIOR
         return lit
 
     def _hatch(self, image: Bytes, window: Window) -> None:
@@ -261,6 +272,41 @@ class CostSamples:
         return result
 
 
+def coarse_tree(
+    costs: Floats, samples: CostSamples, lethal_at: Callable[[Ints, Ints], NDArray[np.bool_]]
+) -> tuple[Ints, Ints]:
+    """From each sample to the neighbour to which the cost falls most over the distance, never across lethal ground.
+
+    lethal_at  of rows and columns of cells, bool (rows, cols)
+
+    Returns the ends of lines, int64 (k, 2, 2) as (row, col) of cells, and how many samples' ways lead along each.
+    """
+    n, m = costs.shape
+    finite = np.isfinite(costs)
+    here = np.where(finite, costs, -np.inf)
+    beside = np.pad(costs, 1, constant_values=np.inf)
+    index = np.arange(n * m).reshape(n, m)
+    best, parent = np.zeros((n, m)), np.full((n, m), -1, np.int64)
+    for d_row, d_col in _BESIDE:
+        fall = here - beside[1 + d_row : 1 + d_row + n, 1 + d_col : 1 + d_col + m]
+        fall /= math.hypot(d_row, d_col)
+        barred = np.zeros((n, m), np.bool_)
+        for share in _ON_THE_WAY * samples.step:
+            row = np.clip(np.rint(samples.rows + share * d_row).astype(np.int64), 0, samples.rows[-1])
+            col = np.clip(np.rint(samples.cols + share * d_col).astype(np.int64), 0, samples.cols[-1])
+            barred |= lethal_at(row, col)
+        better = (fall > best) & ~barred
+        best[better], parent[better] = fall[better], (index + d_row * m + d_col)[better]
+    parents = parent.reshape(-1)
+    through = np.ones(n * m, np.int64)
+    for sample in np.argsort(-costs.reshape(-1), kind="stable"):  # the farthest first; inf has no parent
+        if parents[sample] >= 0:
+            through[parents[sample]] += through[sample]
+    drawn = np.flatnonzero((parents >= 0) & (through >= _LEAST_BRANCH))
+    ends = np.stack([drawn, parents[drawn]], axis=1)
+    return np.stack([samples.rows[ends // m], samples.cols[ends % m]], axis=-1), through[drawn]
+
+
 def nearest_target(costs: dict[str, Floats], order: Sequence[str]) -> Ints:
     """Index in `order` of the target with the least cost at each place; -1 where none can be reached."""
     unreached = np.full(next(iter(costs.values())).shape, np.inf, np.float32)
@@ -299,6 +345,14 @@ class TargetPictures:
         pixels[:, :-1][band[:, :-1] != band[:, 1:]] *= 0.35
         pixels[~reached] = UNREACHED
         return self._colours.on_relief(pixels, self._rows, self._cols)
+
+    def tree(self, target: str) -> tuple[Floats, Floats]:
+        """Returns the steepest descent of the cost between samples, as a river that ends at the target: lines
+        float32 (n, 2, 3), and their radii as rerun takes those in points of the window, float32 (n,)."""
+        ends, through = coarse_tree(self._samples.costs_s[target], self._samples, self._colours.lethal_at)
+        cells = ends[..., 0] * self._mesh.grid.cols + ends[..., 1]
+        radii = -(0.25 + 0.16 * np.log2(through / 2)).astype(np.float32)
+        return self._mesh.place_cells(cells, 0.15 * self._mesh.scale_m), radii
 
     def territories(self, order: Sequence[str]) -> Bytes:
         """Returns which target each place is nearest to in cost, in the colours that targets have in the plots."""

@@ -16,16 +16,26 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from launch_scripts.monitor import live_layout
 from launch_scripts.monitor.ground_colours import (
     COST_COLOURS,
     COST_TO_GO_COLOURS,
     LEARNED_COLOURS,
+    TREE,
     CostSamples,
     GroundColours,
     TargetPictures,
 )
-from launch_scripts.monitor.live_layout import PHOTO, Layer
+from launch_scripts.monitor.live_layout import (
+    COST,
+    KNOWN,
+    LEARNED,
+    NEAREST,
+    PHOTO,
+    ZONE_COLOURS,
+    Layer,
+    Scale,
+    legend_picture,
+)
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.monitor.styles import Look
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
@@ -126,16 +136,16 @@ class GroundView:
         self._colours.close(closed_cells(self._zones))
         drawn_by = {
             PHOTO: colours.photo_of,
-            live_layout.COST: colours.cost_of,
-            live_layout.KNOWN: colours.known_of,
-            live_layout.LEARNED: colours.learned_of,
+            COST: colours.cost_of,
+            KNOWN: colours.known_of,
+            LEARNED: colours.learned_of,
         }
         self._tiled = {layer: picture for layer, picture in drawn_by.items() if layer in scene.layers}
         """Function that draws a tile of each layer of tiles."""
         self._stale: dict[str, dict[int, None]] = {layer.name: {} for layer in self._tiled}
         """Name of a layer -> its tiles that are out of date. Marks come many times a second to the same tiles, and
         each of their pictures is drawn once for all; one that looks as before is not logged again."""
-        self._nearest = any(layer.name == live_layout.NEAREST.name for layer in scene.layers)
+        self._nearest = any(layer.name == NEAREST.name for layer in scene.layers)
         self._to_target = next((layer for layer in scene.layers if layer.target is not None), None)
         self.samples = CostSamples(terrain.grid, self._to_target and self._to_target.target)
         self._pictures = TargetPictures(self._mesh, colours, self.samples)
@@ -185,7 +195,7 @@ class GroundView:
         if layer is not None and layer.target == reply.target and reply.target in self.samples.costs_s:
             self._draw_to_target(layer, reply.target)
         if self._nearest and self.samples.costs_s and self._limit.due("nearest", now_ns):
-            self._texture(live_layout.NEAREST.entity, 0, self._pictures.territories(self._target_ids))
+            self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int, watched: bool) -> str | None:
         """Draws changes, at intervals. Returns the target whose planner is to be asked for costs now."""
@@ -228,29 +238,29 @@ class GroundView:
     def _legend(self, layer: Layer) -> None:
         """Draws the legend below a layer: once, but for a cost-to-go whenever its scale changes."""
         scale, pictures = None, self._pictures
-        if layer == live_layout.COST:  # from high to low, evenly in the logarithm of the pace
+        if layer == COST:  # from high to low, evenly in the logarithm of the pace
             paces = np.geomspace(self._colours.slowest_s_per_m, self._colours.quickest_s_per_m, 5)
-            scale = live_layout.Scale(COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces])
-        elif layer == live_layout.LEARNED:
-            scale = live_layout.Scale(LEARNED_COLOURS, "times the prior pace", ["1/4", "1/2", "1", "2", "4"])
+            scale = Scale(COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces])
+        elif layer == LEARNED:
+            scale = Scale(LEARNED_COLOURS, "times the prior pace", ["1/4", "1/2", "1", "2", "4"])
         elif layer.target is not None and pictures.full_s:
             seconds = [float(f"{each:.3g}") for each in np.linspace(0, pictures.full_s, 6)]
-            scale = live_layout.Scale(
-                COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds]
-            )
-        picture = live_layout.legend_picture((*layer.looks, *self._movers), scale)
+            scale = Scale(COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds])
+        picture = legend_picture((*layer.looks, *self._movers), scale)
         image = rr.EncodedImage(contents=picture, media_type="image/png")
         self._pen.log(f"legend/{layer.name}", image, static=True)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
         self._texture(layer.entity, 0, self._pictures.to_target(target))
+        lines, radii = self._pictures.tree(target)
+        self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
             self._legend(layer)
 
     def _draw_zones(self) -> None:
         parts = [borders(self._mesh, area) for area in self._zones]
-        per_zone = np.array([live_layout.ZONE_COLOURS[area.rule] for area in self._zones], np.uint8).reshape(-1, 3)
+        per_zone = np.array([ZONE_COLOURS[area.rule] for area in self._zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         self._pen.lines("world/zones", even(np.concatenate([np.empty((0, 2, 3), np.float32), *parts])), colours)
         named = self._zones[:_NAMES_SHOWN]

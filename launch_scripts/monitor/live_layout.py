@@ -89,7 +89,8 @@ KNOWN = Layer(
 LEARNED = Layer("learned", "Learned", "world/layers/learned", _CLOSED)
 TO_TARGET = Layer(
     "to_target", "To", "world/layers/to_target",
-    (Look("fill", colours.UNREACHED, "no way from here"), Look("fill", colours.LETHAL_PRIOR, "lethal")),
+    (Look("line", colours.TREE, "where the cost falls most"), Look("fill", colours.UNREACHED, "no way from here"),
+     Look("fill", colours.LETHAL_PRIOR, "lethal")),
 )  # fmt: skip
 NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest", ())
 

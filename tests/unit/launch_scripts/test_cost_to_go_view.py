@@ -5,11 +5,12 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
 from support.makers import cost_reply, planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground_colours import CostSamples, nearest_target
+from launch_scripts.monitor.ground_colours import CostSamples, coarse_tree, nearest_target
 from launch_scripts.monitor.terrain_mesh import Floats
 from swarm.bus.bus import Asked, Event
 from swarm.grid import GridSpec
@@ -64,6 +65,34 @@ def test_between_samples_costs_are_linear_where_all_are_known(
     at_cols = np.linspace(samples.cols[0], samples.cols[-1], 5).astype(np.int64)
     found = samples.spread(plane, at_rows, at_cols)
     np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pace = rng.uniform(0.1, 1, (40, 50)).astype(np.float32)
+    gap, wall = int(rng.integers(0, 40)), int(rng.integers(5, 45))
+    pace[:, wall - 1 : wall + 1] = np.inf
+    pace[gap, wall - 1 : wall + 1] = 0.1
+    samples = CostSamples(GridSpec(40, 50, 10.0), None)
+    samples.step, samples.rows, samples.cols = 4, np.arange(1, 40, 4), np.arange(1, 50, 4)
+    rows, cols = samples.rows, samples.cols
+    pace[5, 5] = 0.1
+    costs = costs_to(pace, 5, 5)
+    lethal = np.isinf(pace)
+
+    def lethal_at(at_rows: NDArray[np.intp], at_cols: NDArray[np.intp]) -> NDArray[np.bool_]:
+        found: NDArray[np.bool_] = lethal[at_rows[:, None], at_cols]
+        return found
+
+    ends, through = coarse_tree(costs[rows[:, None], cols], samples, lethal_at)
+    assert len(ends)
+    assert through.max() <= len(rows) * len(cols)
+    for (from_row, from_col), (to_row, to_col) in ends.tolist():
+        assert costs[to_row, to_col] < costs[from_row, from_col]
+        crosses = (from_col < wall) != (to_col < wall)
+        if crosses and from_row == to_row:
+            assert from_row == gap
 
 
 def test_territories_go_by_cost_and_not_by_distance() -> None:
