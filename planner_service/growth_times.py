@@ -213,47 +213,75 @@ class Askers:
 
 
 class WindowSchedule:
-    """Windows of doubling width, each of which is due once the target has come a share of that width.
+    """Extent of the search when the target moves: windows of doubling width, each due once the target has come a
+    share of that width.
 
     Routes are as old as the widest window that they begin in. A move of the target matters to a cell relative to
     the cell's distance: less, the farther it is. A window that reaches `AHEAD` times as far keeps that small at
-    every distance, and costs 64 cells of search per cell of its width and move.
+    every distance, and costs 64 cells of search per cell of its width and move. One of the narrowest is grown with
+    every move.
 
-    half  of the narrowest window, cells to every side; one that narrow is grown with every move
+    moves  of the target since the whole tree was last exact. The owner counts them
     """
 
-    def __init__(self, grid: GridSpec, half: int) -> None:
+    def __init__(self, grid: GridSpec, config: PlannerConfig, times: GrowthTimes) -> None:
+        self.moves = 0
         self._grid = grid
-        self._half = half
+        self._k_min = config.k_min
+        self._times = times
+        self._narrowest = times.narrowest
+        self._side = max(grid.rows, grid.cols)
         # Cell of the target at the last full search, and at the last window of each width: narrowest first.
         self._whole = 0
-        self._centres = [0] * max((max(grid.rows, grid.cols) // half).bit_length(), 1)
+        self._centres = [0] * max((self._side // self._narrowest).bit_length(), 1)
 
     def half(self, cell: int, widest: int) -> int:
         """Returns the half width of the window around a target that came to `cell`, at most `widest` unless the
         narrowest is wider. A window is never narrower than the target's move since the last of its width, so that
         windows overlap."""
-        found = self._half
+        found = self._narrowest
         for doublings, centre in enumerate(self._centres):
-            half = self._half << doublings
-            if half > max(widest, self._half):
+            half = self._narrowest << doublings
+            if half > max(widest, self._narrowest):
                 break
             if AHEAD * self._grid.distance_cells(centre, cell) >= half:
                 found = half
         return found
 
-    def beyond(self, cell: int, widest: int) -> bool:
-        """Returns True if cells beyond a window of `widest` cells are due: when a window twice as wide would be."""
-        return AHEAD * self._grid.distance_cells(self._whole, cell) >= 2 * widest
+    def note_whole(self, root: int) -> None:
+        """The whole tree of a root is exact."""
+        self.moves = 0
+        self.note_window(root, self._side)
 
-    def note_grown(self, cell: int, half: int) -> None:
-        """Notes that a window of `half` cells to every side of `cell` was searched: all widths up to it start
+    def note_window(self, cell: int, half: int) -> None:
+        """A window of `half` cells to every side of `cell` was grown, or strides as far: all widths up to it start
         again."""
-        if half >= max(self._grid.rows, self._grid.cols):
+        if half >= self._side:
             self._whole = cell
         for doublings in range(len(self._centres)):
-            if self._half << doublings <= half:
+            if self._narrowest << doublings <= half:
                 self._centres[doublings] = cell
+
+    def after_move(self, row: StrategyRow, old: int, new: int, has_network: bool) -> tuple[int, int]:
+        """Returns the half width in which all cells are searched now, and that of strides: no further if both are
+        the same."""
+        fine = self._times.fine
+        has_strides = row.thins_far_cells and has_network and 4 * fine <= self._side
+        least = 2 * self._grid.distance_cells(old, new)
+        if row.on_move is OnMove.BLOCK_WINDOW:
+            half = block_half(self._grid, old, new, self._k_min)
+            return (min(half, max(fine, least)) if has_strides else half), half
+        widest = self._times.widest(row.thins_far_cells)
+        # Cells beyond the widest window are due when a window twice as wide would be.
+        if has_strides and AHEAD * self._grid.distance_cells(self._whole, new) >= 2 * widest:
+            return max(widest, fine, least), self._side
+        half = max(self.half(new, widest), least)
+        return half, half
+
+    def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
+        """Returns True if the whole tree is due to become exact, which takes this time."""
+        within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
+        return row.renews_within_budget and within_budget
 
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
@@ -282,48 +310,3 @@ def exact_half(grid: GridSpec, old: int, new: int) -> int:
     """
     side = min(grid.rows, grid.cols)
     return max(16, min(side // 12, 64), 2 * grid.distance_cells(old, new))
-
-
-class WindowLimit:
-    """Extent of the search when the target moves, and the time of a full search, from earlier times.
-
-    moves  of the target since the whole tree was last exact. The owner counts them
-    """
-
-    def __init__(self, grid: GridSpec, config: PlannerConfig, times: GrowthTimes) -> None:
-        self.moves = 0
-        self._grid = grid
-        self._config = config
-        self._times = times
-        self._side = max(grid.rows, grid.cols)
-        # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
-        self._schedule = WindowSchedule(grid, times.narrowest)
-
-    def note_whole(self, root: int) -> None:
-        """The whole tree of a root is exact."""
-        self.moves = 0
-        self._schedule.note_grown(root, self._side)
-
-    def note_window(self, cell: int, half: int) -> None:
-        """A window of `half` cells to every side was grown, or strides as far."""
-        self._schedule.note_grown(cell, half)
-
-    def after_move(self, row: StrategyRow, old: int, new: int, has_network: bool) -> tuple[int, int]:
-        """Returns the half width in which all cells are searched now, and that of strides: no further if both are
-        the same."""
-        fine = self._times.fine
-        has_strides = row.thins_far_cells and has_network and 4 * fine <= self._side
-        least = 2 * self._grid.distance_cells(old, new)
-        if row.on_move is OnMove.BLOCK_WINDOW:
-            half = block_half(self._grid, old, new, self._config.k_min)
-            return (min(half, max(fine, least)) if has_strides else half), half
-        widest = self._times.widest(row.thins_far_cells)
-        if has_strides and self._schedule.beyond(new, widest):
-            return max(widest, fine, least), self._side
-        half = max(self._schedule.half(new, widest), least)
-        return half, half
-
-    def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
-        """Returns True if the whole tree is due to become exact, which takes this time."""
-        within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
-        return row.renews_within_budget and within_budget

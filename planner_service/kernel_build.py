@@ -34,9 +34,9 @@ from planner_service.kernels import (
     partition_totals,
     pull_routes,
     queue_dial,
+    queue_directed,
     queue_heap,
-    queue_multilevel,
-    queue_wide,
+    queue_wide_buckets,
     repair,
     route_walk,
     stride_growth,
@@ -53,9 +53,9 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    StepKernel(queue_dial.grow_by_buckets, queue_multilevel.grow_directed_by_buckets),
+    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
     parents_from_costs.point_to_parents,
-    StepKernel(queue_wide.grow_by_wide_buckets, None),
+    StepKernel(queue_wide_buckets.grow_by_wide_buckets, None),
     parents_from_costs.untie_parents,
     StepKernel(cut_trees.box_of, None),
     cell_costs.pad_cell_costs,

@@ -38,7 +38,6 @@ from swarm.config.agent_plan import (
     plan_agents,
     readable_groups,
 )
-from swarm.config.explain import choice
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
@@ -264,14 +263,12 @@ class PlacesService(PlanningProcess):
 
     def _take(self, event: Asked, request: PlaceRouteRequest, now_ns: int) -> None:
         name = request.vehicle_class
-        if name not in self._cost_maps:
-            self._refuse(event, f"there is no class {name!r}{choice(name, [*self._cost_maps], ' there are ')}")
+        if (fault := self._fault_of(name)) is not None:
+            self._refuse(event, fault)
         elif event.asker in self._foreign:
             self._refuse(event, f"{event.asker} is of group {self._foreign[event.asker]}: ask its own places")
         elif len(request.cells) > MOST_ROUTES:
             self._refuse(event, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
-        elif not self._has_kernels(name):
-            self._refuse(event, f"the kernels for class {name} are still being compiled")
         else:
             self._wait(_Question(event, event.asker, request, now_ns))
             self._go_on()

@@ -14,6 +14,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import ClassMaps, class_terrains
 from swarm.bus.bus import Asked, Bus, Event, Post, Worker
 from swarm.config.agent_plan import agent_of
+from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.liveness import job_of
 from swarm.runtime.election import Candidacy
@@ -78,8 +79,14 @@ class PlanningProcess:
         raise NotImplementedError
 
     def _has_kernels(self, name: str) -> bool:
-        """Returns True if the trees of a class can be grown."""
-        return name in self._first_classes or self._all_kernels()
+        """Returns True if the trees of a class can be grown. The kernels of "ground" are always among the first."""
+        return name == GROUND or name in self._first_classes or self._all_kernels()
+
+    def _fault_of(self, name: str) -> str | None:
+        """Reason why nothing can be asked for a class; None if something can."""
+        if name not in self._cost_maps:
+            return f"there is no class {name!r}{choice(name, [*self._cost_maps], ' there are ')}"
+        return None if self._has_kernels(name) else f"the kernels for class {name} are still being compiled"
 
     def lacks(self) -> list[str]:
         return self._member.lacks()

@@ -8,6 +8,7 @@ from functools import partial
 
 import msgspec
 
+from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.planner import Action, Answer, Planner, Refusal, Work
 from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.prepared_costs import PreparedCosts
@@ -16,8 +17,6 @@ from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
-from planner_service.tree.strides import StrideNetwork
-from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
 from shared_map.replication.interest import readable_for_target
 from shared_map.sightings import Presence, Sightings, pose_of
@@ -61,6 +60,10 @@ _AWAITED_NS = 10 * NS_PER_S
 """A target without a first pose for this time is an alarm: simulated targets have theirs within two seconds."""
 _AT_ONCE, _ROUTE_COST = 1 << 16, 64
 """Costs after which waiting queries wait for the next tick or event, some 10 ms; a route counts as 64 of them."""
+UNUSED_NS = 60 * NS_PER_S
+"""A tree of a class without a query for this time is dropped."""
+_BEGINS_NS = NS_PER_S
+"""A query waits at most this time for the first tree of its class."""
 
 
 class PlannerService(PlanningProcess):
@@ -92,7 +95,6 @@ class PlannerService(PlanningProcess):
         """Positions of vehicles that may see the target; empty for a target that has a tracker."""
         self._listens = False
         """True if it subscribes to positions and views of vehicles."""
-        # The planners, one of each class with queries.
         self._faults: list[str] = []
         """Faults of the strategy's plug-in that are not reported yet."""
         world = StrategyWorld(self._target, grid, scenario.planner)
@@ -103,7 +105,13 @@ class PlannerService(PlanningProcess):
         hidden = hidden_target(scenario, self._target, setup.incarnation)
         self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
         self._planner = self._new_planner(GROUND, self._cost_maps[GROUND], tree)
-        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of, self._has_kernels)
+        """The planner of "ground", which is always there."""
+        self._planners = {GROUND: self._planner}
+        """Class -> its planner, as long as it has queries; "ground" first."""
+        self._begun_ns: dict[str, int] = {}
+        self._used_ns: dict[str, int] = {}
+        """Classes beside "ground": when the planner was made, which tells it from one that was dropped; and when
+        it was needed last."""
         self._obeyed_version = 0
         self._removed = False
         """True if its target was removed: then it serves no queries."""
@@ -149,14 +157,30 @@ class PlannerService(PlanningProcess):
             vehicle_class=name,
         )
 
-    def _begin_class(self, name: str) -> Planner:
-        """Makes the planner of a class at its first query."""
-        cost_map = self._cost_maps[name]
-        planner = self._new_planner(name, cost_map, self._new_tree(cost_map))
-        planner.lead(self._planner.leads)
-        self._pace(planner)
-        log.info("target %s: a tree for the class %s", self._target, name)
+    def _used(self, name: str, now_ns: int) -> Planner:
+        """Returns the planner of a known class that is needed; made if it is missing."""
+        planner = self._planners.get(name)
+        if planner is None:
+            cost_map = self._cost_maps[name]
+            planner = self._planners[name] = self._new_planner(name, cost_map, self._new_tree(cost_map))
+            planner.lead(self._planner.leads)
+            self._pace(planner)
+            self._begun_ns[name] = now_ns
+            log.info("target %s: a tree for the class %s", self._target, name)
+        if name != GROUND:
+            self._used_ns[name] = now_ns
         return planner
+
+    def _drop_unused(self, now_ns: int) -> None:
+        for name, used_ns in list(self._used_ns.items()):
+            if now_ns - used_ns >= UNUSED_NS:
+                del self._planners[name], self._used_ns[name], self._begun_ns[name]
+
+    def _must_wait(self, name: str, cells: list[int], now_ns: int) -> bool:
+        """Returns True if a query from these cells should wait: no tree answers them yet, but soon."""
+        planner = self._planners[name]
+        is_new = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
+        return planner.must_wait(cells) or (is_new and planner.begins)
 
     def start(self, now_ns: int) -> None:
         self._began_ns = now_ns
@@ -169,7 +193,7 @@ class PlannerService(PlanningProcess):
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
-            for _, planner in self._planners:
+            for planner in self._planners.values():
                 planner.push_all()
         match event:
             case Asked(request=RouteRequest() | CostRequest()):
@@ -201,8 +225,8 @@ class PlannerService(PlanningProcess):
         for told in self._watch.drain(now_ns):
             log.info("%s: %s", told.kind, told.text)
             self._member.note(now_ns, told.kind, told.text, told.cell)
-        self._planners.drop_unused(now_ns)
-        for _, planner in self._planners:
+        self._drop_unused(now_ns)
+        for planner in self._planners.values():
             self._perform(planner, planner.tick(now_ns), now_ns)
         self._obedience.tick(now_ns)
         self._forced = False
@@ -243,8 +267,8 @@ class PlannerService(PlanningProcess):
         for heard in self._bus.collected(CHASERS):
             assert isinstance(heard.message, Chasers)
             name = heard.message.vehicle_class
-            if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
-                self._planners.used(name, now_ns).on_chasers(heard.message, now_ns)
+            if self._fault_of(name) is None and (heard.message.ids or name in self._planners):
+                self._used(name, now_ns).on_chasers(heard.message, now_ns)
 
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         if not self._listens or not self._sightings.receive(sighted, now_ns):
@@ -257,13 +281,13 @@ class PlannerService(PlanningProcess):
 
     def _tag(self, name: str) -> str:
         """Returns the tag of a job for the planner of a class."""
-        return f"{name}/{self._planners.begun_ns(name)}"
+        return f"{name}/{self._begun_ns.get(name, 0)}"
 
     def _asked_by(self, tag: str) -> Planner | None:
         """The planner that asked for a piece of work; None if it was dropped since: another one of its class has
         begun with the map as it was later."""
         name, _ = tag.split("/")
-        return self._planners.held(name) if tag == self._tag(name) else None
+        return self._planners.get(name) if tag == self._tag(name) else None
 
     def _take_fleet(self, now_ns: int) -> None:
         """Takes the positions of vehicles, which may see a target without a living tracker."""
@@ -301,18 +325,14 @@ class PlannerService(PlanningProcess):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
-            fault = self._planners.fault(name)
+            fault = self._fault_of(name)
             if fault is not None:
                 self._refuse(event, fault)
                 continue
-            planner = self._planners.used(name, now_ns)
+            planner = self._used(name, now_ns)
             crowded = len(self._held) + len(held) - n > _MOST_HELD
-            must_wait = (
-                self._planners.must_wait(name, request.cells, now_ns)
-                and not crowded
-                and now_ns - asked_ns < _HOLD_NS
-            )
-            if must_wait or spent > _AT_ONCE:
+            may_wait = not crowded and now_ns - asked_ns < _HOLD_NS
+            if (may_wait and self._must_wait(name, request.cells, now_ns)) or spent > _AT_ONCE:
                 self._held.append((asked_ns, event))
                 continue
             spent += (len(request.cells) + 1) * (_ROUTE_COST if isinstance(request, RouteRequest) else 1)
@@ -339,7 +359,7 @@ class PlannerService(PlanningProcess):
             if heard != self._heard_groups:
                 self._heard_groups = heard
                 self._replica.read_groups(heard)
-        for _, planner in self._planners:
+        for planner in self._planners.values():
             self._pace(planner)
 
     def _pace(self, planner: Planner) -> None:
@@ -355,7 +375,7 @@ class PlannerService(PlanningProcess):
         if order.subject is not None:
             return self._obeyed_version == self._obedience.book.version
         # A zone may be for one class alone; trees of all classes must know of it.
-        knows_map = all(planner.knows_map for _, planner in self._planners)
+        knows_map = all(planner.knows_map for planner in self._planners.values())
         return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map
 
     def stop(self, now_ns: int) -> None:
@@ -369,13 +389,13 @@ class PlannerService(PlanningProcess):
     def _lead(self, leads: bool, now_ns: int) -> None:
         if leads != self._leads:
             self._watch.leads = leads
-            for _, planner in self._planners:
+            for planner in self._planners.values():
                 planner.lead(leads)
         super()._lead(leads, now_ns)
 
     def _tell_status(self, status: PlannerStatus) -> None:
         """Publishes the status of "ground", with the vehicles of all classes."""
-        following = sum(len(planner.followers) for _, planner in self._planners)
+        following = sum(len(planner.followers) for planner in self._planners.values())
         told = msgspec.structs.replace(status, following=following)
         self._bus.publish(STATUS, told, target=self._target)
 

@@ -16,9 +16,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.growth_times import Askers, GrowthTimes, WindowLimit, exact_half
+from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, exact_half
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.route_walk import UNREACHABLE
+from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.strategy import HYSTERESIS, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
@@ -36,7 +37,7 @@ from planner_service.tree.partitioned_tree import (
     offered_gaps,
 )
 from planner_service.tree.route_bounds import LowerBounds, read_routes
-from planner_service.tree.strides import StrideNetwork, find_strides
+from planner_service.tree.strides import find_strides
 from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -171,7 +172,7 @@ class TargetTree:
         self._network: StrideNetwork | None = None
         self._seeks_network = False
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
-        self._windows = WindowLimit(grid, config, self.times)
+        self._windows = WindowSchedule(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
         # Growths that stop, and who has asked: how far they go. Some lay farther than a growth may go here.

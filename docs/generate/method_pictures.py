@@ -29,7 +29,7 @@ from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
 from planner_service.strategy import ROWS, STAGES, Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.strides import one_stride
+from planner_service.tree.strides import all_cells, find_stride
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -277,7 +277,7 @@ def _network(pace: Pace, stride: int) -> tuple[Trail, list[Trail]]:
     """(n, 2) places of the centres of a stride's nodes, and those of the way of each link."""
     costs = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig())
     costs.load(pace)
-    centre, links = one_stride(costs, stride)
+    centre, links = find_stride(costs, stride, all_cells(costs), np.empty(0, np.int64), 0)
     centres = np.stack(np.divmod(centre.astype(np.int64), costs.stride), axis=1) - 1
     paths = np.split(links.paths, np.cumsum(links.length)[:-1])
     ways = [

@@ -34,6 +34,31 @@ _HALF = np.float32(0.5)
 _LEVEL = np.float32(0.0)
 
 
+def with_scratch(climbs: Climbs) -> Climbs:
+    """The same, with rows of its own to write to: one thread's."""
+    return *climbs[:4], *row_scratch(climbs[4].size)
+
+
+def row_scratch(stride: int) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
+    """(keys, best, codes, entries) of a map whose rows are so long."""
+    keys, best, codes = np.empty((3, stride), np.float32)
+    return keys, best, codes, np.empty(stride, np.int32)
+
+
+def climbs_in(climbs: Climbs, stride: int, box: tuple[int, int, int, int]) -> Climbs:
+    """Returns the climbs of a window, as a padded grid of its own."""
+    row0, col0, row1, col1 = box
+    part = climbs[0].reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
+    return np.ascontiguousarray(part).reshape(-1), *climbs[1:]
+
+
+def turned_round(climbs: Climbs) -> Climbs:
+    """Reverses grades and wind, for searches that start at the vehicle."""
+    height, prices, scale, begins, keys, best, codes, entries = climbs
+    tables = np.roll(prices.reshape(-1, int(begins[1])), 4, axis=0)
+    return -height, tables.reshape(-1), scale, begins, keys, best, codes, entries
+
+
 @helper
 def _entry(rise, scale, half):
     """int32: which entry of a table a rise (m) has."""

@@ -11,7 +11,7 @@ cell costs less than the next bucket begins with. Between two calls the cost of 
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)     padded cells that have a cost, in the order of the buckets they got it from
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
-    queue    as of `queue_chunks`; `make_scratch` says how large
+    queue    as of `bucket_chunks`; `make_scratch` says how large
     state    int64   (4,)            the last bucket served; entries that wait in the queue; how many of `touched`
                                      were put into it; how many there are. `begin` writes it, growths change it
 
@@ -29,6 +29,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.bucket_chunks import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.layout import (
     BOX,
@@ -45,7 +46,6 @@ from planner_service.kernels.layout import (
     Longs,
     PaddedGrid,
 )
-from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

@@ -11,48 +11,58 @@ Arrays, beside those of `layout`:
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.decorators import helper, step_kernel
-from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, check_cells, step_length
+from planner_service.kernels.layout import (
+    BOX,
+    GRID,
+    INF,
+    LABELS,
+    NONE,
+    Bytes,
+    Floats,
+    Ints,
+    Longs,
+    check_cells,
+    step_length,
+)
 from planner_service.kernels.queue_heap import heap_lower, heap_pop
 
-Network = tuple[
-    NDArray[np.uint32],
-    NDArray[np.uint8],
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.float32],
-    NDArray[np.uint32],
-    NDArray[np.int32],
-    NDArray[np.uint8],
-]
-"""The nodes of all strides, and what leads from one to another: (centre, doublings, first, other, price, begin,
-steps, paths).
 
-centre     uint32 (nodes,), a padded cell of each
-doublings  uint8 (nodes,), ascending: its stride is two to the power of this
-first      int32 (nodes + 1,), where each node's links begin in the arrays that follow
-other      int32, the node that a link leads to
-price      float32, s, what its way cost when it was found
-begin      uint32, where its way begins in `paths`
-steps      int32, how many steps that has; where it is `paths` backward, from `begin` down, less than 0: ~steps
-paths      uint8, directions
-"""
+class StrideNetwork(NamedTuple):
+    """The nodes of all strides, their links, and the way of each: what a growth of far cells goes along.
+
+    Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. Marks
+    therefore never make it wrong, only less good. Kernels take it as a plain tuple.
+
+    centre     uint32 (nodes,), a padded cell of each
+    doublings  uint8 (nodes,), ascending: its stride is two to the power of this
+    first      int32 (nodes + 1,), where each node's links begin in the arrays that follow
+    other      int32, the node that a link leads to
+    price      float32, s, what its way cost when it was found
+    begin      uint32, where its way begins in `paths`
+    steps      int32, how many steps that has; where it is `paths` backward, from `begin` down, less than 0: ~steps
+    paths      uint8, directions
+    """
+
+    centre: NDArray[np.uint32]
+    doublings: Bytes
+    first: Ints
+    other: Ints
+    price: Floats
+    begin: NDArray[np.uint32]
+    steps: Ints
+    paths: Bytes
+
 
 NETWORK = "Tuple((u4[::1], u1[::1], i4[::1], i4[::1], f4[::1], u4[::1], i4[::1], u1[::1]))"
 
-Scratch = tuple[
-    NDArray[np.float32],
-    NDArray[np.int64],
-    NDArray[np.int32],
-    NDArray[np.float32],
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.uint32],
-]
+Scratch = tuple[Floats, Longs, Ints, Floats, Ints, Ints, NDArray[np.uint32]]
 """Arrays of a heap: keys, items, places; of each node: the lowest key up to now, -inf once it is settled or where
 it takes no part; its link, and the node from which that leads; a trail."""
 

@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.search.growth_from_vehicle import Ways
-from planner_service.search.search_places import OFFSET_S, Searcher
+from planner_service.search.search_places import OFFSET_S, Searcher, Ways
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Floats
 from swarm.clock import NS_PER_S

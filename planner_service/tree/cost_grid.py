@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
 from planner_service.kernels import repair, route_walk
-from planner_service.kernels.climbs import Climbs
+from planner_service.kernels.climbs import Climbs, row_scratch, with_scratch
 from planner_service.kernels.layout import (
     RULE_FOUR,
     RULE_OCTILE,
     RULE_PAPER,
+    SQRT2,
     SQRT2_EXACT,
     Buckets,
     PaddedGrid,
     step_offsets,
 )
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
-from planner_service.tree.growth import grow_tree, padded_climbs, with_scratch
+from planner_service.tree.queue_choice import grow_tree
 from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -107,7 +108,7 @@ class CostGrid:
         """Highest cost of a step, in cell costs."""
         self._metres = grid.resolution_m
         if climb is not None:
-            self.climbs, self.dearest_step = padded_climbs(climb, self.rule)
+            self.climbs, self.dearest_step = _padded_climbs(climb, self.rule)
             self._metres *= climb.lowest
         self.length_weight_s = min(config.length_weight * grid.resolution_m, float(kernels.DEAREST_S))
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
@@ -409,3 +410,17 @@ class CostGrid:
         grid."""
         self.grid.row_col(cell)
         return bool(self.cell_cost[self.pad(cell)] < np.inf)
+
+
+def _padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
+    """Returns (climbs, the highest cost of an allowed step, in cell costs)."""
+    grid = climb.grid
+    height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
+    height[1:-1, 1:-1] = climb.elevation_m
+    diagonal = {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
+    tables = climb.table[: 8 if climb.windy else 2] / np.float32(climb.lowest)
+    tables[1::2] *= diagonal
+    begins = (np.arange(8) % len(tables) * tables.shape[1]).astype(np.int32)
+    per_metre = np.array(climb.per_metre, np.float32)
+    climbs = height.reshape(-1), tables.reshape(-1), per_metre, begins, *row_scratch(grid.cols + 2)
+    return climbs, float(tables[tables < np.inf].max())

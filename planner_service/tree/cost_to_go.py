@@ -11,23 +11,26 @@ tree's offset is an upper bound of the cost driven along the parents.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import stride_growth
-from planner_service.kernels.cell_costs import find_rim, merge_window
+from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
+from planner_service.kernels.climbs import climbs_in
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
-from planner_service.kernels.layout import NONE, Labels
+from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents_from_costs import point_to_parents
 from planner_service.kernels.repair import repair
+from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import FINE, KeptScratch, box_of, grow_window
 from planner_service.tree.partial_growth import PartialGrowth
-from planner_service.tree.strides import StrideNetwork
+from planner_service.tree.queue_choice import FINE, KeptScratch, grow_tree
 from shared_map.array_files import Floats
+from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
@@ -167,10 +170,10 @@ class CostToGoTree:
         box = box_of(grid, window)
         row, col = divmod(self.root, grid.grid.cols)
         half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)
-        scratch = stride_growth.make_scratch(len(network.arrays[0]), grid.size)
+        scratch = stride_growth.make_scratch(network.centre.size, grid.size)
         stamps = self._stamps_now(), self._now
         visited: int = stride_growth.grow_strides(
-            *(grid.padded, grid.climbs, self._labels, network.arrays, stamps, box, (2 * half, far), scratch)
+            *(grid.padded, grid.climbs, self._labels, tuple(network), stamps, box, (2 * half, far), scratch)
         )
         self.exact = False
         self._ways_changed()
@@ -317,3 +320,60 @@ def _most_repaired(cells: int) -> tuple[int, int, int]:
     beforehand, so a repair that gives up has then cost a fifth of a full search at most.
     """
     return cells // 8 + 64, cells // 24 + 64, cells // 20 + 64
+
+
+Box = tuple[int, int, int, int]
+
+_SMALL = 1 << 16
+"""Padded cells of a small window, whose scratch is worth keeping."""
+
+
+class GrownWindow(NamedTuple):
+    """Costs and parents of a window as a padded grid of its own, s.
+
+    way  s; cost from the old root to the new one inside the window; inf if no path exists
+    """
+
+    box: Box
+    cost: Floats
+    parent: NDArray[np.uint8] | None
+    way: float
+
+
+def grow_window(
+    grid: CostGrid, root: int, old: int, window: Window, kept: KeptScratch, with_parents: bool
+) -> GrownWindow:
+    """Grows a window that holds the new root and the old one. Raises OutsideGridError where it is not inside the
+    grid or does not hold both.
+
+    kept  scratch of the last window of one tree
+    """
+    row0, col0, row1, col1 = box = box_of(grid, window)
+    width = col1 - col0 + 2
+    start, end = _in_window(grid, root, window), _in_window(grid, old, window)
+    part = np.empty((row1 - row0 + 2) * width, np.float32)
+    bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
+    lowest, highest = np.array(bits, np.int32).view(np.float32).tolist()
+    cost = np.empty_like(part)
+    parent = np.full(part.size, NONE, np.uint8) if with_parents else None
+    padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
+    climbs = None if grid.climbs is None else climbs_in(grid.climbs, grid.stride, box)
+    scratch = kept if part.size <= _SMALL else None
+    grow_tree(padded, climbs, (lowest, highest, grid.dearest_step), start, cost, parent, scratch)
+    return GrownWindow(box, cost, parent, float(cost[end]))
+
+
+def box_of(grid: CostGrid, window: Window) -> Box:
+    """For kernels. Raises OutsideGridError on a window that is not inside the grid."""
+    row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
+    if not (0 <= row0 < row1 <= grid.grid.rows and 0 <= col0 < col1 <= grid.grid.cols):
+        raise OutsideGridError(f"{window} is not inside the grid")
+    return row0, col0, row1, col1
+
+
+def _in_window(grid: CostGrid, cell: int, window: Window) -> int:
+    """A cell's index in the window as a padded grid of its own. Raises OutsideGridError if it lies outside."""
+    row, col = grid.grid.row_col(cell)
+    if not window.contains(row, col):
+        raise OutsideGridError(f"cell {cell} is not in {window}")
+    return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1

@@ -13,7 +13,7 @@ from planner_service.kernels.cut_trees import box_of, stays_exact, walk_by_costs
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import NARROW
+from planner_service.tree.queue_choice import NARROW
 from shared_map.array_files import Floats
 
 MOST_BUCKETS = 1 << 12

@@ -32,8 +32,8 @@ from planner_service.kernels.partition import (
 )
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.growth import KeptScratch, grow_window
+from planner_service.tree.cost_to_go import CostToGoTree, grow_window
+from planner_service.tree.queue_choice import KeptScratch
 from shared_map.array_files import Floats
 from swarm.grid import Window
 

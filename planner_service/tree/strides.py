@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import stride_network
-from planner_service.kernels.stride_growth import Network
+from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Bytes, Floats
@@ -21,23 +20,6 @@ FINE = 8
 """Strides below the least one serve this multiple of the narrowest window: there all cells are searched."""
 MOST_SHARE = 8
 """The largest stride is at most such a share of the map's side (docs/design/windows-and-strides.md)."""
-
-
-class StrideNetwork(NamedTuple):
-    """Nodes, links and their ways, of every stride: what a coarse growth goes along.
-
-    Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. Marks
-    therefore never make it wrong, only less good.
-
-    arrays  for kernels
-    """
-
-    arrays: Network
-
-
-def one_stride(cost_grid: CostGrid, stride: int) -> tuple[NDArray[np.uint32], Links]:
-    """The centres of the nodes of one stride, padded cells, and its links: searched on all cells of the map."""
-    return _find_stride(cost_grid, stride, _all_cells(cost_grid), np.empty(0, np.int64), 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,26 +38,27 @@ class Links:
     paths: Bytes
 
 
-def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
+def all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
+    """Returns `node` for `find_stride` where there is no stride before: all passable cells."""
     return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
 
 
 def find_strides(grid: CostGrid) -> StrideNetwork:
     """Finds the network of a map: the least stride first, each from the ways of the one before."""
-    node = _all_cells(grid)
+    node = all_cells(grid)
     centres: list[NDArray[np.uint32]] = []
     links: list[Links] = []
     side = max(grid.grid.rows, grid.grid.cols)
     most = max(LEAST, (side // MOST_SHARE).bit_length() - 1)
     for doublings in range(LEAST, most + 1):
         below = centres[-1].astype(np.int64) if centres else np.empty(0, np.int64)
-        centre, found = _find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
+        centre, found = find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
         centres.append(centre)
         links.append(found)
-    return StrideNetwork(_joined(centres, links))
+    return _joined(centres, links)
 
 
-def _find_stride(
+def find_stride(
     grid: CostGrid, stride: int, node: NDArray[np.int32], below: Cells, before: int
 ) -> tuple[NDArray[np.uint32], Links]:
     """The centres of one stride's nodes, and all links among them and to those of the stride before.
@@ -122,7 +105,7 @@ def _joining_steps(grid: CostGrid, node: NDArray[np.int32], cost: Floats, many: 
     return steps[found], prices[found]
 
 
-def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> Network:
+def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> StrideNetwork:
     """Every link from both of its ends, by the node that it begins at."""
     centre = np.concatenate(centres)
     doublings = np.repeat(np.arange(LEAST, LEAST + len(centres)), [len(part) for part in centres]).astype(np.uint8)
@@ -136,7 +119,7 @@ def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> Network:
     np.cumsum(np.bincount(source, minlength=centre.size), out=first[1:])
     # A way without a step, where a node and the one above have the same centre, is never followed backward.
     backward = np.where(length > 0, begin + length - 1, 0)
-    return (
+    return StrideNetwork(
         centre,
         doublings,
         first,

@@ -12,7 +12,7 @@ from support.kernel_oracle import inner
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.queue_multilevel import grow_directed_by_buckets, make_scratch
+from planner_service.kernels.queue_directed import grow_directed_by_buckets, make_scratch
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig

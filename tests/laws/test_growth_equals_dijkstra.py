@@ -12,7 +12,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels import queue_dial, queue_wide
+from planner_service.kernels import queue_dial, queue_wide_buckets
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -52,8 +52,8 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
         narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
         assert queue_dial.grow_whole(ground.padded, narrow, root, (width, 4096), scratch) > 0
-        room = queue_wide.make_scratch(ground.size, ground.rule)
-        reach = queue_wide.grow_by_wide_buckets(ground.padded, wide, root, width, room)
+        room = queue_wide_buckets.make_scratch(ground.size, ground.rule)
+        reach = queue_wide_buckets.grow_by_wide_buckets(ground.padded, wide, root, width, room)
         np.testing.assert_array_equal(wide, narrow)
         assert reach >= wide[np.isfinite(wide)].max()
 

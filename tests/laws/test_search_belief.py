@@ -11,8 +11,7 @@ from support.effort import few
 from support.kernel_oracle import inner
 
 from planner_service.search.belief import Belief, blocks_of
-from planner_service.search.growth_from_vehicle import Ways
-from planner_service.search.search_places import IDLE_S, Searcher
+from planner_service.search.search_places import IDLE_S, Searcher, Ways
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.step_climb import Climb, climb_of

@@ -15,10 +15,11 @@ from support.kernel_oracle import inner, unpadded
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import stride_growth
+from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.tree import cost_to_go, strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import StrideNetwork, find_strides
+from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -71,13 +72,13 @@ def _components(count: int, pairs: list[tuple[int, int]]) -> Labels:
 
 def _links(network: StrideNetwork) -> list[tuple[int, int, int]]:
     """(node, node, link) of every link, from both of its ends."""
-    _, _, first, other, *_ = network.arrays
+    _, _, first, other, *_ = network
     return [(n, int(other[i]), i) for n in range(first.size - 1) for i in range(first[n], first[n + 1])]
 
 
 def _way(ground: Ground, n: int, link: int) -> list[int]:
     """The cells of the grid that a link leads over, from a node's centre on."""
-    centre, _, _, _, _, begin, steps, paths = ground.network.arrays
+    centre, _, _, _, _, begin, steps, paths = ground.network
     row, col = (int(part) - 1 for part in divmod(int(centre[n]), ground.costs.stride))
     cells = [row * ground.costs.grid.cols + col]
     at = int(begin[link])
@@ -92,7 +93,7 @@ def _way(ground: Ground, n: int, link: int) -> list[int]:
 @settings(max_examples=15, deadline=None)
 def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
-    centre, doublings = ground.network.arrays[:2]
+    centre, doublings = ground.network[:2]
     cells = unpadded(ground.costs, centre.astype(np.int64))
     links = _links(ground.network)
     for level in np.unique(doublings):
@@ -111,8 +112,8 @@ def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: i
 def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     legal = {(u, v) for u, v, _ in ground.steps}
-    cells = unpadded(ground.costs, ground.network.arrays[0].astype(np.int64))
-    doublings = ground.network.arrays[1].astype(int)
+    cells = unpadded(ground.costs, ground.network[0].astype(np.int64))
+    doublings = ground.network[1].astype(int)
     labels = {level: ground.labels(1 << level) for level in set(doublings)}
     for a, b, link in _links(ground.network):
         way = _way(ground, a, link)
@@ -141,7 +142,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
         tree.grow_strides(ground.costs.grid.around(root, half), ground.network, far)
     lowest, by, place = kept[0][3], kept[0][4], kept[0][2]
     assert (place == -1).all()
-    centre, doublings, *_ = ground.network.arrays
+    centre, doublings, *_ = ground.network
     cells = unpadded(ground.costs, centre.astype(np.int64))
     row, col = np.divmod(np.arange(rows * cols), cols)
     away = np.maximum(abs(row - root // cols), abs(col - root % cols))

@@ -17,7 +17,7 @@ from support.segments import crossed
 
 from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
-from planner_service.search.growth_from_vehicle import Ways
+from planner_service.search.search_places import Ways
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air import AirGround, air_ground

@@ -13,7 +13,7 @@ from support.map_strategies import set_of
 from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
-from planner_service import vehicle_class_planners as class_planners
+from planner_service import service as planner_service
 from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.cost_map import CostMap
@@ -169,7 +169,7 @@ class _World(SwarmModel):
         return self.ear.replies[0] if self.ear.replies else None
 
     def trees(self) -> list[str]:
-        return [name for name, _ in self.service._planners]
+        return list(self.service._planners)
 
 
 def _open_cell() -> int:
@@ -189,7 +189,7 @@ def world() -> _World:
 
 
 def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(world, monkeypatch):
-    monkeypatch.setattr(class_planners, "UNUSED_NS", 5 * NS_PER_S)  # a minute of ticks would show no more
+    monkeypatch.setattr(planner_service, "UNUSED_NS", 5 * NS_PER_S)  # a minute of ticks would show no more
     assert world.trees() == ["ground"]
     reply = world.ask(CostRequest(cells=[world.target], vehicle_class="walker"))
     assert (reply.vehicle_class, world.trees()) == ("walker", ["ground", "walker"])
@@ -200,7 +200,7 @@ def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(world, monk
 
 
 def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(world, monkeypatch):
-    monkeypatch.setattr(class_planners, "UNUSED_NS", NS_PER_S)
+    monkeypatch.setattr(planner_service, "UNUSED_NS", NS_PER_S)
     tags = []
     for _ in range(2):
         world.ask(CostRequest(cells=[world.target], vehicle_class="low"))

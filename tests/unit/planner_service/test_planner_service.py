@@ -204,7 +204,7 @@ def test_questions_that_waited_for_a_tree_are_answered_in_bounded_work_a_tick_an
     swarm.cells["t"] = GRID.cell(5, 5)
     swarm.run(0.5)
     planner, waits = swarm.planners["t"], [True]
-    planner._planners.must_wait = lambda name, cells, now_ns: waits[0]  # type: ignore[method-assign]
+    planner._must_wait = lambda name, cells, now_ns: waits[0]  # type: ignore[method-assign]
     for n in range(200):
         ask(f"rover.q{n % 10}", CostRequest(cells=list(range(2000)) * 10))
     ask("agent.a0", RouteRequest(cells=[GRID.cell(0, 20)]))

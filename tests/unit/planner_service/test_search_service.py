@@ -67,7 +67,7 @@ class World(SwarmModel):
 def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_ground_and_apart() -> None:
     world = World()
     world.run(8)
-    planners = {"ground": world.service._planner, "low": world.service._planners.used("low", 0)}
+    planners = {"ground": world.service._planner, "low": world.service._used("low", 0)}
     world.run(1)
     low = np.flatnonzero(np.isfinite(planners["low"]._cost_map.pace_s_per_m))
     start = int(low[len(low) // 2])

@@ -12,7 +12,7 @@ from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Move, random_pace
 
 from planner_service import growth_times
-from planner_service.growth_times import WindowSchedule
+from planner_service.growth_times import GrowthTimes, WindowSchedule
 from planner_service.strategy import AHEAD, STAGES, Auto, Growths
 from planner_service.tree import strides
 from swarm.config.scenario import PlannerConfig
@@ -79,10 +79,11 @@ def test_far_from_the_target_strides_hold_where_windows_alone_drift() -> None:
 @settings(max_examples=few(60))
 def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_wide(seed: int, steps: int) -> None:
     grid = GridSpec(256, 256, 1.0)
-    schedule = WindowSchedule(grid, 8)
+    config = PlannerConfig(k_min=1)
+    schedule = WindowSchedule(grid, config, GrowthTimes(grid, config, False, False, None))
     rng = np.random.default_rng(seed)
     cell = grid.cell(128, 128)
-    schedule.note_grown(cell, 256)
+    schedule.note_window(cell, 256)
     since = {8 << doublings: cell for doublings in range(5)}
     for _ in range(steps):
         row, col = grid.row_col(cell)
@@ -90,7 +91,7 @@ def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_w
             int(np.clip(row + rng.integers(-3, 4), 0, 255)), int(np.clip(col + rng.integers(-3, 4), 0, 255))
         )
         half = schedule.half(cell, 128)
-        schedule.note_grown(cell, half)
+        schedule.note_window(cell, half)
         for wide in since:
             if wide <= half:
                 since[wide] = cell

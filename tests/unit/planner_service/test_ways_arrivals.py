@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 
-from planner_service.search.growth_from_vehicle import Ways
+from planner_service.search.search_places import Ways
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -22,7 +22,7 @@ def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below
     exact = 10.0 * naive.cost_to_go(pace, start, corner_cutting=True, left_share=1.0)
     ways = Ways(costs)
     np.testing.assert_allclose(ways.arrivals_s(start), exact, rtol=1e-5)
-    monkeypatch.setattr("planner_service.search.growth_from_vehicle._MOST_CELLS", 0)
+    monkeypatch.setattr("planner_service.search.search_places._MOST_CELLS", 0)
     bound = ways.arrivals_s(start)
     assert (bound <= exact * (1 + 1e-5)).all()
     assert (np.isinf(bound) == np.isinf(exact)).all()
