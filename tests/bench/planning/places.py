@@ -70,7 +70,7 @@ class _Asked:
         grid = self._field.grid
         cells = self._field.draw(CHANGED, self._rng)
         rows, cols = np.divmod(cells, grid.cols)
-        self._pace[rows, cols] *= self._rng.choice(np.float32((1.5, 1 / 1.5)), CHANGED)
+        self._pace[rows, cols] *= self._rng.choice(np.array((1.5, 1 / 1.5), np.float32), CHANGED)
         windows = [
             Window(row, col, row + 1, col + 1) for row, col in zip(rows.tolist(), cols.tolist(), strict=True)
         ]
