@@ -306,7 +306,41 @@ def read_text_grid(path: Path, what: str) -> Numbers:
         If the file cannot be read or is no text, a line holds what is no number, or the points lie on no regular
         grid.
     """
-    return _points(_layout(path, what))
+    layout, total = _layout(path, what), 0
+    xs = ys = np.zeros(0)
+    for part in _numbers(layout):
+        xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
+        if not ((np.abs(xs) <= _FURTHEST).all() and (np.abs(ys) <= _FURTHEST).all()):
+            raise TerrainError(f"{what}: a point has no x or no y, or one beyond {_FURTHEST:g}")
+        total += len(part)
+        if max(len(xs), len(ys)) > _MOST_STEPS:
+            raise _irregular(what, f"x and y have more than {_MOST_STEPS} different values")
+    across, down = _axis(xs, "x", what), _axis(ys, "y", what)
+    cells, steps = down.cells * across.cells, f"{across.step:g} x {down.step:g}"
+    if total < _LEAST_FILLED * cells:
+        raise _irregular(what, f"{total} points are {total / cells:.1%} of a grid of {steps}")
+    check_size(down.cells, across.cells, what)
+    heights = np.full(cells, np.nan, np.float32)
+    for part in _numbers(layout):  # a second time: to hold the points would take ten times their grid
+        col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
+        row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
+        at = row * across.cells + col
+        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite, which is no-data
+            z = part[:, 2].astype(np.float32)
+        before = heights[at]
+        heights[at] = z
+        other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))
+        if other.any():
+            x, y, height_m = part[int(other.argmax())]
+            raise TerrainError(f"{what}: two heights at x {x:g}, y {y:g}, of which one is {height_m:g}")
+    missing = int(np.isnan(heights).sum())
+    notes = [f"{total} points x, y, z, {steps} apart, the middles of cells"]
+    if missing:
+        notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
+    west, north = across.first - across.step / 2, down.last + down.step / 2
+    place = from_origin(west, north, across.step, down.step)
+    crs = CRS.from_epsg(4326) if layout.degrees else None
+    return Numbers(heights.reshape(down.cells, across.cells), place, crs, tuple(notes))
 
 
 # --- text to numbers ----------------------------------------------------------------------------------------
@@ -374,44 +408,6 @@ class _Axis(NamedTuple):
     last: float
     step: float
     cells: int
-
-
-def _points(layout: _Layout) -> Numbers:
-    what, total = layout.what, 0
-    xs = ys = np.zeros(0)
-    for part in _numbers(layout):
-        xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
-        if not ((np.abs(xs) <= _FURTHEST).all() and (np.abs(ys) <= _FURTHEST).all()):
-            raise TerrainError(f"{what}: a point has no x or no y, or one beyond {_FURTHEST:g}")
-        total += len(part)
-        if max(len(xs), len(ys)) > _MOST_STEPS:
-            raise _irregular(what, f"x and y have more than {_MOST_STEPS} different values")
-    across, down = _axis(xs, "x", what), _axis(ys, "y", what)
-    cells, steps = down.cells * across.cells, f"{across.step:g} x {down.step:g}"
-    if total < _LEAST_FILLED * cells:
-        raise _irregular(what, f"{total} points are {total / cells:.1%} of a grid of {steps}")
-    check_size(down.cells, across.cells, what)
-    heights = np.full(cells, np.nan, np.float32)
-    for part in _numbers(layout):  # a second time: to hold the points would take ten times their grid
-        col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
-        row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
-        at = row * across.cells + col
-        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite, which is no-data
-            z = part[:, 2].astype(np.float32)
-        before = heights[at]
-        heights[at] = z
-        other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))
-        if other.any():
-            x, y, height_m = part[int(other.argmax())]
-            raise TerrainError(f"{what}: two heights at x {x:g}, y {y:g}, of which one is {height_m:g}")
-    missing = int(np.isnan(heights).sum())
-    notes = [f"{total} points x, y, z, {steps} apart, the middles of cells"]
-    if missing:
-        notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
-    west, north = across.first - across.step / 2, down.last + down.step / 2
-    place = from_origin(west, north, across.step, down.step)
-    crs = CRS.from_epsg(4326) if layout.degrees else None
-    return Numbers(heights.reshape(down.cells, across.cells), place, crs, tuple(notes))
 
 
 def _axis(values: NDArray[np.float64], name: str, what: str) -> _Axis:

@@ -145,9 +145,11 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     import rasterio
     from rasterio.vrt import WarpedVRT
 
-    if path.suffix.lower() in PLAIN:
-        return in_memory(_plain(path, f"{what} {path}"), files)
     what = f"{what} {path}"
+    if (suffix := path.suffix.lower()) in PLAIN:
+        from shared_map.importers.plain_grids import read_npz, read_text_grid
+
+        return in_memory((read_npz if suffix == ".npz" else read_text_grid)(path, what), files)
     name, driver, length = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
     _check_size(dataset, what)
@@ -174,16 +176,6 @@ def _check_numbers(dataset: Any, what: str) -> None:
     if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
         found = f"scales {dataset.scales[:4]} and offsets {dataset.offsets[:4]}"
         raise TerrainError(f"{what} has {found}, expected finite numbers, and no scale of 0")
-
-
-def _plain(path: Path, what: str) -> Numbers:
-    if path.suffix.lower() == ".npz":
-        from shared_map.importers.plain_grids import read_npz
-
-        return read_npz(path, what)
-    from shared_map.importers.plain_grids import read_text_grid
-
-    return read_text_grid(path, what)
 
 
 def _system_beside(path: Path, what: str) -> Any:

@@ -161,14 +161,8 @@ def _winners(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
         return stated  # no cell is disputed, as in nearly all traffic: nothing to sort
     # Stable: on a tie the larger author stays behind.
     order = np.lexsort((stated.stamps_ns, stated.zones, places))
-    return stated.taken(order[_last_of_each(places[order])])
-
-
-def _last_of_each(places: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Returns which of these, in order, are the last of their value."""
-    last = np.ones(len(places), bool)
-    last[:-1] = places[1:] != places[:-1]
-    return last
+    places = places[order]
+    return stated.taken(order[np.append(places[1:] != places[:-1], True)])
 
 
 def _placed(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -106,24 +106,17 @@ def gradient_of_padded(padded_m: Floats, resolution_m: float) -> tuple[Floats, F
     return east, north
 
 
-def _neighbours(padded_m: Floats) -> Iterator[tuple[int, int, Floats]]:
-    """(rows down, columns right, heights there) of the eight neighbours of the cells within the border."""
-    rows, cols = padded_m.shape[0] - 2, padded_m.shape[1] - 2
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            if dr or dc:
-                yield dr, dc, padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]
-
-
 def _gradient_beside_voids(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
     scale = np.float32(1.0 / (8.0 * resolution_m))
     centre = padded_m[1:-1, 1:-1]
+    rows, cols = centre.shape
     east, north = np.zeros(centre.shape, np.float32), np.zeros(centre.shape, np.float32)
-    for dr, dc, beside_m in _neighbours(padded_m):
-        rise = beside_m - centre
-        np.copyto(rise, np.float32(0), where=np.isnan(rise))
-        east += np.float32(dc * (2 - abs(dr))) * rise
-        north -= np.float32(dr * (2 - abs(dc))) * rise
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            rise = padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - centre
+            np.copyto(rise, np.float32(0), where=np.isnan(rise))
+            east += np.float32(dc * (2 - abs(dr))) * rise
+            north -= np.float32(dr * (2 - abs(dc))) * rise
     return east * scale, north * scale
 
 
@@ -138,15 +131,13 @@ def grade(elevation_m: Floats, resolution_m: float) -> Floats:
     return steepness
 
 
-def _hypot(east: Floats, north: Floats) -> Floats:
-    """sqrt(a^2 + b^2) in place of `east`: numpy's hypot costs ten times as much and nothing here overflows."""
+def grade_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
+    """`grade` of an array that brings its own border. NumPy's hypot costs ten times as much, and nothing here
+    overflows."""
+    east, north = gradient_of_padded(padded_m, resolution_m)
     east *= east
     east += north * north
     return np.sqrt(east, out=east)
-
-
-def grade_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
-    return _hypot(*gradient_of_padded(padded_m, resolution_m))
 
 
 def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
