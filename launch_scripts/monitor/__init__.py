@@ -4,7 +4,7 @@
   five (docs/design/live-view.md). It queries nothing but costs of planners, and no process waits for it.
 - `ground_view` lies still: the terrain, its layers with their legends, zones. It decides what is drawn again and
   when. `terrain_mesh` and `ground_colours` make arrays of what the shared map and planners say; they know no rerun.
-- `movers_view` moves: targets, obstacles, beliefs, alarms; `vehicles_view` vehicles with their trails and routes.
+- `movers_view` moves: vehicles with their trails and routes, targets, obstacles, beliefs, alarms.
   `styles` is the one table of colours and of how much is drawn for how many vehicles.
 - `live_layout` has the layers, their legends, and the panels beside: plots, a summary, a log.
 - `rerun_outputs` has the pen, which logs differences only, and its destinations: a file `run.rrd`, and a page

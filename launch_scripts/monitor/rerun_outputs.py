@@ -212,6 +212,10 @@ class Sinks:
         """page  one that is served already; None: one is opened here"""
         self._recording_id = recording_id
         self._blueprint = blueprint
+        self._path = path
+        self._size, self._still = -1, 0
+        """Bytes of the file, and checks that found as many, without a break."""
+        self._limit = RateLimit({"look": 1.0, "try": _RETRY_S})
         self.rec = self._stream()
         self.streams = [self.rec]
         """Streams to log to: `rec`, and the file that was begun last, if the first has ended."""
@@ -226,7 +230,7 @@ class Sinks:
             live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))
         try:
             self.rec.set_sinks(*_files(path), *live, default_blueprint=blueprint)
-        except RuntimeError as error:  # no space on the disk: `RecordingWatch` begins another file later
+        except RuntimeError as error:  # no space on the disk: `check_file` begins another later
             if path is None:
                 raise
             log.warning("recording nothing in %s: %s", path, error)
@@ -243,6 +247,31 @@ class Sinks:
             return Audience(now=0, ever=0)
         streams = self.page.server.audience()
         return Audience(streams.now or int(self.page.is_open), streams.ever)
+
+    def check_file(self, now_ns: int) -> Path | None:
+        """Notices that the file has ended for want of space, and begins another when there is some. Returns that
+        one, which is empty yet.
+
+        Rerun's file sink ends at the first error, with a line in its own log only. The launcher says that the disk
+        is full (`DiskWatch`).
+        """
+        path, limit = self._path, self._limit
+        if path is None or not (limit.due("look", now_ns) and self._has_ended(path) and limit.due("try", now_ns)):
+            return None
+        with contextlib.suppress(StoreError):
+            check_space(path.parent)
+            self._path = new_recording_path(path.parent)
+            self.begin_file(self._path)
+            self._size, self._still = -1, 0
+            return self._path
+        return None
+
+    def _has_ended(self, path: Path) -> bool:
+        before = self._size
+        with contextlib.suppress(OSError):
+            self._size = path.stat().st_size
+        self._still = self._still + 1 if self._size == before else 0
+        return self._still >= STILL_CHECKS
 
     def begin_file(self, path: Path) -> None:
         """Sends later logs of `streams` to this file, too. On a stream of its own: new sinks for `rec` would close
@@ -305,41 +334,6 @@ class RateLimit:
             return False
         self._next_ns[name] = now_ns + slower * self._every_ns[name]
         return True
-
-
-class RecordingWatch:
-    """Notices that a recording has ended for want of space, and begins another when there is some.
-
-    Rerun's file sink ends at the first error, with a line in its own log only. The launcher says that the disk is
-    full (`DiskWatch`).
-
-    begin  sends later drawings to this file as well; raises StoreError if it cannot
-    """
-
-    def __init__(self, path: Path, begin: Callable[[Path], None]) -> None:
-        self._path = path
-        self._begin = begin
-        self._size, self._still = -1, 0
-        """Bytes of the file, and checks that found as many, without a break."""
-        self._limit = RateLimit({"look": 1.0, "try": _RETRY_S})
-
-    def check(self, now_ns: int) -> Path | None:
-        """Returns the new file, if one has begun, which is empty yet."""
-        if self._limit.due("look", now_ns) and self._has_ended() and self._limit.due("try", now_ns):
-            with contextlib.suppress(StoreError):
-                check_space(self._path.parent)
-                self._path = new_recording_path(self._path.parent)
-                self._begin(self._path)
-                self._size, self._still = -1, 0
-                return self._path
-        return None
-
-    def _has_ended(self) -> bool:
-        before = self._size
-        with contextlib.suppress(OSError):
-            self._size = self._path.stat().st_size
-        self._still = self._still + 1 if self._size == before else 0
-        return self._still >= STILL_CHECKS
 
 
 def check_space(folder: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable
+from pathlib import Path
 
 from PIL import Image
 
@@ -21,7 +22,7 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers_view import MoversView
-from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
@@ -72,7 +73,7 @@ class MonitorService:
 
     scene      terrain and other inputs that are known beforehand
     web_port   port of the live view's page on this machine; 0: it has none
-    recording  watches the file of the recording, if there is one
+    recording  begins another file where one has ended, and returns it (`Sinks.check_file`)
     audience   viewers of the stream; if not given, there is always one
     """
 
@@ -85,7 +86,7 @@ class MonitorService:
         scene: Scene,
         *,
         web_port: int = 0,
-        recording: RecordingWatch | None = None,
+        recording: Callable[[int], Path | None] = lambda now_ns: None,
         audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
     ) -> None:
         scenario = setup.scenario
@@ -189,7 +190,7 @@ class MonitorService:
             self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
     def _watch_recording(self, now_ns: int) -> None:
-        if self._recording is not None and (path := self._recording.check(now_ns)) is not None:
+        if (path := self._recording(now_ns)) is not None:
             self._begin_drawing()
             sentence = f"the recording had ended, and goes on in {path}"
             log.warning("%s", sentence)
@@ -263,10 +264,15 @@ def load_view(
     closing.callback(sinks.close)
     truth = load_truth(setup, terrain) if knows_truth else None
     scene = Scene(Pen(sinks.streams, mesh), layers, truth, scenario_areas(scenario, terrain.grid))
-    watch = None if path is None else RecordingWatch(path, sinks.begin_file)
-
     service = MonitorService(
-        setup, terrain, bus, post, scene, web_port=sinks.web_port, recording=watch, audience=sinks.audience
+        setup,
+        terrain,
+        bus,
+        post,
+        scene,
+        web_port=sinks.web_port,
+        recording=sinks.check_file,
+        audience=sinks.audience,
     )
     give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
     life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"

@@ -11,8 +11,8 @@
 | run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
 | fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                |
 | run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
-| run_recorder.py    | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report |
-| history.py         | what a recorder keeps over time, in bounded memory; results per target, group, vehicle   |
+| run_recorder.py    | `Recorder`: figures, tracks, routes, captures, notes over time, in bounded memory; it    |
+|                    | makes the numbers of the report, and results per target, group and vehicle               |
 | run_folder.py      | the folder of a run, and how files are written whole                                     |
 | palette.py         | how pictures and the live view look                                                      |
 

@@ -18,9 +18,25 @@ import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from launch_scripts.gateways.ros2 import map_messages, ros_messages
-from launch_scripts.gateways.ros2.map_messages import Colour, Drawing
-from launch_scripts.gateways.ros2.ros_messages import RosMessages
+from launch_scripts.gateways.ros2 import map_messages
+from launch_scripts.gateways.ros2.map_messages import (
+    UNKNOWN,
+    Colour,
+    Drawing,
+    Form,
+    marker_array,
+    occupancy_grid,
+    occupancy_of,
+)
+from launch_scripts.gateways.ros2.ros_messages import (
+    TERRAIN_FRAME,
+    RosMap,
+    RosMessages,
+    Severity,
+    frames_of,
+    headings_along,
+    ros_name,
+)
 from launch_scripts.gateways.ros2.ros_types import RosTypes, types_of
 from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
 from launch_scripts.observe.run_alarms import Alarm
@@ -57,7 +73,7 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
         raise ConfigError(f"{folder} has no tracks: no messages about vehicles and targets")
     (path,) = free_places(folder, [f"{run}.mcap"], out, force)
     types = types_of("jazzy")
-    timeline = _Timeline(RosMessages(types, ros_messages.RosMap(tracks.grid)), tracks, ground, _colours(report))
+    timeline = _Timeline(RosMessages(types, RosMap(tracks.grid)), tracks, ground, _colours(report))
     counts = _write(path, timeline.messages_in_order(lines), types, _facts(run, report, tracks.grid))
     topics = ", ".join(f"{count:,} {topic}" for topic, count in sorted(counts.items()))
     without = "" if ground is not None else f"; no /map: there is no {GROUND_PACE_FILE} of it"
@@ -152,17 +168,12 @@ class _Timeline:
 
     def _still(self) -> Iterator[TimedMessage]:
         messages, first_ns, map = self._messages, self._first_ns, self._messages.map
-        still = [messages.transform(first_ns, (ros_messages.TERRAIN_FRAME, map.frame), map.origin_m)]
-        still += [
-            messages.transform(first_ns, (map.frame, ros_messages.frames_of(each)[0]))
-            for each in self._frames.values()
-        ]
+        still = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
+        still += [messages.transform(first_ns, (map.frame, frames_of(each)[0])) for each in self._frames.values()]
         yield TimedMessage(first_ns, "/tf_static", messages.transforms(still))
         if (ground := self._ground) is not None:
-            occupancy = map_messages.occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
-            yield TimedMessage(
-                first_ns, "/map", map_messages.occupancy_grid(messages, first_ns, occupancy, ground.side)
-            )
+            occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
+            yield TimedMessage(first_ns, "/map", occupancy_grid(messages, first_ns, occupancy, ground.side))
 
     def _moving(self, tracks: Sequence[Track], topic: str, *, frames: bool) -> Iterator[TimedMessage]:
         """The samples of all tracks, time by time. Headings lead from each sample to the next of its track.
@@ -175,7 +186,7 @@ class _Timeline:
         messages = self._messages
         times = np.concatenate([each.time_ns for each in tracks])
         xy_m = np.concatenate([each.xy_m for each in tracks])
-        headings = np.concatenate([ros_messages.headings_along(each.xy_m) for each in tracks])
+        headings = np.concatenate([headings_along(each.xy_m) for each in tracks])
         ids = [each.id for each in tracks for _ in each.time_ns]
         order = np.argsort(times, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(times[order])) + 1):
@@ -183,10 +194,7 @@ class _Timeline:
             if frames:
                 bases = [
                     messages.transform(
-                        now_ns,
-                        ros_messages.frames_of(self._frames[ids[n]]),
-                        messages.map.to_ros(*xy_m[n]),
-                        headings[n],
+                        now_ns, frames_of(self._frames[ids[n]]), messages.map.to_ros(*xy_m[n]), headings[n]
                     )
                     for n in some.tolist()
                 ]
@@ -202,20 +210,18 @@ class _Timeline:
         stands = np.isin(marks.kinds, (MarkKind.LETHAL, MarkKind.PACE))
         paces = np.where(marks.kinds == MarkKind.LETHAL, np.inf, marks.paces.astype(np.float64))[stands]
         best_s_per_m = ground.best_s_per_m if ground is not None else float(paces.min(initial=1.0))
-        values = map_messages.occupancy_of(paces, max(best_s_per_m, 1e-6))
+        values = occupancy_of(paces, max(best_s_per_m, 1e-6))
         rows, cols = np.divmod(marks.cells[stands], grid.cols)
         order = np.argsort(marks.stamps_ns[stands], kind="stable")
         rows, cols, values = rows[order] // side, cols[order] // side, values[order]
         stamps_ns = np.clip(marks.stamps_ns[stands][order], self._first_ns, self._last_ns)
-        occupancy = np.full((-(-grid.rows // side), -(-grid.cols // side)), map_messages.UNKNOWN, np.int8)
+        occupancy = np.full((-(-grid.rows // side), -(-grid.cols // side)), UNKNOWN, np.int8)
         done = 0
         for now_ns in self._instants(np.unique(stamps_ns).tolist(), _MOST_CELLS // occupancy.size):
             until = int(np.searchsorted(stamps_ns, now_ns, "right"))
             np.maximum.at(occupancy, (rows[done:until], cols[done:until]), values[done:until])
             done = until
-            yield TimedMessage(
-                now_ns, "/marks", map_messages.occupancy_grid(self._messages, now_ns, occupancy.copy(), side)
-            )
+            yield TimedMessage(now_ns, "/marks", occupancy_grid(self._messages, now_ns, occupancy.copy(), side))
 
     def _drawn(self) -> Iterator[TimedMessage]:
         """The route that each vehicle has begun last, and captures for a while."""
@@ -235,16 +241,12 @@ class _Timeline:
                 current[vehicle] = map_messages.route(grid, middles_of(grid, cells).T, colour)
                 done += 1
             captured = {
-                each.id: Drawing(
-                    "captures", map_messages.Form.CUBES, each.xy_m[:1], _CAPTURE, 3 * grid.resolution_m
-                )
+                each.id: Drawing("captures", Form.CUBES, each.xy_m[:1], _CAPTURE, 3 * grid.resolution_m)
                 for at_ns, each in captures
                 if at_ns <= now_ns < at_ns + _SHOWN_NS
             }
             drawings = [*current.values(), *captured.values()]
-            yield TimedMessage(
-                now_ns, "/swarm/markers", map_messages.marker_array(self._messages, now_ns, drawings)
-            )
+            yield TimedMessage(now_ns, "/swarm/markers", marker_array(self._messages, now_ns, drawings))
 
     def _instants(self, changes: Iterable[int], room_for: int) -> list[int]:
         return instants_of(changes, self._first_ns, self._last_ns, min(max(room_for, _LEAST), _MOST))
@@ -252,13 +254,9 @@ class _Timeline:
 
 def frame_names(ids: Iterable[str]) -> dict[str, str]:
     """Vehicle -> its name in frames, as of the gateway: a0-07 -> a0_07, or its id where another has that name."""
-    ids = sorted(set(ids))
-    names = {id: id for id in ids if ros_messages.ros_name(id) == id}
-    taken = set(names)
-    for id in ids:
-        if id not in names:
-            names[id] = id if ros_messages.ros_name(id) in taken else ros_messages.ros_name(id)
-            taken.add(names[id])
+    names: dict[str, str] = {}
+    for id in sorted(set(ids), key=lambda id: (ros_name(id) != id, id)):
+        names[id] = id if ros_name(id) in names.values() else ros_name(id)
     return names
 
 
@@ -293,7 +291,7 @@ class Line:
     """time_ns as `RunTracks` counts; name, the sender"""
 
     time_ns: int
-    severity: ros_messages.Severity
+    severity: Severity
     name: str
     text: str
 
@@ -312,23 +310,19 @@ def lines_of(report: Mapping[str, Any], path: Path, began_ns: int, captures: lis
         raise StoreError(f"{path} is damaged: {error}") from error
 
     def at(t_s: float) -> int:
-        return round(min(max(began_ns + t_s * NS_PER_S, 0), STAMP_LIMIT_NS - 1))  # it may be beyond all numbers
+        # Bounded before it is rounded: a report may tell of a time beyond all whole numbers.
+        return round(min(max(began_ns + t_s * NS_PER_S, 0), STAMP_LIMIT_NS - 1))
 
-    lines = [Line(at(note.t_s), ros_messages.Severity.INFO, note.sender, note.text) for note in words.notes or []]
+    lines = [Line(at(note.t_s), Severity.INFO, note.sender, note.text) for note in words.notes or []]
     first_ns = min((line.time_ns for line in lines), default=STAMP_LIMIT_NS)
     for each in captures:
         if each.time_ns[0] < first_ns - NS_PER_S:
-            lines.append(
-                Line(int(each.time_ns[0]), ros_messages.Severity.INFO, "targets", f"{each.id} was captured")
-            )
+            lines.append(Line(int(each.time_ns[0]), Severity.INFO, "targets", f"{each.id} was captured"))
     for alarm in words.alarms or []:
-        said, severity = (
-            f"{alarm.label}: {alarm.text}",
-            ros_messages.Severity.ERROR if alarm.serious else ros_messages.Severity.WARN,
-        )
+        said, severity = f"{alarm.label}: {alarm.text}", Severity.ERROR if alarm.serious else Severity.WARN
         if alarm.since_s is not None:
             lines.append(Line(at(alarm.since_s), severity, alarm.about, said))
         if alarm.over_s is not None and alarm.over_s != alarm.since_s:
             over = f"{alarm.label} is over: {alarm.text}"
-            lines.append(Line(at(alarm.over_s), ros_messages.Severity.INFO, alarm.about, over))
+            lines.append(Line(at(alarm.over_s), Severity.INFO, alarm.about, over))
     return sorted(lines)

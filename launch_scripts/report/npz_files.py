@@ -20,9 +20,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.history import tracks_of
 from launch_scripts.observe.latest_messages import MarkedCells
-from launch_scripts.observe.run_recorder import Recorder
+from launch_scripts.observe.run_recorder import Recorder, tracks_of
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S

@@ -22,7 +22,7 @@ from support.ros_peer import RosPeer, ros_router, write_definitions
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import ROWS, TABLE, Direction
+from launch_scripts.gateways.ros2.topic_table import ROWS
 from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.network
 
 OPTIONS = ("--no-live",)
 TYPES = types_of("jazzy")
-OUT = [row.name for row in TABLE if row.direction is Direction.OUT]
+OUT = list(ROWS)
 
 
 @dataclass

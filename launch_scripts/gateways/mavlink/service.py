@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,20 +55,16 @@ def run(
     pymavlink()
     with connect() as swarm:
         check_ground(swarm.frame)
-        link = open_link(address)
-        try:
+        with contextlib.closing(open_link(address)) as link:
             shell = Shell(swarm, link, Wire(sysid, key, time.time()), wishes, tell)
             tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
-            with stop_requests() as stopping:  # the vehicle is commanded to stop
+            with stop_requests() as stopping:
                 try:
-                    while not stopping():
-                        shell.turn()
-                except KeyboardInterrupt:
-                    pass
+                    with contextlib.suppress(KeyboardInterrupt):
+                        while not stopping():
+                            shell.turn()
                 finally:
-                    shell.stop()
-        finally:
-            link.close()
+                    shell.stop()  # the vehicle is commanded to stop
 
 
 class Shell:

@@ -6,18 +6,8 @@ The gateway and the page of the reference draw from it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from launch_scripts.gateways.ros2.rmw import Qos
-
-
-class Direction(StrEnum):
-    """Direction of a topic."""
-
-    OUT = "to ROS"
-    IN = "from ROS"
-    SERVICE = "service"
-
 
 VEHICLE, TARGET, ROBOT = "{vehicle}", "{target}", "{robot}"
 """Stand in names for that of each vehicle, target or robot."""
@@ -38,7 +28,7 @@ class TopicRow:
     topic: str
     type_name: str
     qos: Qos
-    direction: Direction
+    direction: str
     hz: float | None
     says: str
 
@@ -48,7 +38,7 @@ class TopicRow:
         return next((each for each in (VEHICLE, TARGET) if each in self.topic), None)
 
 
-_OUT, _IN, _SERVICE = Direction.OUT, Direction.IN, Direction.SERVICE
+_OUT, _IN, _SERVICE = "to ROS", "from ROS", "service"
 TABLE: tuple[TopicRow, ...] = (
     TopicRow("map", "/map", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _OUT, None,
              "Pace of each cell; repeated while it changes."),

@@ -21,7 +21,7 @@ from support.target_reports import fleet
 
 from launch_scripts import parent_death
 from launch_scripts.monitor.live_layout import make_blueprint
-from launch_scripts.monitor.rerun_outputs import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.rerun_outputs import Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
@@ -323,7 +323,7 @@ import numpy
 import rerun as rr
 from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.rerun_outputs import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.rerun_outputs import Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 
@@ -332,14 +332,13 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
 path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
 mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
 sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
-watch = RecordingWatch(path, sinks.begin_file)
 for second in range(20):
     if second == 8:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     for stream in sinks.streams:
         stream.set_time("tick", sequence=second)
         stream.log("a", rr.Scalars(second))
-    if begun := watch.check(second * 10**9):
+    if begun := sinks.check_file(second * 10**9):
         print(second, begun, flush=True)
 sinks.close()
 """
@@ -354,10 +353,8 @@ def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
     rig = Rig(scenario, terrain, tmp_path / "run.rrd")
-    watch = RecordingWatch(tmp_path / "run.rrd", rig.sinks.begin_file)
     told = iter([None, tmp_path / "run-2.rrd"])
-    watch.check = lambda now_ns: next(told, None)  # type: ignore[method-assign]
-    rig.service._recording = watch
+    rig.service._recording = lambda now_ns: next(told, None)
     rig.run(0.15)
     rig.sinks.begin_file(tmp_path / "run-2.rrd")
     rig.run(1.0)

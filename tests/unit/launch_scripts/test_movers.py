@@ -15,11 +15,20 @@ from support.makers import stats
 from support.monitor_rig import hill
 
 from launch_scripts.check.scenario_check import network
-from launch_scripts.monitor.movers_view import OVER_S, alarm_marks, searched_points, target_labels
+from launch_scripts.monitor.movers_view import (
+    OVER_S,
+    RouteLines,
+    RouteNow,
+    Trails,
+    alarm_marks,
+    cells_at,
+    searched_points,
+    target_labels,
+    vehicle_details,
+)
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
 from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.vehicles_view import RouteLines, RouteNow, Trails, cells_at, vehicle_details
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of

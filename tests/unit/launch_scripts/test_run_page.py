@@ -23,13 +23,13 @@ from support.fake_run import BEGAN_NS, leave, little_scenario, played
 
 from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.observe.summed_counts import percent
-from launch_scripts.report.mcap_export import export_mcap, frame_names, instants_of
+from launch_scripts.report.mcap_export import export_mcap, frame_names, instants_of, lines_of
 from launch_scripts.report.npz_files import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.grid import GridSpec
-from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
 from swarm.wire.messages.processes import Note
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
@@ -339,3 +339,10 @@ def test_no_two_vehicles_share_a_frame(ids: set[str]) -> None:
     assert set(names) == ids
     assert len(set(names.values())) == len(ids)
     assert all(name in (ros_name(id), id) for id, name in names.items())
+
+
+@given(st.floats(-1e308, 1e308), st.integers(0, 2**62))
+def test_a_line_of_any_time_is_of_a_time_that_messages_may_have(t_s: float, began_ns: int) -> None:
+    report = {"notes": [{"t_s": t_s, "text": "it", "from": "targets"}]}
+    [line] = lines_of(report, Path("report.json"), began_ns, [])
+    assert 0 <= line.time_ns < STAMP_LIMIT_NS

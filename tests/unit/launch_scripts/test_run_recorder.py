@@ -14,9 +14,8 @@ from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.history import BegunRoute, Sampling, Thinned, tracks_of
 from launch_scripts.observe.latest_messages import LatestState, plan_of
-from launch_scripts.observe.run_recorder import Recorder
+from launch_scripts.observe.run_recorder import BegunRoute, Recorder, Sampling, Thinned, tracks_of
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.gateways.ros2 import ros_messages
+from launch_scripts.gateways.ros2.ros_messages import (
+    TERRAIN_FRAME,
+    RosMap,
+    heading_of,
+    heading_of_quaternion,
+    yaw_of,
+)
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.grid import Window
@@ -59,11 +65,7 @@ class FrameReader:
     """
 
     def __init__(
-        self,
-        map: ros_messages.RosMap,
-        own: str = "",
-        offset_m: tuple[float, float] = (0.0, 0.0),
-        turn_rad: float = 0.0,
+        self, map: RosMap, own: str = "", offset_m: tuple[float, float] = (0.0, 0.0), turn_rad: float = 0.0
     ) -> None:
         self._map, self._own, self._offset_m, self._turn_rad = map, own.strip("/"), offset_m, turn_rad
 
@@ -71,9 +73,9 @@ class FrameReader:
         """Reads a geometry_msgs/Pose under a std_msgs/Header. Raises ConfigError."""
         towards = pose.orientation
         x_m, y_m = self.point(header, pose.position.x, pose.position.y)
-        heading_rad = ros_messages.heading_of_quaternion(towards.x, towards.y, towards.z, towards.w)
+        heading_rad = heading_of_quaternion(towards.x, towards.y, towards.z, towards.w)
         if heading_rad is not None and self._is_own(header):
-            heading_rad = ros_messages.heading_of(ros_messages.yaw_of(heading_rad) + self._turn_rad)
+            heading_rad = heading_of(yaw_of(heading_rad) + self._turn_rad)
         return Place(x_m, y_m, heading_rad)
 
     def point(self, header: Any, x: float, y: float) -> tuple[float, float]:
@@ -81,7 +83,7 @@ class FrameReader:
         if not (abs(x) <= _MOST_M and abs(y) <= _MOST_M):
             raise ConfigError(f"place is ({x!r}, {y!r}), expected numbers of metres")
         frame = header.frame_id.strip("/")
-        if frame == ros_messages.TERRAIN_FRAME:
+        if frame == TERRAIN_FRAME:
             x_m, y_m = x, y
         elif frame == self._map.frame or self._is_own(header):
             if self._is_own(header):
@@ -89,9 +91,7 @@ class FrameReader:
                 x, y = cos * x - sin * y + self._offset_m[0], sin * x + cos * y + self._offset_m[1]
             x_m, y_m = self._map.to_terrain(x, y)
         else:
-            known = " or ".join(
-                repr(each) for each in (self._map.frame, self._own, ros_messages.TERRAIN_FRAME) if each
-            )
+            known = " or ".join(repr(each) for each in (self._map.frame, self._own, TERRAIN_FRAME) if each)
             raise ConfigError(f"frame is {frame[:80]!r}, expected {known}")
         grid = self._map.grid
         if grid.cell_at(x_m, y_m) < 0:
@@ -123,7 +123,7 @@ def robot_place(reader: FrameReader, message: Any) -> Place:
     heading_rad = place.heading_rad
     if heading_rad is not None:
         # Direction of motion, not heading: a robot that reverses endangers the cells behind it.
-        heading_rad = ros_messages.heading_of(ros_messages.yaw_of(heading_rad) + math.atan2(left, forward))
+        heading_rad = heading_of(yaw_of(heading_rad) + math.atan2(left, forward))
     return Place(place.x_m, place.y_m, heading_rad, speed)
 
 
@@ -174,7 +174,7 @@ def corners_of(reader: FrameReader, message: Any) -> list[tuple[float, float]]:
     return [reader.point(message.header, float(point.x), float(point.y)) for point in points]
 
 
-def closed_cells(map: ros_messages.RosMap, message: Any, occupied: int) -> list[int]:
+def closed_cells(map: RosMap, message: Any, occupied: int) -> list[int]:
     """Cells of the terrain that a nav_msgs/OccupancyGrid closes, in order: those of which half or more lies under
     cells of the grid from `occupied` up to 100. Cells that are unknown (-1) or beyond the grid close nothing.
 
@@ -218,7 +218,7 @@ def _between(values: NDArray[np.float64], borders: NDArray[np.float64]) -> NDArr
     return np.asarray(np.diff(at_borders, axis=0))
 
 
-def _check_grid(map: ros_messages.RosMap, message: Any) -> None:
+def _check_grid(map: RosMap, message: Any) -> None:
     info, frame, many = message.info, message.header.frame_id.strip("/"), len(message.data)
     at, turned = info.origin.position, info.origin.orientation
     fault = None
@@ -236,7 +236,7 @@ def _check_grid(map: ros_messages.RosMap, message: Any) -> None:
         raise ConfigError(fault)
 
 
-def _window(map: ros_messages.RosMap, info: Any) -> Window:
+def _window(map: RosMap, info: Any) -> Window:
     """Our cells that the grid touches."""
     grid, at = map.grid, info.origin.position
     side_m = grid.resolution_m
