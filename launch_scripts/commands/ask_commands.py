@@ -108,11 +108,11 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
     watch  Show processes once a second, as `swarm top`.
     """
-    from launch_scripts.commands.status_view import ask_status, print_status, show_top, status_fields
+    from launch_scripts.commands.status_view import ask_status, print_status, status_fields
     from launch_scripts.launcher.terminal_tables import whole_output
 
     if watch:
-        show_top(where, each=False, once=False, as_json=as_json)
+        top(where, as_json=as_json)
     elif as_json:
         typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:
