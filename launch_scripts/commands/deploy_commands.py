@@ -24,7 +24,6 @@ from launch_scripts.deploy.machines_needed import (
     LEAST_SIDE,
     Estimate,
     Machine,
-    Needs,
     Swarm,
     fewest_machines,
     reaches,
@@ -192,29 +191,25 @@ def size(
     if as_json:
         typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
     else:
-        _show_size(found)
+        table = columns("Needs of this swarm", number_of(found.machines, "machine"))
+        for name, value in (
+            ("cores, all machines", sum(found.cpu_cores.values())),
+            *((f"  {role}", each) for role, each in found.cpu_cores.items()),
+            ("cores, a machine", found.machine_cores),
+            ("cores, the first", found.first_cores),
+            ("memory, a machine, GB", found.memory_gb),
+            ("memory, the first, GB", found.first_memory_gb),
+            ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
+            ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
+            ("sessions of a router", found.sessions),
+        ):
+            table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
+        Console(highlight=False).print(table)
         for each in full:
             typer.echo(f"{each}: more machines do not help.")
         if beyond:
             typer.echo("Extrapolated: larger than the swarms that were measured.")
     return int(bool(full))
-
-
-def _show_size(found: Needs) -> None:
-    table = columns("Needs of this swarm", number_of(found.machines, "machine"))
-    for name, value in (
-        ("cores, all machines", sum(found.cpu_cores.values())),
-        *((f"  {role}", each) for role, each in found.cpu_cores.items()),
-        ("cores, a machine", found.machine_cores),
-        ("cores, the first", found.first_cores),
-        ("memory, a machine, GB", found.memory_gb),
-        ("memory, the first, GB", found.first_memory_gb),
-        ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
-        ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
-        ("sessions of a router", found.sessions),
-    ):
-        table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
-    Console(highlight=False).print(table)
 
 
 @command(app)

@@ -25,7 +25,6 @@ from swarm.files import writing
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.study.summary import Summary
     from launch_scripts.simulation.study.sweep import Sweep
     from launch_scripts.simulation.trials import Result, Trial
 
@@ -225,7 +224,8 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     from dask.system import CPU_COUNT
 
     from launch_scripts.simulation.study.study import study_path
-    from launch_scripts.simulation.study.sweep import NUMBERS, Sweep
+    from launch_scripts.simulation.study.summary import METHOD, outcome_table
+    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS, Sweep
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -244,8 +244,14 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     summary = sweep.finish()
     if as_json:
         typer.echo((sweep.folder / NUMBERS).read_text(encoding="utf-8"))
-    else:
-        _print_summary(summary, sweep.folder)
+        return not summary.failing and not summary.missing
+    for name in summary.cases[0].outcomes:
+        typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
+    for failure in summary.failing[:_SHOWN_FAILURES]:
+        typer.echo(f"failed: {failure.replay}")
+    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
+    typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
+    typer.echo(f"{METHOD}\nsummary: {sweep.folder / NUMBERS}, results: {sweep.folder / RESULTS}")
     return not summary.failing and not summary.missing
 
 
@@ -268,16 +274,3 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
                 raise KeyboardInterrupt
 
         sweep.run(workers, scheduler, told)
-
-
-def _print_summary(summary: Summary, folder: Path) -> None:
-    from launch_scripts.simulation.study.summary import METHOD, outcome_table
-    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS
-
-    for name in summary.cases[0].outcomes:
-        typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
-    for failure in summary.failing[:_SHOWN_FAILURES]:
-        typer.echo(f"failed: {failure.replay}")
-    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
-    typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
-    typer.echo(f"{METHOD}\nsummary: {folder / NUMBERS}, results: {folder / RESULTS}")

@@ -220,20 +220,14 @@ def show(answer: Answer) -> None:
     age_s = reply.tree_age_ms / 1e3
     grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
     typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
-    _show_pose(reply)
+    # How old the pose is by which the planner answers.
+    if reply.pose_age_s is not None and reply.tracker_lost:
+        where = f"{reply.target} is lost: it has no tracker, and this is its position {reply.pose_age_s:.1f} s ago"
+        typer.secho(where, fg="yellow")
+    elif reply.pose_age_s is not None:
+        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
 
 
 def _target(answer: Answer) -> str:
     cell = answer.target_cell
     return answer.reply.target if cell is None else f"{answer.reply.target} at {written(answer.frame, cell)}"
-
-
-def _show_pose(reply: RouteReply) -> None:
-    """Say how old the pose is that the answer goes by."""
-    if reply.pose_age_s is None:
-        return
-    if reply.tracker_lost:
-        where = f"{reply.target} is lost: it has no tracker, and this is its position {reply.pose_age_s:.1f} s ago"
-        typer.secho(where, fg="yellow")
-    else:
-        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
