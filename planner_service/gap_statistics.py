@@ -57,7 +57,9 @@ class GapStatistics:
         cells = every[:: -(-every.size // _MOST)]
         routes = tree.routes(cells, 0)
         driven = routes.cost_s + self._length_weight * routes.length_m
-        self._offered(_ratios(driven, tree.cost_to_go_at(cells)))
+        optimum = tree.cost_to_go_at(cells).astype(np.float64)
+        given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
+        self._offered(driven[given] / optimum[given])
 
     def _offered(self, gaps: Gaps) -> None:
         gaps = gaps[np.isfinite(gaps)]
@@ -68,9 +70,3 @@ class GapStatistics:
 
     def _count_broken(self, many: int) -> None:
         self._counters.count("broken_certificates", many)
-
-
-def _ratios(driven: Gaps, optimum: NDArray[np.float32]) -> Gaps:
-    """Cost over optimum where both are finite and the optimum is not 0."""
-    given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
-    return np.asarray(driven[given] / optimum[given].astype(np.float64), np.float64)

@@ -278,11 +278,6 @@ class WindowSchedule:
         half = max(self.half(new, widest), least)
         return half, half
 
-    def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
-        """Returns True if the whole tree is due to become exact, which takes this time."""
-        within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
-        return row.renews_within_budget and within_budget
-
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     """Returns the half width, in cells, of the window of variable range (section 3.3.2).

@@ -272,11 +272,6 @@ class KernelLoader:
         if self._missing:
             self._thread.start()
 
-    def wait(self) -> None:
-        """Waits until all may be called."""
-        if self._missing:
-            self._thread.join()
-
     def _load_rest(self) -> None:
         while self._missing:
             self._have_built()

@@ -64,7 +64,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Work:
-    """Run `job` on a worker, and bring what it returns to `Planner.adopt` or `Planner.adopt_strides`."""
+    """Run `job` on a worker, and bring what it returns to `Planner.adopt` or `TargetTree.take_strides`."""
 
     job: Callable[[], GrownTree] | Callable[[], StrideNetwork]
 
@@ -242,10 +242,6 @@ class Planner:
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
 
-    def adopt_strides(self, found: StrideNetwork) -> None:
-        """Goes by what the worker found."""
-        self.tree.take_strides(found)
-
     def must_wait(self, cells: Sequence[int]) -> bool:
         """Returns True if no tree answers these cells now, but one will once the search under way is adopted."""
         return not self.tree.knows(cells) and (self._growing_since_ns is not None or self.tree.wants_full)
@@ -285,16 +281,14 @@ class Planner:
 
     def _search(self, now_ns: int) -> None:
         """Searches for the target while it is unseen."""
-        search, pose, grid = self.target_search, self._watch.pose, self._grid
+        search = self.target_search
         if search is None:
             return
         if self.tree.map_version < 0 and not search.tracked:
             self._learn_map(now_ns)
         if self.vehicle_class != GROUND:
             return  # that class has given the search all of this
-        place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
-        age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
-        search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
+        search.tick(self._watch, self._cost_map.pace_s_per_m, now_ns)
         if search.searches:
             self.counters.counts["searches"] = search.searches
             self.counters.counts["search_places"] = search.searcher.decisions

@@ -205,7 +205,7 @@ class PlannerService(PlanningProcess):
                 self._on_grown(tag, grown, took_ns, now_ns)
             case WorkDone(tag=tag, result=StrideNetwork() as found):
                 if (asked_by := self._asked_by(tag)) is not None:
-                    asked_by.adopt_strides(found)
+                    asked_by.tree.take_strides(found)
             case _:
                 super().handle(event, now_ns)
 

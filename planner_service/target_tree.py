@@ -30,7 +30,6 @@ from planner_service.tree.partitioned_tree import (
     GrownTree,
     PartitionedTree,
     can_be_root,
-    empty_tree,
     growth_job,
     in_cells,
     in_pieces,
@@ -325,7 +324,7 @@ class TargetTree:
             return RouteBatch.none(asked, NO_TARGET)
         self._reach(asked)
         routes = read_routes(self._tree, self._bounds, asked, max_cells)
-        if isinstance(self._tree, CostToGoTree) and self._tree.bound < np.inf:
+        if not self._is_whole:
             unknown = routes.statuses == UNREACHABLE
             routes.statuses[unknown] = NO_TARGET
             routes.lower_bound_s[unknown] = self._tree.bound * self._costs.time_share
@@ -344,10 +343,8 @@ class TargetTree:
 
     def may_reach(self, cells: Any, costs_s: Floats) -> bool:
         """Returns True if a growth that has stopped may still find a way for one of the cells without a cost."""
-        if not isinstance(self._tree, CostToGoTree) or self._tree.bound == np.inf:
-            return False
         unknown = np.asarray(cells, np.int64).reshape(-1)[np.isinf(costs_s)]
-        return any(0 <= cell < self._grid.cells and self._costs.passable(cell) for cell in unknown.tolist())
+        return not self._is_whole and self._open(unknown).size > 0
 
     # --- how ----------------------------------------------------------------------------------------------------
 
@@ -493,7 +490,7 @@ class TargetTree:
             self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
         if isinstance(self._tree, PartitionedTree) is not self._in_pieces:
-            self._tree = empty_tree(self._costs, self._in_pieces)
+            self._tree = PartitionedTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
         self._tree.grow(target_cell)
         self._state = State.CURRENT
         self._windows.note_whole(target_cell)
@@ -517,7 +514,7 @@ class TargetTree:
     @property
     def _is_whole(self) -> bool:
         """Returns True if a cell without a cost has no path."""
-        return isinstance(self._tree, PartitionedTree) or self._tree.bound == np.inf
+        return self._tree.bound == np.inf
 
     def _follow_near(self, target_cell: int, changes: Changes | None) -> Update | None:
         """Follows by a growth that stops; None where the whole tree is to be kept."""
@@ -553,51 +550,50 @@ class TargetTree:
 
     def knows(self, cells: Any) -> bool:
         """Returns True if these cells are answered for good; if not, a worker's tree is to come."""
-        if self.ready and not self._is_whole:
-            self._reach(np.asarray(cells, np.int64))
-            tree = self._tree
-            if isinstance(tree, CostToGoTree) and tree.bound < np.inf:
-                return bool((tree.cost[self._open(self._inside(cells))] < np.inf).all())
-        return self.ready
+        if not self.ready or self._is_whole:
+            return self.ready
+        self._reach(cells)
+        return self._is_whole or not self._without_path(self._open(cells)).size
 
-    def _reach(self, asked: NDArray[np.int64]) -> None:
+    def _reach(self, asked: Any) -> None:
         """Continues a stopped growth up to these cells."""
         if not self.times.may_stop and self._is_whole:
             return
-        tree, starts = self._tree, self._open(self._inside(asked))
-        if not self._is_whole and isinstance(tree, CostToGoTree):
-            missing = starts[tree.cost[starts] == np.inf]
-            if missing.size:
-                if self._growth.go_on(missing, self.times.most_cells) < 0:
-                    self._too_far = True
-                    return
-                self._take_grown(tree.root)
-                self._too_far |= not self._is_whole and bool((tree.cost[missing] == np.inf).any())
+        starts = self._open(asked)
+        if not self._is_whole and (missing := self._without_path(starts)).size:
+            if self._growth.go_on(missing, self.times.most_cells) < 0:
+                self._too_far = True
+                return
+            self._take_grown(self._tree.root)
+            self._too_far |= not self._is_whole and self._without_path(missing).size > 0
         self._note(starts)
 
     def expect(self, cells: Any) -> None:
         """Notes cells from which queries will come, such as those of a standby's followers: growths will reach
         them."""
         if self.ready and self._growth.usable:
-            self._note(self._open(self._inside(cells)))
+            self._note(self._open(cells))
 
     def _note(self, starts: NDArray[np.int64]) -> None:
         """Notes padded cells that asked, and how far a growth must go for them."""
         if not starts.size:
             return
-        tree, root = self._tree, self._costs.pad(self._tree.root)
-        if (self._is_whole or self._too_far) and (tree.parent[starts[starts != root]] == NONE).any():
+        if (self._is_whole or self._too_far) and self._without_path(starts).size:
             self._askers.note(starts, self._grid.cells)
             return
         rows, cols = np.divmod(starts, self._costs.stride)
-        row, col = divmod(root, self._costs.stride)
+        row, col = divmod(self._costs.pad(self._tree.root), self._costs.stride)
         self._askers.note(
             starts, _CELLS_PER_SQUARE * int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) ** 2
         )
 
-    def _open(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those of some cells of the grid that are passable, padded."""
-        return self._passable(self._costs.pad_all(cells))
+    def _without_path(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of some padded cells from which the tree leads nowhere, or not yet."""
+        return starts[(self._tree.parent[starts] == NONE) & (starts != self._costs.pad(self._tree.root))]
+
+    def _open(self, cells: Any) -> NDArray[np.int64]:
+        """Those of some numbers that are passable cells of the grid, padded."""
+        return self._passable(self._costs.pad_all(self._inside(cells)))
 
     def _passable(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         return starts[self._costs.cell_cost[starts] < np.inf]
@@ -688,7 +684,8 @@ class TargetTree:
         if done.kind in ("full", "exact") or done.wants_full or self._job_out:
             return False
         costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns
-        return self._windows.is_whole_due(self.strategy, costs_ns)
+        moves = self._windows.moves
+        return self.strategy.renews_within_budget and moves > 0 and moves * self.times.budget_ns >= costs_ns
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:
         asked = np.asarray(cells, np.int64).reshape(-1)

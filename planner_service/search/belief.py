@@ -189,7 +189,8 @@ class Belief:
         self._arrival_s = arrival_s
         self._crossing_s = blocks.pace_s_per_m * np.float32(blocks.side_m) * np.float32(min(slowness, 1e30))
         quick, usual = np.percentile(self._crossing_s[blocks.open], (1, 50)).tolist()
-        self._most_s: float = _MOST_MOVED * max(quick, 1e-9)
+        self.step_s: float = _MOST_MOVED * max(quick, 1e-9)
+        """Longest step of `predict` that is a single one."""
         self._turns_per_s = TURNS_PER_BLOCK / max(usual, 1e-9)
         opened = blocks.open.astype(np.float32)
         self._goes_on = np.stack([blocks.neighbours(opened, direction, 0.0) for direction in range(8)])
@@ -208,11 +209,6 @@ class Belief:
         return total
 
     @property
-    def step_s(self) -> float:
-        """Returns the longest step of `predict` that is a single one."""
-        return self._most_s
-
-    @property
     def reachable(self) -> Bools:
         """bool (rows, cols): where the target can be by now."""
         if self._arrival_s is None:
@@ -222,7 +218,7 @@ class Belief:
 
     def predict(self, seconds: float) -> None:
         """Moves the target on for some seconds."""
-        steps = min(max(math.ceil(seconds / self._most_s), 1), _MOST_STEPS)
+        steps = min(max(math.ceil(seconds / self.step_s), 1), _MOST_STEPS)
         for _ in range(steps):
             self._drive(seconds / steps)
         self.elapsed_s += seconds

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.search.search_places import OFFSET_S, Searcher, Ways
+from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Floats
 from swarm.clock import NS_PER_S
@@ -68,7 +69,7 @@ class TargetSearch:
         self.time_scale = time_scale
         self.searches = 0
         """Number of searches begun."""
-        self._hidden = hidden
+        self._hidden, self._grid = hidden, costs.grid
         self._places_m: list[tuple[float, float]] = []
         self._first_ns: int | None = None
         self._ticked_ns = 0
@@ -102,23 +103,12 @@ class TargetSearch:
         if known is None or (min(sighted.stamp_ns, now_ns), sighted.author) > (known.stamp_ns, known.author):
             self._remembered = msgspec.structs.replace(sighted, stamp_ns=min(sighted.stamp_ns, now_ns))
 
-    def tick(
-        self,
-        pose: TargetPose | None,
-        place_m: tuple[float, float],
-        age_ns: int,
-        lost: bool,
-        pace: Floats,
-        now_ns: int,
-    ) -> None:
+    def tick(self, watch: TargetWatch, pace: Floats, now_ns: int) -> None:
         """Begins or ends the search when it is due, and records what vehicles have looked at.
 
-        pose     the newest; None before the first
-        place_m  its (east, south) from the grid's corner
-        age_ns   time since the pose was received
-        lost     True if no tracker lives
-        pace     (rows, cols) float32, the map
+        pace  (rows, cols) float32, the map
         """
+        pose, grid = watch.pose, self._grid
         if self._first_ns is None:
             self._first_ns = self._ticked_ns = now_ns
         elapsed_s = (now_ns - self._ticked_ns) / NS_PER_S * self.time_scale
@@ -127,8 +117,12 @@ class TargetSearch:
         if self.active and (pose is not self._searched or told_since):
             self.searcher.end()
         if not self.active:
-            nearest_m = min((math.dist(place_m, each) for each in self._places_m), default=math.inf)
-            if self._is_unseen(pose, nearest_m, age_ns, lost, now_ns):
+            nearest_m = math.inf
+            if pose is not None:
+                place_m = pose.x_m - grid.west_m, grid.north_m - pose.y_m
+                nearest_m = min((math.dist(place_m, each) for each in self._places_m), default=math.inf)
+            age_ns = int((watch.age_s(now_ns) or 0.0) * NS_PER_S)
+            if self._is_unseen(pose, nearest_m, age_ns, watch.lost(now_ns), now_ns):
                 caught = self._hidden.jumps and nearest_m <= 2 * self._hidden.capture_range_m
                 cell = None if pose is None or caught else pose.cell
                 if pose is None and self._remembered is not None:

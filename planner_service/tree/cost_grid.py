@@ -106,13 +106,14 @@ class CostGrid:
         If not, a cell's cost is that of the cheapest straight step into it."""
         self.dearest_step = self.diagonal
         """Highest cost of a step, in cell costs."""
-        self._metres = grid.resolution_m
+        self.metres = grid.resolution_m
+        """m; a straight step into a cell takes its pace times this."""
         if climb is not None:
             self.climbs, self.dearest_step = _padded_climbs(climb, self.rule)
-            self._metres *= climb.lowest
+            self.metres *= climb.lowest
         self.length_weight_s = min(config.length_weight * grid.resolution_m, float(kernels.DEAREST_S))
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
-        if not (_SHORTEST_M <= self._metres <= _LONGEST_M and self.length_weight_s >= 0):
+        if not (_SHORTEST_M <= self.metres <= _LONGEST_M and self.length_weight_s >= 0):
             raise ValueError(
                 f"resolution_m is {grid.resolution_m:g}, planner.length_weight {config.length_weight:g}; expected"
                 f" {_SHORTEST_M:g} to {_LONGEST_M:g} and 0 or more"
@@ -214,12 +215,7 @@ class CostGrid:
 
     def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int, int]:
         costs: Floats = np.full(self.size, np.inf, np.float32)
-        return costs, *kernels.pad_cell_costs(pace, self._metres, extra_s, self.stride, costs)
-
-    @property
-    def metres(self) -> float:
-        """m; a straight step into a cell takes its pace times this."""
-        return self._metres
+        return costs, *kernels.pad_cell_costs(pace, self.metres, extra_s, self.stride, costs)
 
     @property
     def time_cost(self) -> Floats:
@@ -311,7 +307,7 @@ class CostGrid:
             before = np.empty(most, np.float32)
             count = kernels.changed_cells(
                 pace,
-                self._metres,
+                self.metres,
                 self.length_weight_s,
                 box,
                 self.stride,
@@ -325,7 +321,7 @@ class CostGrid:
             if self._time_cost is not None:
                 # A change of time may be too small to be seen in a cost that holds the price of length, too.
                 room = np.empty(most, np.int64), np.empty(most, np.float32)
-                seen = kernels.changed_cells(pace, self._metres, 0.0, box, self.stride, self._time_cost, *room)
+                seen = kernels.changed_cells(pace, self.metres, 0.0, box, self.stride, self._time_cost, *room)
                 timed.append(room[0][:seen])
         if self._time_cost is not None and timed:
             self._time_range.change(self._time_cost, np.concatenate(timed))

@@ -58,9 +58,11 @@ class PartitionedTree:
                and states the cost driven
     window_bound  None: an exact tree bounds itself
     fine, precise  as of a `CostToGoTree`: true
+    bound          as of a `CostToGoTree`: it is whole
     """
 
     fine = precise = True
+    bound = math.inf
 
     def __init__(self, cost_grid: CostGrid) -> None:
         if cost_grid.climbs is not None:
@@ -228,11 +230,6 @@ class PartitionedTree:
 
 
 AnyTree = CostToGoTree | PartitionedTree
-
-
-def empty_tree(cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
-    """One that is to be grown."""
-    return PartitionedTree(cost_grid) if in_pieces else CostToGoTree(cost_grid)
 
 
 def in_pieces(tree: AnyTree) -> PartitionedTree:

@@ -181,7 +181,7 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     assert disk.options == [name_of(kernel) for kernel in needed], "in the order in which they are needed"
     assert not loader.complete
     disk.coming = [name_of(kernel) for kernel in needed.later]
-    loader.wait()
+    loader._thread.join()
     assert loader.complete
 
 
